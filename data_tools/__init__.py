@@ -1,0 +1,1 @@
+"""Datasets, simulator, LiDAR geometry, metrics, export and plots of saga-fg."""

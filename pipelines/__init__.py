@@ -1,0 +1,1 @@
+"""Pipelines of saga-fg: online tracking, and the `saga-fg` command."""

@@ -1,0 +1,95 @@
+"""Validation of arrays at construction: convert once, check once, freeze.
+
+Every public value type funnels its arrays through `checked`, so that nothing of a wrong shape, with a NaN where a
+number is needed, ever reaches the numerics (or GTSAM, which would crash the interpreter).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from saga_fg.errors import InputError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+StrArray = NDArray[np.str_]
+
+Values = Literal["finite", "finite-or-nan", "any"]
+
+
+def checked(
+    name: str, value: ArrayLike, shape: tuple[int | None, ...], values: Values = "finite"
+) -> FloatArray:
+    """Return `value` as a read-only float64 array of `shape` (None: any length).
+
+    Raises `InputError` naming the array, the offending entry and what was expected.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected numbers, got {_short(value)}") from error
+    if array.ndim == len(shape) - 1 and array.size == 0 and shape[0] is None:
+        array = array.reshape((0, *(n or 0 for n in shape[1:])))
+    if array.ndim != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
+    ):
+        raise InputError(f"{name}: expected shape {_shape(shape)}, got {array.shape}")
+    if values != "any":
+        bad = ~np.isfinite(array) if values == "finite" else np.isinf(array)
+        if bad.any():
+            where = tuple(int(i) for i in np.argwhere(bad)[0])
+            expected = "a finite number" if values == "finite" else "a finite number, or NaN for unknown"
+            raise InputError(f"{name}{list(where)}: expected {expected}, got {array[where]}")
+    array.flags.writeable = False
+    return array
+
+
+def checked_labels(name: str, value: Any, length: int | None = None) -> StrArray:
+    """Return `value` as a read-only array of non-empty strings of shape (length,)."""
+    array = np.asarray(value)
+    if array.size == 0:
+        array = np.empty(0, dtype="<U1")
+    if array.dtype.kind != "U" or array.ndim != 1:
+        raise InputError(f"{name}: expected a list of strings, got {_short(value)}")
+    if length is not None and len(array) != length:
+        raise InputError(f"{name}: expected {length} entries, got {len(array)}")
+    if (array == "").any():
+        raise InputError(f"{name}[{int(np.argmax(array == ''))}]: expected a name, got an empty string")
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntArray:
+    """Return `value` as a read-only int64 array of unique entries, of shape (length,)."""
+    array = np.asarray(value)
+    if array.size == 0:
+        array = np.empty(0, dtype=np.int64)
+    if array.dtype.kind not in "iu" or array.ndim != 1:
+        raise InputError(f"{name}: expected a list of integers, got {_short(value)}")
+    if length is not None and len(array) != length:
+        raise InputError(f"{name}: expected {length} entries, got {len(array)}")
+    unique, counts = np.unique(array, return_counts=True)
+    if len(unique) != len(array):
+        raise InputError(f"{name}: expected unique ids, {int(unique[counts > 1][0])} occurs more than once")
+    array = array.astype(np.int64)
+    array.flags.writeable = False
+    return array
+
+
+def _shape(shape: tuple[int | None, ...]) -> str:
+    return (
+        "("
+        + ", ".join("any" if n is None else str(n) for n in shape)
+        + ("," if len(shape) == 1 else "")
+        + ")"
+    )
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

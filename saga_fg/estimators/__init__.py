@@ -1,0 +1,1 @@
+"""Estimators behind one protocol, and the textbook reference they must agree with."""

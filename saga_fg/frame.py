@@ -1,0 +1,136 @@
+"""What a sensor says: `Detection`, a table of them (`Detections`), and a `Frame`, one message of one sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, Self, get_args
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.boxes import Boxes
+from saga_fg.errors import InputError
+from saga_fg.geometry import checked_transform
+
+Coordinates = Literal["world", "ego", "sensor"]
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One detected object. NaN stands for "not measured" in size, yaw and velocity.
+
+    position: centre (x, y, z), m; size: (length, width, height), m; yaw: rad about z; velocity: (vx, vy), m/s over
+    ground; score: the detector's confidence, any finite number (probability or logit: see the sensor's model).
+    """
+
+    label: str
+    position: tuple[float, float, float]
+    size: tuple[float, float, float] = (NAN, NAN, NAN)
+    yaw: float = NAN
+    velocity: tuple[float, float] = (NAN, NAN)
+    score: float = 1.0
+
+    def __post_init__(self) -> None:
+        Detections.of([self])
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """N detections as columns: `boxes` and their `score` (N,). Iterating gives `Detection`s."""
+
+    boxes: Boxes
+    score: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "score", checked("score", self.score, (len(self.boxes),)))
+
+    @classmethod
+    def of(cls, detections: Sequence[Detection]) -> Self:
+        """The table of some `Detection`s."""
+        boxes = Boxes.of(
+            [d.label for d in detections],
+            [d.position for d in detections],
+            [d.size for d in detections],
+            [d.yaw for d in detections],
+            [d.velocity for d in detections],
+        )
+        return cls(boxes, np.array([d.score for d in detections], dtype=np.float64))
+
+    @classmethod
+    def empty(cls) -> Self:
+        return cls(Boxes.empty(), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __getitem__(self, row: int) -> Detection:
+        b = self.boxes
+        return Detection(
+            label=str(b.label[row]),
+            position=tuple(b.position[row].tolist()),
+            size=tuple(b.size[row].tolist()),
+            yaw=float(b.yaw[row]),
+            velocity=tuple(b.velocity[row].tolist()),
+            score=float(self.score[row]),
+        )
+
+    def __iter__(self) -> Iterator[Detection]:
+        return (self[row] for row in range(len(self)))
+
+    def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
+        """The detections of a mask, of row indices or of a slice."""
+        boxes = self.boxes.select(rows)
+        index = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
+        return type(self)(boxes, self.score[index])
+
+    def transformed(self, target_T_source: FloatArray) -> Self:
+        """The detections in target coordinates."""
+        return type(self)(self.boxes.transformed(target_T_source), self.score)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One message of one sensor: everything it detected at `timestamp`. An empty frame says "looked, saw nothing".
+
+    timestamp    s, any epoch, the same for all sensors of a scene
+    sensor       the sensor's name, e.g. "lidar"
+    detections   boxes in `coordinates`: "world", "ego" (vehicle) or "sensor"
+    world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world"
+    token        the dataset's own name of the record, "" if none
+
+    Raises `InputError` for a timestamp that is not finite, an unknown kind of coordinates, a pose that is not rigid.
+    """
+
+    timestamp: float
+    sensor: str
+    detections: Detections
+    world_T_ego: FloatArray | None = None
+    coordinates: Coordinates = "world"
+    token: str = ""
+
+    def __post_init__(self) -> None:
+        try:
+            timestamp = float(self.timestamp)
+        except (TypeError, ValueError):
+            timestamp = NAN
+        if not math.isfinite(timestamp):
+            raise InputError(f"timestamp: expected a finite number of seconds, got {self.timestamp!r}")
+        object.__setattr__(self, "timestamp", timestamp)
+        if not isinstance(self.sensor, str) or not self.sensor:
+            raise InputError(f"sensor: expected a name, got {self.sensor!r}")
+        if self.coordinates not in get_args(Coordinates):
+            raise InputError(
+                f"coordinates: expected one of {', '.join(get_args(Coordinates))}, got {self.coordinates!r}"
+            )
+        if self.world_T_ego is not None:
+            object.__setattr__(self, "world_T_ego", checked_transform("world_T_ego", self.world_T_ego))
+        elif self.coordinates != "world":
+            raise InputError(
+                f"world_T_ego: expected a pose, since the detections are in {self.coordinates} coordinates"
+            )
+
+    def __len__(self) -> int:
+        return len(self.detections)
