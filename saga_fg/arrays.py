@@ -21,9 +21,7 @@ StrArray = NDArray[np.str_]
 Values = Literal["finite", "finite-or-nan", "any"]
 
 
-def checked(
-    name: str, value: ArrayLike, shape: tuple[int | None, ...], values: Values = "finite"
-) -> FloatArray:
+def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: Values = "finite") -> FloatArray:
     """Return `value` as a read-only float64 array of `shape` (None: any length).
 
     Raises `InputError` naming the array, the offending entry and what was expected.
@@ -82,12 +80,7 @@ def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntAr
 
 
 def _shape(shape: tuple[int | None, ...]) -> str:
-    return (
-        "("
-        + ", ".join("any" if n is None else str(n) for n in shape)
-        + ("," if len(shape) == 1 else "")
-        + ")"
-    )
+    return "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
 
 
 def _short(value: object) -> str:

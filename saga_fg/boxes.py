@@ -39,9 +39,7 @@ class Boxes:
         size = checked("size", self.size, (n, 3), "finite-or-nan")
         if (size <= 0).any():
             row = int(np.argwhere(size <= 0)[0][0])
-            raise InputError(
-                f"size[{row}]: expected positive length, width, height in m, got {size[row].tolist()}"
-            )
+            raise InputError(f"size[{row}]: expected positive length, width, height in m, got {size[row].tolist()}")
         yaw = wrap_angle(checked("yaw", self.yaw, (n,), "finite-or-nan"))
         yaw.flags.writeable = False
         for name, array in (
@@ -88,12 +86,11 @@ class Boxes:
 
     def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
         """The boxes of a mask, of row indices or of a slice."""
-        index: Any = (
-            rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        )
-        return _unchecked(
-            type(self), {name: getattr(self, name)[index] for name in self.__dataclass_fields__}
-        )
+        index: Any = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
+        chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
+        for name in self.__dataclass_fields__:
+            object.__setattr__(chosen, name, getattr(self, name)[index])
+        return chosen
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The boxes in target coordinates; `target_T_source` is a rigid (4, 4) transform whose tilt is small."""
@@ -111,12 +108,4 @@ class Boxes:
         half = self.size[:, None, :2] / 2 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         c, s = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
         x, y = half[..., 0], half[..., 1]
-        return self.position[:, None, :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
-
-
-def _unchecked(cls: Any, columns: dict[str, Any]) -> Any:
-    """An instance from columns that are rows of a validated one: nothing to check again."""
-    instance = object.__new__(cls)
-    for name, array in columns.items():
-        object.__setattr__(instance, name, array)
-    return instance
+        return np.asarray(self.position[:, None, :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1))

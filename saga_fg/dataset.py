@@ -82,9 +82,7 @@ class Scene:
             checked_transform(f"scene {self.name}: world_T_ego[{k}]", pose)
         for name, column in (("tokens", self.tokens), ("ground_truth", self.ground_truth)):
             if column is not None and len(column) != len(timestamps):
-                raise InputError(
-                    f"scene {self.name}: {name}: expected {len(timestamps)} entries, got {len(column)}"
-                )
+                raise InputError(f"scene {self.name}: {name}: expected {len(timestamps)} entries, got {len(column)}")
         times = np.array([frame.timestamp for frame in self.frames])
         if (np.diff(times) < 0).any():
             k = int(np.argmax(np.diff(times) < 0)) + 1

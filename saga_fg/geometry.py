@@ -49,7 +49,7 @@ def transform_points(target_T_source: FloatArray, points: FloatArray) -> FloatAr
 
 def yaw_of(rotation: FloatArray) -> FloatArray:
     """Yaw (rad) of rotation matrices (..., 3, 3): direction of the rotated x axis in the horizontal plane."""
-    return np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])
+    return np.asarray(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]))
 
 
 def yaw_transform(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> FloatArray:
@@ -61,7 +61,7 @@ def yaw_transform(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0
 def quaternion_yaw(quaternion: FloatArray) -> FloatArray:
     """Yaw (N,) of unit quaternions (N, 4) in (w, x, y, z) order."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def yaw_quaternion(yaw: ArrayLike) -> FloatArray:
@@ -90,4 +90,4 @@ def checked_quaternions(name: str, value: ArrayLike) -> FloatArray:
     if bad.any():
         row = int(np.argmax(bad))
         raise InputError(f"{name}[{row}]: expected a unit quaternion (w, x, y, z), got norm {norm[row]:.6g}")
-    return quaternions / norm[:, None]
+    return np.asarray(quaternions / norm[:, None])
