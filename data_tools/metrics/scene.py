@@ -1,0 +1,198 @@
+"""How well the tracks of a scene follow its true objects: errors, identities, and what becomes of hidden objects.
+
+Over the matching of `data_tools.metrics.matching` (CLEAR):
+
+    MOTA   = 1 - (misses + false positives + identity switches) / objects      objects: visible true boxes
+    MOTP   = mean distance of the matched pairs of visible objects, m
+    recall = matched visible objects / visible objects
+
+An object that no sensor can see (`Annotations.visible` is False) may be matched, and changes of identity count there
+too, but to say nothing about it is no miss: misses and false positives judge what could be seen.
+
+Hidden objects are judged by the *carried error*. It asks where the object is according to the very track that
+followed it when it was last seen: for every object that was matched while visible and is hidden now,
+
+    carried error = min(distance to that track, cap)        cap, if that track no longer exists
+
+so that a tracker can't improve the figure by giving up the hard objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+
+from data_tools.metrics.consistency import nees
+from data_tools.metrics.error_sample import ErrorSample
+from data_tools.metrics.matching import Matching, match_scene
+from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.dataset import Annotations
+from saga_fg.geometry import wrap_angle
+from saga_fg.settings import setting
+from saga_fg.track import Tracks
+
+
+@dataclass(frozen=True)
+class SceneMetricSettings:
+    """How tracks are compared with ground truth."""
+
+    gate: float = setting(2.0, "largest horizontal distance of a matched pair, m")
+    same_label: bool = setting(True, "match objects and tracks of the same class only")
+    cap: float = setting(5.0, "error charged for a hidden object whose track is lost or far away, m")
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMetrics:
+    """Counts and errors of one scene, or of several (`pool`). Errors are of matched pairs, unless said otherwise.
+
+    objects, hidden_objects      true boxes that were visible, and that were not
+    matches, hidden_matches      those of them with a track
+    false_positives              track boxes that match nothing
+    switches                     identity switches
+    position, velocity           m and m/s, horizontal, visible objects (velocity: where both are known)
+    hidden_position, hidden_velocity   the same, of hidden objects
+    heading                      rad, in [0, pi], visible objects
+    carried                      m, hidden objects, lost ones at the cap (see the module)
+    nees                         of the position of visible objects, 2 degrees of freedom
+    """
+
+    objects: int
+    hidden_objects: int
+    matches: int
+    hidden_matches: int
+    false_positives: int
+    switches: int
+    position: ErrorSample
+    velocity: ErrorSample
+    hidden_position: ErrorSample
+    hidden_velocity: ErrorSample
+    heading: ErrorSample
+    carried: ErrorSample
+    nees: ErrorSample
+
+    @classmethod
+    def pool(cls, scenes: Iterable[SceneMetrics]) -> Self:
+        """Counts added, errors put together."""
+        parts = list(scenes)
+        pooled: dict[str, Any] = {}
+        for field in fields(cls):
+            column = [getattr(part, field.name) for part in parts]
+            pooled[field.name] = sum(column) if field.type == "int" else ErrorSample.pool(column)
+        return cls(**pooled)
+
+    @property
+    def misses(self) -> int:
+        """Visible objects without a track (FN)."""
+        return self.objects - self.matches
+
+    @property
+    def mota(self) -> float:
+        faults = self.misses + self.false_positives + self.switches
+        return 1.0 - faults / self.objects if self.objects else float("nan")
+
+    @property
+    def mota_sums(self) -> tuple[float, float]:
+        """(objects less faults, objects), whose ratio is MOTA: what a bootstrap of MOTA resamples."""
+        return float(self.matches - self.false_positives - self.switches), float(self.objects)
+
+    @property
+    def motp(self) -> float:
+        """Mean position error, m."""
+        return self.position.mean
+
+    @property
+    def recall(self) -> float:
+        return self.matches / self.objects if self.objects else float("nan")
+
+    @property
+    def hidden_recall(self) -> float:
+        return self.hidden_matches / self.hidden_objects if self.hidden_objects else float("nan")
+
+
+def scene_metrics(
+    ground_truth: Sequence[Annotations], tracks: Sequence[Tracks], settings: SceneMetricSettings | None = None
+) -> SceneMetrics:
+    """The metrics of one scene: K annotations and the K track tables of the same moments, both in world coordinates.
+
+    Raises `InputError` when their numbers differ.
+    """
+    settings = settings or SceneMetricSettings()
+    matchings = match_scene(ground_truth, tracks, settings.gate, settings.same_label)
+    moments = list(zip(ground_truth, tracks, matchings, strict=True))
+    pairs = [_pair_errors(*moment) for moment in moments]
+    visible = np.concatenate([np.empty(0, dtype=np.bool_), *(truth.visible[m.object_row] for truth, _, m in moments)])
+    position, velocity, heading, consistency = np.concatenate([np.empty((4, 0)), *pairs], axis=1)
+    objects = sum(int(truth.visible.sum()) for truth in ground_truth)
+    return SceneMetrics(
+        objects=objects,
+        hidden_objects=sum(map(len, ground_truth)) - objects,
+        matches=int(visible.sum()),
+        hidden_matches=int((~visible).sum()),
+        false_positives=sum(map(len, tracks)) - len(visible),
+        switches=sum(int(m.switched.sum()) for m in matchings),
+        position=ErrorSample(position[visible]),
+        velocity=_known(velocity[visible]),
+        hidden_position=ErrorSample(position[~visible]),
+        hidden_velocity=_known(velocity[~visible]),
+        heading=_known(heading[visible]),
+        carried=ErrorSample(_carried_errors(moments, settings.cap)),
+        nees=_known(consistency[visible]),
+    )
+
+
+def scene_metrics_by_label(
+    ground_truth: Sequence[Annotations], tracks: Sequence[Tracks], settings: SceneMetricSettings | None = None
+) -> dict[str, SceneMetrics]:
+    """`scene_metrics` of each class that occurs, by name; with `same_label` their pool is that of the whole scene."""
+    boxes = [truth.boxes for truth in ground_truth] + [found.boxes for found in tracks]
+    labels = {label for table in boxes for label in table.label.tolist()}
+    return {
+        label: scene_metrics(
+            [_annotations(truth, truth.boxes.label == label) for truth in ground_truth],
+            [found.select(found.boxes.label == label) for found in tracks],
+            settings,
+        )
+        for label in sorted(labels)
+    }
+
+
+def _pair_errors(truth: Annotations, found: Tracks, matching: Matching) -> FloatArray:
+    """(4, M): position, velocity, heading errors and NEES of the pairs of one moment; NaN where unknown."""
+    a, b = truth.boxes.select(matching.object_row), found.boxes.select(matching.track_row)
+    velocity = b.velocity - a.velocity
+    consistency = nees((b.position - a.position)[:, :2], found.position_covariance[matching.track_row])
+    heading = np.abs(wrap_angle(b.yaw - a.yaw))
+    return np.stack([matching.distance, np.hypot(velocity[:, 0], velocity[:, 1]), heading, consistency])
+
+
+def _carried_errors(moments: Sequence[tuple[Annotations, Tracks, Matching]], cap: float) -> FloatArray:
+    """Errors of all hidden objects, by the track that followed each of them when it was last seen."""
+    carrier: dict[str, int] = {}
+    errors: list[float] = []
+    for truth, found, matching in moments:
+        row_of = {track: row for row, track in enumerate(found.id.tolist())}
+        for row in np.flatnonzero(~truth.visible):
+            track = carrier.get(truth.id[row])
+            if track is None:
+                continue
+            at = row_of.get(track)
+            if at is None:
+                errors.append(cap)
+            else:
+                offset = found.boxes.position[at, :2] - truth.boxes.position[row, :2]
+                errors.append(min(float(np.hypot(*offset)), cap))
+        seen = truth.visible[matching.object_row]
+        names = truth.id[matching.object_row[seen]].tolist()
+        carrier.update(zip(names, found.id[matching.track_row[seen]].tolist(), strict=True))
+    return np.array(errors)
+
+
+def _annotations(truth: Annotations, rows: BoolArray) -> Annotations:
+    return Annotations(truth.id[rows], truth.boxes.select(rows), truth.visible[rows])
+
+
+def _known(values: FloatArray) -> ErrorSample:
+    return ErrorSample(values[np.isfinite(values)])
