@@ -1,0 +1,193 @@
+"""YAML to settings dataclasses. What a file leaves out keeps its default.
+
+* A section overrides field by field, a table (`Mapping`) entry by entry: an entry the defaults lack starts from the
+  table's entry `default` where there is one, and `null` takes an entry away. A list replaces the default list.
+* A key that does not exist is an error that names the nearest one; so are a value of a wrong type and a key twice.
+* Numbers may be written as `1e-3`, which YAML 1.1 takes for text.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import yaml
+
+from pipelines.configuration.schema import (
+    Choice,
+    Listing,
+    Nullable,
+    Scalar,
+    Schema,
+    Section,
+    Table,
+    kind_of,
+    settings_of,
+)
+from saga_fg.errors import InputError
+
+T = TypeVar("T")
+DEFAULT_ENTRY = "default"
+_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+
+
+def load_settings(cls: type[T], path: Path, base: T | None = None) -> T:
+    """The settings of a YAML file over `base` (default: `cls()`). Raises `InputError` naming file and dotted key."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable YAML file: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a YAML file in UTF-8") from error
+    return read_settings(cls, text, str(path), base)
+
+
+def read_settings(cls: type[T], text: str, source: str = "configuration", base: T | None = None) -> T:
+    """The settings of a YAML text; `source` is the name that errors give to it."""
+    try:
+        _refuse_repeated_keys(yaml.compose(text, Loader=yaml.SafeLoader))
+        data = yaml.safe_load(text)
+        return cast(T, _read(Section((cls,)), {} if data is None else data, cls() if base is None else base, ""))
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: PyYAML on a date such as 2020-02-31
+        raise InputError(f"{source}: expected YAML: {_one_line(error)}") from error
+
+
+def _read(schema: Schema, data: Any, base: Any, where: str) -> Any:
+    match schema:
+        case Nullable(value):
+            return None if data is None else _read(value, data, base, where)
+        case Scalar(type=kind):
+            return _read_scalar(kind, data, where)
+        case Choice(options):
+            if not any(type(data) is type(option) and data == option for option in options):
+                raise _mismatch(where, "one of " + ", ".join(map(str, options)), data)
+            return data
+        case Listing():
+            return _read_listing(schema, data, where)
+        case Table(value):
+            return _read_table(value, data, base, where)
+        case Section():
+            return _read_section(schema, data, base, where)
+
+
+def _read_scalar(kind: type, data: Any, where: str) -> Any:
+    if kind is float and isinstance(data, str):
+        try:
+            data = float(data)
+        except ValueError:
+            raise _mismatch(where, "a number", data) from None
+    if kind is float and isinstance(data, int) and not isinstance(data, bool) and abs(data) < 2**1023:
+        data = float(data)
+    if type(data) is not kind:
+        raise _mismatch(where, _NAMES[kind], data)
+    return data
+
+
+def _read_listing(schema: Listing, data: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(data, list):
+        raise _mismatch(where, "a list", data)
+    if schema.any_length:
+        return tuple(_read(schema.items[0], entry, None, f"{where}[{k}]") for k, entry in enumerate(data))
+    if len(data) != len(schema.items):
+        raise InputError(f"{where}: expected a list of {len(schema.items)}, got {len(data)} entries")
+    return tuple(_read(s, d, None, f"{where}[{k}]") for k, (s, d) in enumerate(zip(schema.items, data, strict=True)))
+
+
+def _read_table(value: Schema, data: Any, base: Any, where: str) -> dict[str, Any]:
+    result = dict(base) if base is not None else {}
+    for key in sorted(_text_keys(data, where), key=lambda key: key != DEFAULT_ENTRY):  # what others start from first
+        if data[key] is None:
+            result.pop(key, None)
+        else:
+            start = result.get(key, result.get(DEFAULT_ENTRY))
+            result[key] = _read(value, data[key], start, _join(where, key))
+    return result
+
+
+def _read_section(schema: Section, data: Any, base: Any, where: str) -> Any:
+    keys = _text_keys(data, where)
+    cls = schema.classes[0] if base is None else type(base)
+    if len(schema.classes) > 1:
+        cls = _class_of_kind(schema, data, where) if "kind" in keys or base is None else cls
+    settings = {setting.name: setting for setting in settings_of(cls)}
+    values: dict[str, Any] = {}
+    for key in keys:
+        if key in settings:
+            values[key] = data[key]
+        elif key != "kind" or len(schema.classes) == 1:
+            raise InputError(f"{_join(where, key)}: unknown key, {_suggestion(key, settings)}")
+    start = base if type(base) is cls else None
+    for name, setting in settings.items():
+        before = getattr(start, name) if start is not None else None if setting.required else setting.default()
+        if name in values:
+            values[name] = _read(setting.schema, values[name], before, _join(where, name))
+        elif start is None and setting.required:
+            raise InputError(f"{_join(where, name)}: expected a value, the key is missing")
+        else:
+            values[name] = before
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}" if where else str(error)) from error
+
+
+def _class_of_kind(schema: Section, data: dict[str, Any], where: str) -> type:
+    kinds = [kind_of(cls) for cls in schema.classes]
+    if "kind" not in data:
+        raise InputError(f"{where}.kind: expected one of {', '.join(kinds)}, the key is missing")
+    cls = schema.class_of_kind(data["kind"]) if isinstance(data["kind"], str) else None
+    if cls is None:
+        raise InputError(f"{where}.kind: got {data['kind']!r}, {_suggestion(str(data['kind']), kinds)}")
+    return cls
+
+
+def _text_keys(data: Any, where: str) -> list[str]:
+    if not isinstance(data, dict):
+        raise _mismatch(where, "a section (key: value)", data)
+    for key in data:
+        if not isinstance(key, str):
+            raise InputError(f"{_join(where, str(key))}: expected a key that is text, got {key!r} (quote it)")
+    return list(data)
+
+
+def _suggestion(key: str, known: Iterable[str]) -> str:
+    nearest = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    return f"did you mean {nearest[0]!r}?" if nearest else "expected one of " + ", ".join(known)
+
+
+def _mismatch(where: str, expected: str, data: Any) -> InputError:
+    names = {dict: "a section", list: "a list", type(None): "nothing (null)"}
+    got = names.get(type(data)) or (f"the text {data!r}" if isinstance(data, str) else str(data).lower())
+    return InputError(f"{where or 'the top level'}: expected {expected}, got {got}")
+
+
+def _join(where: str, key: str) -> str:
+    return f"{where}.{key}" if where else key
+
+
+def _refuse_repeated_keys(root: yaml.Node | None) -> None:
+    """PyYAML keeps the last of two equal keys in silence; a configuration that says two things is a mistake."""
+    todo, done = [root], set()
+    while todo:
+        node = todo.pop()
+        if node is None or id(node) in done:  # anchors and aliases may lead to the same node again
+            continue
+        done.add(id(node))
+        if isinstance(node, yaml.MappingNode):
+            names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+            twice = next((key for key, _ in reversed(node.value) if names.count(key.value) > 1), None)
+            if twice is not None:
+                raise InputError(f"line {twice.start_mark.line + 1}: the key {twice.value!r} occurs twice in a section")
+            todo += [value for _, value in node.value]
+        elif isinstance(node, yaml.SequenceNode):
+            todo += node.value
+
+
+def _one_line(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+    return f"line {mark.line + 1}, column {mark.column + 1}: {problem}" if mark else str(problem)

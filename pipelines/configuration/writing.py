@@ -1,0 +1,125 @@
+"""Settings dataclasses to YAML that people read: every value, each with its comment, and exact on the way back.
+
+A table's second and later entries repeat the keys but not the comments. Entries that the defaults hold and the
+settings do not are written as `null`, which takes them away when the text is read over the defaults.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from pipelines.configuration.reading import DEFAULT_ENTRY
+from pipelines.configuration.schema import Listing, Nullable, Schema, Section, Table, kind_of, settings_of
+
+WIDTH = 110
+_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./ -]*(?<! )")
+
+
+def write_settings(settings: Any, comments: bool = True) -> str:
+    """The YAML text of a settings dataclass; `read_settings(type(settings), text)` gives back an equal one."""
+    cls = type(settings)
+    return "\n".join(_section_lines(Section((cls,)), settings, cls(), comments)) + "\n"
+
+
+def scalar_text(value: Any) -> str:
+    """A number or a word as YAML: floats keep all digits and stay floats for every YAML reader."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return _float_text(value)
+    if isinstance(value, str):
+        if _PLAIN.fullmatch(value) and yaml.safe_load(value) == value:
+            return value
+        return yaml.safe_dump(value, default_style='"', width=2**31, allow_unicode=True).rstrip("\n")
+    return str(value)
+
+
+def _float_text(value: float) -> str:
+    if value != value:
+        return ".nan"
+    if value in (float("inf"), float("-inf")):
+        return ".inf" if value > 0 else "-.inf"
+    mantissa, _, exponent = repr(value).partition("e")
+    if not exponent:
+        return mantissa
+    return f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent if exponent[0] in '+-' else '+' + exponent}"
+
+
+def _section_lines(schema: Section, settings: Any, base: Any, comments: bool) -> list[str]:
+    entries: list[tuple[list[str], str]] = []
+    if len(schema.classes) > 1:
+        comment = "one of " + ", ".join(kind_of(cls) for cls in schema.classes) if comments else ""
+        entries.append(([f"kind: {scalar_text(kind_of(type(settings)))}"], comment))
+    same = type(base) is type(settings)
+    for item in settings_of(type(settings)):
+        if len(schema.classes) > 1 and item.name == "kind":
+            continue
+        before = getattr(base, item.name) if same else None if item.required else item.default()
+        lines = _entry_lines(item.name, _form(item.schema, getattr(settings, item.name), before, comments))
+        entries.append((lines, item.comment if comments else ""))
+    return _with_comments(entries)
+
+
+def _form(schema: Schema, value: Any, base: Any, comments: bool) -> str | list[str]:
+    """How a value is written: on the line of its key (text), or in lines below it."""
+    while isinstance(schema, Nullable) and value is not None:
+        schema = schema.value
+    match schema:
+        case Section():
+            return _section_lines(schema, value, base, comments) or "{}"
+        case Table(value=inner):
+            return _table_lines(inner, value, base, comments) or "{}"
+        case Listing():
+            items = schema.items * len(value) if schema.any_length else schema.items
+            forms = [
+                _form(item, entry, None, comments and type(entry) not in map(type, value[:k]))
+                for k, (item, entry) in enumerate(zip(items, value, strict=True))
+            ]
+            if all(isinstance(form, str) for form in forms):
+                return "[" + ", ".join(map(str, forms)) + "]"
+            return [line for form in forms for line in _dashed([form] if isinstance(form, str) else form)]
+    return scalar_text(value)
+
+
+def _table_lines(inner: Schema, value: Mapping[str, Any], base: Mapping[str, Any] | None, comments: bool) -> list[str]:
+    base = base or {}
+    lines: list[str] = []
+    for k, (key, entry) in enumerate(value.items()):
+        before = base.get(key, None if key == DEFAULT_ENTRY else value.get(DEFAULT_ENTRY))
+        lines += _entry_lines(key, _form(inner, entry, before, comments and k == 0))
+    return lines + [f"{scalar_text(key)}: null" for key in base if key not in value]
+
+
+def _entry_lines(key: str, form: str | list[str]) -> list[str]:
+    head = scalar_text(key)
+    return [f"{head}: {form}"] if isinstance(form, str) else [f"{head}:", *_indented(form)]
+
+
+def _dashed(lines: list[str]) -> list[str]:
+    first = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+    return [*_indented(lines[:first]), f"- {lines[first]}", *_indented(lines[first + 1 :])]
+
+
+def _indented(lines: list[str]) -> list[str]:
+    return ["  " + line for line in lines]
+
+
+def _with_comments(entries: list[tuple[list[str], str]]) -> list[str]:
+    """Comments behind one-line entries, in one column; above those that are longer, or when they would not fit."""
+    short = [len(lines[0]) for lines, comment in entries if len(lines) == 1 and comment]
+    column = max((n for n in short if n <= 44), default=0) + 2
+    result: list[str] = []
+    for lines, comment in entries:
+        if comment and len(lines) == 1 and len(lines[0]) < column and column + 2 + len(comment) <= WIDTH:
+            result.append(f"{lines[0]:<{column}}# {comment}")
+        else:
+            above = textwrap.wrap(comment, WIDTH - 2) if comment else []
+            result += [f"# {line}" for line in above] + lines
+    return result
