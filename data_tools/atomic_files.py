@@ -1,0 +1,131 @@
+"""Output that is there whole or not at all.
+
+A file is written under a temporary name in its own folder and moved over its final name with `os.replace` (atomic on
+POSIX and Windows) only when everything went well; any exception, KeyboardInterrupt included, removes the temporary one
+and leaves an earlier file of that name as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from saga_fg.errors import InputError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
+    """Open `path` for writing bytes; it appears, or is replaced, when the block ends without an exception.
+
+    The temporary file is opened at once, so a folder one cannot write to is noticed before any work is done.
+    Raises `InputError` if the folder is missing or not writable, if `path` is not a regular file, or the disk full.
+    """
+    final = _final(path)
+    if final.exists() and not final.is_file():
+        kind = "a folder" if final.is_dir() else "no regular file"
+        raise InputError(f"{path}: expected the name of a file to write, this is {kind}")
+    temporary = _temporary(final)
+    try:
+        file = temporary.open("xb")
+    except OSError as error:
+        raise _not_writable(final, error) from error
+    try:
+        with _disk_full(final), file:
+            yield file
+        temporary.replace(final)
+    except OSError as error:
+        if error.filename == str(temporary):
+            raise _not_writable(final, error) from error
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_directory(path: str | Path) -> Iterator[Path]:
+    """Yield an empty folder to fill; its files appear under `path` when the block ends without an exception.
+
+    A `path` that does not exist, or is empty, appears in one step. In one that has files already, each new file
+    replaces its namesake in one step and other files stay. Raises `InputError` as `atomic_file` does.
+    """
+    final = _final(path)
+    if final.exists() and not final.is_dir():
+        raise InputError(f"{path}: expected the name of a folder to write to, this is a file")
+    temporary = _temporary(final)
+    try:
+        temporary.mkdir()
+        if final.exists():  # writable as well? (the temporary folder lies beside it)
+            probe = _temporary(final / "probe")
+            probe.touch()
+            probe.unlink()
+    except OSError as error:
+        with suppress(OSError):
+            temporary.rmdir()
+        raise _not_writable(final, error) from error
+    try:
+        with _disk_full(final):
+            yield temporary
+        _move_into_place(temporary, final)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a whole file atomically. Raises `InputError` as `atomic_file` does."""
+    with atomic_file(path) as file:
+        file.write(content)
+
+
+def write_text(path: str | Path, content: str) -> None:
+    """Write a whole UTF-8 text file atomically. Raises `InputError` as `atomic_file` does."""
+    write_bytes(path, content.encode("utf-8"))
+
+
+def _final(path: str | Path) -> Path:
+    """`path` with links followed (so that they survive), in an existing folder."""
+    try:
+        final = Path(path).expanduser().resolve()
+        if final.parent.is_dir():
+            return final
+        reason = "is not a folder" if final.parent.exists() else "does not exist"
+    except (OSError, RuntimeError) as error:  # name too long, a circle of links
+        raise InputError(f"{path}: not writable: {error}") from error
+    raise InputError(f"{path}: not writable: the folder {final.parent} {reason}")
+
+
+def _temporary(final: Path) -> Path:
+    return final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.tmp")
+
+
+def _not_writable(path: Path, error: OSError) -> InputError:
+    return InputError(f"{path}: not writable: {error.strerror or error}; expected a folder one may write to")
+
+
+@contextmanager
+def _disk_full(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise InputError(f"{path}: not written: {error.strerror}") from error
+        raise
+
+
+def _move_into_place(source: Path, final: Path) -> None:
+    if not final.exists() or not any(final.iterdir()):
+        with suppress(FileNotFoundError):
+            final.rmdir()
+        source.rename(final)
+        return
+    for file in sorted(p for p in source.rglob("*") if not p.is_dir()):
+        target = final / file.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(file, target)  # noqa: PTH105 (the call this module is about)

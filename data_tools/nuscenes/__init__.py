@@ -1,0 +1,25 @@
+"""nuScenes: the official tables and detection results in, official tracking results out."""
+
+from data_tools.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES
+from data_tools.nuscenes.dataset import NuScenes
+from data_tools.nuscenes.result_files import ResultMeta
+from data_tools.nuscenes.splits import split_scenes
+from data_tools.nuscenes.tracking_results import (
+    TrackedBoxes,
+    TrackingResults,
+    read_tracking_results,
+    write_tracking_results,
+)
+
+__all__ = [
+    "CATEGORY_TO_TRACKING_CLASS",
+    "DETECTION_CLASSES",
+    "TRACKING_CLASSES",
+    "NuScenes",
+    "ResultMeta",
+    "TrackedBoxes",
+    "TrackingResults",
+    "read_tracking_results",
+    "split_scenes",
+    "write_tracking_results",
+]

@@ -1,0 +1,131 @@
+"""Tracking results in the official nuScenes format, written and read.
+
+    {"meta": {"use_camera": bool, ...}, "results": {sample_token: [{sample_token, translation, size (w, l, h),
+     rotation (w, x, y, z), velocity (vx, vy), tracking_id, tracking_name, tracking_score}, ...]}}
+
+in the global frame. Every sample of a scene is listed, with at most 500 boxes; a track keeps its class. Source:
+https://github.com/nutonomy/nuscenes-devkit, python-sdk/nuscenes/eval/tracking/README.md.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.atomic_files import atomic_file
+from data_tools.located import located
+from data_tools.nuscenes.classes import TRACKING_CLASSES
+from data_tools.nuscenes.result_files import ResultMeta, read_result_file
+from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.boxes import Boxes
+from saga_fg.dataset import Scene
+from saga_fg.errors import InputError
+from saga_fg.geometry import yaw_quaternion
+from saga_fg.track import Tracks
+
+MAX_BOXES = 500  # per sample, official
+
+
+def write_tracking_results(
+    path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks]]], meta: ResultMeta
+) -> None:
+    """Write the tracks of some scenes, each with one `Tracks` for each of its timestamps, in order.
+
+    `scenes` may be a generator: it is consumed while the file is written, and the file appears when all is done.
+    Only the seven tracking classes are written, per sample the 500 boxes of highest score; an unknown velocity becomes
+    zero. Track ids become "scene-id" and so are unique over scenes. Raises `InputError` for a path that is not
+    writable, tracks that do not fit the scene, a size or heading that is unknown, a track that changes its class.
+    """
+    with atomic_file(path) as binary:
+        file = io.TextIOWrapper(binary, encoding="utf-8", write_through=True)
+        file.write(f'{{"meta": {json.dumps(asdict(meta))}, "results": {{')
+        written: set[str] = set()
+        for scene, moments in scenes:
+            with located(f"{path}: scene {scene.name}"):
+                if len(moments) != len(scene):
+                    raise InputError(f"expected tracks for {len(scene)} samples, got {len(moments)}")
+                class_of: dict[int, str] = {}
+                for token, tracks in zip(scene.tokens, moments, strict=True):
+                    if not token or token in written:
+                        raise InputError(f"expected a token of its own for every sample, got {token!r}")
+                    boxes = _boxes(scene.name, token, tracks, class_of)
+                    file.write(f"{',' if written else ''}\n{json.dumps(token)}: {json.dumps(boxes, allow_nan=False)}")
+                    written.add(token)
+        file.write("\n}}\n")
+        file.detach()
+
+
+def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> list[dict[str, Any]]:
+    rows = np.flatnonzero(np.isin(tracks.boxes.label, TRACKING_CLASSES))
+    best = np.argsort(-tracks.score[rows], kind="stable")[:MAX_BOXES]
+    chosen = tracks.select(rows[np.sort(best)])
+    boxes = chosen.boxes
+    for id_, label in zip(chosen.id.tolist(), boxes.label.tolist(), strict=True):
+        if class_of.setdefault(id_, label) != label:
+            raise InputError(f"sample {token}: track {id_}: expected one class, got {class_of[id_]} and {label}")
+    unmeasured = ~np.isfinite(boxes.size).all(axis=1) | ~np.isfinite(boxes.yaw)
+    if unmeasured.any():
+        id_ = int(chosen.id[np.argmax(unmeasured)])
+        raise InputError(f"sample {token}: track {id_}: expected a known size and heading, the format requires them")
+    columns = zip(
+        boxes.position.round(6).tolist(),
+        boxes.size[:, [1, 0, 2]].round(6).tolist(),
+        yaw_quaternion(boxes.yaw).round(12).tolist(),
+        np.nan_to_num(boxes.velocity).round(6).tolist(),
+        chosen.id.tolist(),
+        boxes.label.tolist(),
+        chosen.score.tolist(),
+        strict=True,
+    )
+    return [
+        {
+            "sample_token": token,
+            "translation": translation,
+            "size": size,
+            "rotation": rotation,
+            "velocity": velocity,
+            "tracking_id": f"{scene}-{id_}",
+            "tracking_name": label,
+            "tracking_score": score,
+        }
+        for translation, size, rotation, velocity, id_, label, score in columns
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedBoxes:
+    """The boxes of one sample of a tracking result: `id` (N,) names of the tracks, `boxes`, `score` (N,)."""
+
+    id: StrArray
+    boxes: Boxes
+    score: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingResults:
+    """A tracking result file: its `meta`, and the boxes of every sample by token."""
+
+    meta: ResultMeta
+    samples: dict[str, TrackedBoxes]
+
+
+def read_tracking_results(path: str | Path) -> TrackingResults:
+    """Read a tracking result file. Raises `InputError` naming sample, box and field of what is not as it should be."""
+    result = read_result_file(path, "tracking")
+    columns = result.boxes
+    samples = {}
+    for token, rows in columns.rows.items():
+        ids = columns.id[rows]
+        if len(np.unique(ids)) != len(ids):
+            raise InputError(f"{path}: sample {token}: tracking_id: expected each track at most once")
+        samples[token] = TrackedBoxes(ids, columns.boxes.select(rows), columns.score[rows])
+    return TrackingResults(result.meta, samples)
