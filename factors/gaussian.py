@@ -1,0 +1,97 @@
+"""Linear Gaussian factors of any number of variables, native to GTSAM.
+
+    phi(x) = exp( -1/2 || sum_k A_k x_k - b ||_R^2 )
+
+GTSAM keeps it whitened as one block matrix [W A_1 ... W A_n | W b], W R W^T = 1. From Python its `JacobianFactor` takes
+three variables at most; a `GaussianConditional` without frontal variables takes any number, and its clone is a plain
+`JacobianFactor`. Handing the block matrix over whole costs half of handing it over block by block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.errors import FactorError
+from factors.validation import FloatArray, checked, checked_keys, format_key, format_keys, whitener
+
+
+def gaussian_factor(
+    keys: Iterable[int], blocks: Sequence[ArrayLike], rhs: ArrayLike, covariance: ArrayLike | None = None
+) -> gtsam.JacobianFactor:
+    """Return the factor || sum_k blocks[k] x_k - rhs ||_covariance.
+
+    keys: n distinct keys, in any order; blocks[k]: (m, d_k); rhs: (m,); covariance: (m, m), None for the identity.
+    Raises `FactorError` when shapes disagree, a number is not finite, or the covariance is not positive definite.
+    """
+    distinct = checked_keys("keys", keys)
+    b = checked("rhs", rhs, (None,))
+    if not distinct or len(blocks) != len(distinct):
+        raise FactorError(f"blocks: expected one block per key, got {len(blocks)} for {len(distinct)} keys")
+    matrices = [
+        checked(f"block of {format_key(key)}", block, (len(b), None))
+        for key, block in zip(distinct, blocks, strict=True)
+    ]
+    dims = [matrix.shape[1] for matrix in matrices]
+    if 0 in dims or not len(b):
+        raise FactorError("blocks: expected at least one row, and one column per block")
+    augmented = np.column_stack([*matrices, b])
+    if covariance is not None:
+        augmented = whitener("covariance", covariance, len(b)) @ augmented
+    return native_factor(distinct, dims, np.asfortranarray(augmented))
+
+
+def native_factor(keys: Sequence[int], dims: Sequence[int], augmented: FloatArray) -> gtsam.JacobianFactor:
+    """Return the factor of the whitened block matrix [A_1 ... A_n | b], of shape (m, sum(dims) + 1).
+
+    Unchecked, for inner loops: keys distinct, dims positive, entries finite. Column-major matrices are copied fastest.
+    """
+    matrix = gtsam.VerticalBlockMatrix(dims, augmented, True)
+    factor: gtsam.JacobianFactor = gtsam.GaussianConditional(keys, 0, matrix).clone()  # type: ignore[assignment]
+    return factor
+
+
+def gaussian_graph(factors: Iterable[gtsam.GaussianFactor]) -> gtsam.GaussianFactorGraph:
+    """Return a graph that shares these factors."""
+    graph = gtsam.GaussianFactorGraph()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph
+
+
+def nonlinear_graph(factors: Iterable[gtsam.GaussianFactor], dims: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:
+    """Wrap linear factors on vector variables for nonlinear solvers and iSAM2.
+
+    dims: the dimension of every key. GTSAM's `LinearContainerFactor` without a linearisation point is silently wrong in
+    iSAM2, so these get one, at zero: there the factors speak of the variables themselves, not of increments.
+    Raises `FactorError` for a key whose dimension is missing or contradicts its factor.
+    """
+    point = gtsam.Values()
+    for key, dim in dims.items():
+        point.insert(key, np.zeros(dim))
+    return nonlinear_graph_at(factors, point)
+
+
+def nonlinear_graph_at(factors: Iterable[gtsam.GaussianFactor], point: gtsam.Values) -> gtsam.NonlinearFactorGraph:
+    """Wrap linear factors on increments from `point` (as `NonlinearFactorGraph.linearize(point)` gives them).
+
+    The variables may be of any type. Raises `FactorError` for a key that `point` lacks or holds in another dimension.
+    """
+    dims = point.dims()
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        keys = factor.keys()
+        missing = [key for key in keys if key not in dims]
+        if missing:
+            raise FactorError(f"dimension of {format_keys(missing)} unknown")
+        width = (factor.cols() if isinstance(factor, gtsam.JacobianFactor) else factor.information().shape[0] + 1) - 1
+        total = sum(dims[key] for key in keys)
+        if total != width:
+            raise FactorError(
+                f"the factor on {format_keys(keys)} has {width} columns, but these variables have {total} dimensions"
+            )
+        graph.push_back(gtsam.LinearContainerFactor(factor, point))
+    return graph

@@ -1,0 +1,43 @@
+"""What is known of a variable, or of several together, before anything is measured.
+
+    phi(x) = || x - m ||_P^2
+
+One variable's prior is the birth of a track. A joint prior over many keys, P being their full joint covariance, is what
+a filter knows of the past: all of it in one factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.errors import FactorError
+from factors.gaussian import gaussian_factor, native_factor
+from factors.validation import checked, checked_keys, whitener
+
+
+def prior_factor(key: int, mean: ArrayLike, covariance: ArrayLike) -> gtsam.JacobianFactor:
+    """Return the factor || x(key) - mean ||_covariance; mean: (d,), covariance: (d, d), positive definite."""
+    center = checked("mean", mean, (None,))
+    return gaussian_factor([key], [np.eye(len(center))], center, covariance)
+
+
+def joint_prior_factor(keys: Iterable[int], means: Sequence[ArrayLike], covariance: ArrayLike) -> gtsam.JacobianFactor:
+    """Return one factor on all `keys` from their joint covariance.
+
+    means: one vector (d_k,) a key; covariance: (D, D) with D = sum_k d_k, in the order of the keys, positive definite.
+    Raises `FactorError` on anything else.
+    """
+    distinct = checked_keys("keys", keys)
+    vectors = [checked("means", mean, (None,)) for mean in means]
+    dims = [len(vector) for vector in vectors]
+    if not distinct or len(vectors) != len(distinct) or 0 in dims:
+        raise FactorError(f"means: expected one vector per key, got {len(vectors)} for {len(distinct)} keys")
+    W = whitener("covariance", covariance, sum(dims))
+    augmented = np.empty((len(W), len(W) + 1), order="F")
+    augmented[:, :-1] = W
+    augmented[:, -1] = W @ np.concatenate(vectors)
+    return native_factor(distinct, dims, augmented)

@@ -1,0 +1,112 @@
+"""Checks at the door of C++: GTSAM answers a wrong shape with a crash or a wrong number, so it never sees one.
+
+Noise enters a linear factor by whitening. With Q = L L^T (Cholesky) and W = L^-1,
+
+    || r ||_Q^2  =  r^T Q^-1 r  =  || W r ||^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors.errors import FactorError
+
+FloatArray = NDArray[np.float64]
+KeyArray = NDArray[np.uint64]
+
+_SYMMETRY = 1e-8  # relative asymmetry that rounding may leave in a covariance
+
+
+def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
+    """Return `value` as a float64 array of `shape` (None: any length), every entry finite, or raise `FactorError`."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FactorError(f"{name}: expected numbers in a regular array") from error
+    if array.ndim != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
+    ):
+        wanted = ", ".join("any" if n is None else str(n) for n in shape)
+        raise FactorError(f"{name}: expected shape ({wanted}), got {array.shape}")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise FactorError(f"{name}{list(where)}: expected a finite number, got {array[where]}")
+    return array
+
+
+def checked_keys(name: str, keys: Iterable[int]) -> tuple[int, ...]:
+    """Return `keys` as distinct GTSAM keys (integers from 0 to 2^64 - 1), or raise `FactorError`."""
+    result = []
+    for key in keys:
+        if isinstance(key, bool) or not isinstance(key, int | np.integer) or not 0 <= key < 1 << 64:
+            raise FactorError(f"{name}: expected integers from 0 to 2^64 - 1, got {key!r}")
+        result.append(int(key))
+    if len(set(result)) != len(result):
+        twice = next(key for key in result if result.count(key) > 1)
+        raise FactorError(f"{name}: expected distinct keys, {format_key(twice)} occurs more than once")
+    return tuple(result)
+
+
+def checked_key_array(name: str, keys: ArrayLike) -> KeyArray:
+    """Return `keys` as a flat array of GTSAM keys, not necessarily distinct, or raise `FactorError`."""
+    array = np.asarray(keys)
+    if array.size == 0:
+        array = np.empty(0, dtype=np.uint64)
+    if array.ndim != 1 or array.dtype.kind not in "iu" or (array.dtype.kind == "i" and int(array.min()) < 0):
+        raise FactorError(f"{name}: expected a flat array of integers from 0 to 2^64 - 1")
+    return array.astype(np.uint64)
+
+
+def whitener(name: str, covariance: ArrayLike, dim: int) -> FloatArray:
+    """Return W of shape (dim, dim), lower triangular, with W `covariance` W^T = identity.
+
+    Raises `FactorError` when the covariance is not symmetric and positive definite (or is so only up to rounding).
+    """
+    only: FloatArray = whiteners(name, checked(name, covariance, (dim, dim))[None])[0]
+    return only
+
+
+def whiteners(name: str, covariances: ArrayLike, dim: int | None = None) -> FloatArray:
+    """Return the whiteners (n, dim, dim) of a stack of covariances of the same shape; see `whitener`."""
+    stack = checked(name, covariances, (None, dim, dim))
+    if stack.shape[1] != stack.shape[2]:
+        raise FactorError(f"{name}: expected square matrices, got shape {stack.shape[1:]}")
+    if stack.shape[1] == 0 or len(stack) == 0:
+        return stack
+    variances = np.diagonal(stack, axis1=1, axis2=2)
+    asymmetric = np.abs(stack - stack.swapaxes(1, 2)).max(axis=(1, 2)) > _SYMMETRY * np.abs(variances).max(axis=1)
+    if asymmetric.any():
+        raise FactorError(f"{_entry(name, stack, asymmetric)}: expected a symmetric covariance")
+    try:
+        factor = np.linalg.cholesky(stack)
+    except np.linalg.LinAlgError as error:
+        failed = np.linalg.eigvalsh(stack)[:, 0] <= 0
+        raise FactorError(_not_definite(_entry(name, stack, failed))) from error
+    pivots = np.diagonal(factor, axis1=1, axis2=2) ** 2
+    singular = (pivots <= 16 * stack.shape[1] * np.finfo(float).eps * variances).any(axis=1)
+    if singular.any():
+        raise FactorError(_not_definite(_entry(name, stack, singular)))
+    return np.tril(np.linalg.inv(factor))
+
+
+def format_key(key: int) -> str:
+    """Return the key as people write it: x12 for a GTSAM symbol, the number itself otherwise."""
+    letter = chr(int(key) >> 56)  # GTSAM's own formatter fails on what is not a letter
+    return f"{letter}{int(key) & (1 << 56) - 1}" if letter.isascii() and letter.isalpha() else str(int(key))
+
+
+def format_keys(keys: Sequence[int], limit: int = 8) -> str:
+    """Return up to `limit` keys, separated by commas, and how many more there are."""
+    more = f" and {len(keys) - limit} more" if len(keys) > limit else ""
+    return ", ".join(format_key(key) for key in keys[:limit]) + more
+
+
+def _entry(name: str, stack: FloatArray, bad: NDArray[np.bool_]) -> str:
+    return f"{name}[{int(np.argmax(bad))}]" if len(stack) > 1 else name
+
+
+def _not_definite(name: str) -> str:
+    return f"{name}: expected a positive definite covariance, this one is singular or indefinite"

@@ -1,0 +1,146 @@
+"""Priors and marginals against the dense formulas: Schur complement and block of the covariance."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import (
+    FactorError,
+    SingularSystemError,
+    gaussian_factor,
+    gaussian_graph,
+    joint_prior_factor,
+    marginal_factors,
+    marginal_moments,
+    prior_factor,
+)
+
+
+def random_graph(rng, dims, covariance):
+    keys = list(dims)
+    factors = [prior_factor(key, rng.normal(size=dims[key]), covariance(rng, dims[key])) for key in keys]
+    for _ in range(2 * len(keys)):
+        chosen = rng.permutation(keys)[: rng.integers(1, 5)].tolist()
+        m = int(rng.integers(1, 4))
+        blocks = [rng.normal(size=(m, dims[key])) for key in chosen]
+        factors.append(gaussian_factor(chosen, blocks, rng.normal(size=m), covariance(rng, m)))
+    return gaussian_graph(factors)
+
+
+def moments(graph, keys):
+    information, vector = graph.hessian(gtsam.Ordering(keys))
+    covariance = np.linalg.inv(information)
+    return covariance @ vector, covariance
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_marginal_keeps_what_is_known_of_the_rest(seed, covariance):
+    rng = np.random.default_rng(seed)
+    keys = rng.permutation(500)[:9].tolist()
+    dims = {key: int(rng.integers(1, 5)) for key in keys}
+    graph = random_graph(rng, dims, covariance)
+    gone, kept = keys[:4], keys[4:]
+    mean, P = moments(graph, [*kept, *gone])
+    size = sum(dims[key] for key in kept)
+
+    remaining = marginal_factors(graph, gone)
+    assert sorted(remaining.keyVector()) == sorted(kept)
+    reduced_mean, reduced_P = moments(remaining, kept)
+    np.testing.assert_allclose(reduced_mean, mean[:size], atol=1e-8)
+    np.testing.assert_allclose(reduced_P, P[:size, :size], atol=1e-8)
+
+    joint_mean, joint_P = marginal_moments(graph, kept[::-1][:3])
+    order = [keys.index(key) for key in kept[::-1][:3]]
+    assert len(order) == 3
+    rows = np.concatenate([_rows(kept, dims, key) for key in kept[::-1][:3]])
+    np.testing.assert_allclose(joint_mean, mean[rows], atol=1e-8)
+    np.testing.assert_allclose(joint_P, P[np.ix_(rows, rows)], atol=1e-8)
+
+
+def _rows(keys, dims, key):
+    start = sum(dims[other] for other in keys[: keys.index(key)])
+    return np.arange(start, start + dims[key])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joint_prior_says_its_mean_and_covariance(seed, covariance):
+    rng = np.random.default_rng(seed)
+    keys = rng.permutation(50)[:6].tolist()
+    means = [rng.normal(size=rng.integers(1, 4)) for _ in keys]
+    P = covariance(rng, sum(map(len, means)))
+    mean, recovered = marginal_moments(gaussian_graph([joint_prior_factor(keys, means, P)]), keys)
+    np.testing.assert_allclose(mean, np.concatenate(means), atol=1e-9)
+    np.testing.assert_allclose(recovered, P, rtol=1e-8, atol=1e-10)
+
+
+def test_eliminating_nothing_or_everything(covariance):
+    rng = np.random.default_rng(0)
+    graph = random_graph(rng, {1: 2, 2: 3}, covariance)
+    assert marginal_factors(graph, []).size() == graph.size()
+    assert marginal_factors(graph, [1, 2]).keyVector() == []
+
+
+def test_untouched_factors_are_passed_on(covariance):
+    rng = np.random.default_rng(0)
+    alone = prior_factor(3, rng.normal(size=2), covariance(rng, 2))
+    graph = random_graph(rng, {1: 2, 2: 3}, covariance)
+    graph.push_back(alone)
+    remaining = marginal_factors(graph, [1])
+    assert any(
+        factor.keys() == [3] and factor.equals(alone, 0.0) for factor in map(remaining.at, range(remaining.size()))
+    )
+
+
+def test_unknown_key_is_refused(covariance):
+    graph = gaussian_graph([prior_factor(1, [0.0], [[1.0]])])
+    with pytest.raises(FactorError, match="no variable x7"):
+        marginal_factors(graph, [gtsam.symbol("x", 7)])
+    with pytest.raises(FactorError, match="no variable 2"):
+        marginal_moments(graph, [1, 2])
+
+
+def test_singular_system_names_the_free_variables_only():
+    x = [gtsam.symbol("x", i) for i in range(4)]
+    between = [np.eye(2), -np.eye(2)]
+    graph = gaussian_graph(
+        [
+            prior_factor(x[0], [0.0, 0.0], np.eye(2)),
+            gaussian_factor([x[0], x[1]], between, [0.0, 0.0]),
+            gaussian_factor([x[2], x[3]], between, [0.0, 0.0]),  # these two hang in the air
+        ]
+    )
+    with pytest.raises(SingularSystemError, match="does not determine x2, x3") as caught:
+        marginal_factors(graph, x)
+    assert caught.value.keys == (x[2], x[3])
+    with pytest.raises(SingularSystemError):
+        marginal_moments(graph, x)
+
+
+def test_variable_whose_factors_vanish_is_named():
+    graph = gaussian_graph([gaussian_factor([1, 2], [np.eye(2), np.eye(2)], [0.0, 0.0])])
+    with pytest.raises(SingularSystemError, match="does not determine"):
+        marginal_moments(graph, [1])
+
+
+def test_nan_is_found_when_marginalising():
+    factor = prior_factor(5, [1.0], [[1.0]])
+    factor.getb()[:] = np.nan  # as an in-place update might
+    graph = gaussian_graph([factor, gaussian_factor([5, 6], [[[1.0]], [[1.0]]], [0.0])])
+    with pytest.raises(FactorError, match="factors on 5 hold numbers that are not finite"):
+        marginal_factors(graph, [5])
+
+
+@pytest.mark.parametrize(
+    ("keys", "means", "covariance", "message"),
+    [
+        ([1, 1], [[0.0], [0.0]], np.eye(2), "more than once"),
+        ([1, 2], [[0.0]], np.eye(2), "one vector per key"),
+        ([], [], np.empty((0, 0)), "one vector per key"),
+        ([1, 2], [[0.0], [0.0, 1.0]], np.eye(2), r"covariance: expected shape \(3, 3\)"),
+        ([1, 2], [[0.0], [np.inf]], np.eye(2), "finite"),
+        ([1, 2], [[0.0], [0.0]], np.ones((2, 2)), "singular"),
+    ],
+)
+def test_bad_joint_prior_is_refused(keys, means, covariance, message):
+    with pytest.raises(FactorError, match=message):
+        joint_prior_factor(keys, means, covariance)
