@@ -1,0 +1,92 @@
+"""Vehicles and their drivers: kinds, sizes, and the parameters each driver keeps for the whole scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.simulator.idm import Drivers
+from data_tools.simulator.settings import DriverSettings, TrafficSettings
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of vehicle: the label it carries, mean and spread of its size, m, and how it drives compared to a car."""
+
+    name: str
+    label: str
+    size: tuple[float, float, float]
+    spread: tuple[float, float, float]
+    speed: float = 1.0
+    headway: float = 1.0
+    acceleration: float = 1.0
+
+
+KINDS = (
+    Kind("car", "car", (4.6, 1.85, 1.58), (0.3, 0.07, 0.1)),
+    Kind("van", "car", (5.4, 2.0, 2.35), (0.4, 0.06, 0.2)),
+    Kind("truck", "truck", (8.5, 2.45, 3.3), (1.4, 0.1, 0.3), speed=0.9, headway=1.2, acceleration=0.65),
+    Kind("bus", "bus", (11.8, 2.5, 3.1), (0.7, 0.05, 0.15), speed=0.9, headway=1.15, acceleration=0.7),
+)
+CAR, VAN, TRUCK, BUS = range(4)
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """N vehicles: kind (N,) rows of `KINDS`, size (N, 3) m, and drivers of shape (N,)."""
+
+    kind: IntArray
+    size: FloatArray
+    drivers: Drivers
+
+    @property
+    def label(self) -> StrArray:
+        return np.array([kind.label for kind in KINDS])[self.kind]
+
+    @property
+    def length(self) -> FloatArray:
+        return self.size[:, 0]
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+
+def draw_sizes(kind: IntArray, rng: np.random.Generator) -> FloatArray:
+    """Sizes (N, 3), m, of vehicles of some kinds, within two deviations of the mean."""
+    mean = np.array([k.size for k in KINDS])[kind]
+    spread = np.array([k.spread for k in KINDS])[kind]
+    return np.asarray(mean + spread * np.clip(rng.standard_normal(mean.shape), -2, 2))
+
+
+def draw_kinds(count: int, settings: TrafficSettings, rng: np.random.Generator) -> IntArray:
+    """Kinds (count,) of moving vehicles."""
+    shares = np.array([settings.van_share, settings.truck_share, settings.bus_share])
+    return rng.choice(len(KINDS), size=count, p=[1 - shares.sum(), *shares])
+
+
+def draw_fleet(
+    count: int, desired_speed: float, drivers: DriverSettings, traffic: TrafficSettings, rng: np.random.Generator
+) -> Fleet:
+    """`count` vehicles whose car drivers on average like to drive at `desired_speed`, m/s."""
+    kind = draw_kinds(count, traffic, rng)
+
+    def spread(mean: float, factor: FloatArray | float = 1.0) -> FloatArray:
+        deviation = np.clip(rng.standard_normal(count), -2.5, 2.5)
+        return np.asarray(mean * factor * np.exp(drivers.spread * deviation))
+
+    speed, headway, acceleration = (
+        np.array([getattr(k, name) for k in KINDS])[kind] for name in ("speed", "headway", "acceleration")
+    )
+    return Fleet(
+        kind,
+        draw_sizes(kind, rng),
+        Drivers(
+            spread(desired_speed, speed),
+            spread(drivers.time_headway, headway),
+            spread(drivers.minimum_gap),
+            spread(drivers.max_acceleration, acceleration),
+            spread(drivers.comfortable_deceleration),
+        ),
+    )

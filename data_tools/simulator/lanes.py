@@ -1,0 +1,103 @@
+"""Lanes beside the centre line of a road, each with a direction of travel, and a lane that joins and ends.
+
+Along a lane, distance is measured in its direction of travel: road s for forward lanes, length - s for oncoming ones.
+An ending lane approaches the road from `approach` m outside and runs beside it for a while before it ends: an
+on-ramp; with approach 0 it is a lane drop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.simulator.road import Road
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+
+
+def smooth_step(share: FloatArray) -> FloatArray:
+    """6 x^5 - 15 x^4 + 10 x^3, clipped to [0, 1]: from 0 to 1 with vanishing slope and curvature at both ends."""
+    x = np.clip(share, 0.0, 1.0)
+    return np.asarray(x**3 * (x * (6 * x - 15) + 10))
+
+
+def smooth_step_slope(share: FloatArray) -> FloatArray:
+    """Derivative of `smooth_step`."""
+    x = np.clip(share, 0.0, 1.0)
+    return np.asarray(30 * x**2 * (1 - x) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Lanes:
+    """The lanes of a road, numbered forward lanes first, from the middle of the road outwards.
+
+    road
+    offset     (L,) distance of each lane to the left of the centre line, m (where it runs beside the road)
+    direction  (L,) +1 forward, -1 oncoming
+    ending     the lane that ends, or -1
+    end        where it ends, m
+    opening    from where on one may change out of it, m
+    approach   how far outside it starts, m
+    """
+
+    road: Road
+    offset: FloatArray
+    direction: IntArray
+    ending: int = -1
+    end: float = np.inf
+    opening: float = 0.0
+    approach: float = 0.0
+    approach_length: float = 120.0
+
+    @property
+    def forward(self) -> IntArray:
+        return np.flatnonzero(self.direction > 0)
+
+    @property
+    def oncoming(self) -> IntArray:
+        return np.flatnonzero(self.direction < 0)
+
+    def lateral(self, lane: IntArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Offset d of the lanes' middle at travelled s, m, and its derivative by s; lane and s of one shape."""
+        d = self.offset[lane]
+        if self.ending < 0 or self.approach == 0:
+            return d, np.zeros_like(d)
+        share = (self.opening - s) / self.approach_length
+        here = lane == self.ending
+        outside = np.where(here, self.approach, 0.0)
+        slope = outside * smooth_step_slope(share) / self.approach_length
+        return d - outside * smooth_step(share), slope
+
+    def road_s(self, lane: IntArray, s: FloatArray) -> FloatArray:
+        """Road coordinate of travelled s, m."""
+        return np.where(self.direction[lane] > 0, s, self.road.length - s)
+
+    def neighbour(self, lane: IntArray, side: int) -> IntArray:
+        """The lane on the left (side -1) or right (+1) as the driver sees it, or -1."""
+        other = lane + side
+        exists = (other >= 0) & (other < len(self.offset))
+        other = np.where(exists, other, 0)
+        return np.where(exists & (self.direction[other] == self.direction[lane]), other, -1)
+
+    def may_change(self, lane: IntArray, target: IntArray, s: FloatArray) -> BoolArray:
+        """Whether the road allows to change from a lane to its neighbour here; nobody enters a lane that ends."""
+        allowed = (target >= 0) & (target != self.ending if self.ending >= 0 else True)
+        return np.asarray(allowed & ((lane != self.ending) | (s >= self.opening)))
+
+    def pose(
+        self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """World position (..., 2), heading (...) and metric (...) at travelled s, offset d, where dd/ds = `slope`.
+
+        The metric is the length travelled over ground per unit of s.
+        """
+        sign = self.direction[lane]
+        along = self.road_s(lane, s)
+        stretch = 1 - self.road.curvature_at(along) * d
+        tangent = self.road.heading_at(along)
+        heading = tangent + np.where(sign > 0, 0.0, np.pi) + sign * np.arctan2(slope, stretch)
+        return self.road.position(along, d), heading, np.hypot(stretch, slope)
+
+    def metric(self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray) -> FloatArray:
+        """The metric of `pose` alone."""
+        return np.hypot(1 - self.road.curvature_at(self.road_s(lane, s)) * d, slope)

@@ -1,0 +1,122 @@
+"""What a scene is made of, drawn from its settings: road, lanes, disturbances, and vehicles with their first places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.simulator.disturbances import SlowZone, StopLine, draw_intervals
+from data_tools.simulator.fleet import Fleet, draw_fleet
+from data_tools.simulator.idm import equilibrium_gap
+from data_tools.simulator.lanes import Lanes
+from data_tools.simulator.road import curved_road
+from data_tools.simulator.settings import RoadSettings, SimulatorSettings, TrafficSettings
+from saga_fg.arrays import FloatArray, IntArray
+
+JUNCTION = 30.0  # m between the stop lines of the two directions
+FOCUS = 0.55  # share of the road's length at which things happen
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A scene before anybody moves; `focus` is where, m along the road, traffic is disturbed."""
+
+    lanes: Lanes
+    focus: float
+    hedge: float | None
+    fleet: Fleet
+    lane: IntArray
+    s: FloatArray
+    speed: FloatArray
+    stop_lines: tuple[StopLine, ...]
+    slow_zones: tuple[SlowZone, ...]
+
+    @property
+    def edges(self) -> tuple[float, float]:
+        """Offsets d of the outer borders of the lanes, m: right (negative), left."""
+        width = abs(self.lanes.offset[1] - self.lanes.offset[0])
+        return float(self.lanes.offset.min() - width / 2), float(self.lanes.offset.max() + width / 2)
+
+
+def draw_scenario(settings: SimulatorSettings, rng: np.random.Generator) -> Scenario:
+    """A scenario with its own road, traffic and disturbances."""
+    lanes, hedge = _draw_lanes(settings.road, rng)
+    focus = FOCUS * settings.road.length
+    until = settings.warm_up + settings.duration
+    stop_lines, slow_zones = _draw_disturbances(lanes, focus, until, settings.traffic, rng)
+    desired_speed = float(rng.uniform(*settings.drivers.desired_speed))
+    fleet, lane, s = _fill(lanes, desired_speed, settings, rng)
+    speed = np.full(len(fleet), _start_speed(desired_speed))
+    return Scenario(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones)
+
+
+def _start_speed(desired_speed: float) -> float:
+    return 0.6 * desired_speed
+
+
+def _draw_lanes(settings: RoadSettings, rng: np.random.Generator) -> tuple[Lanes, float | None]:
+    """Lanes, and the offset of the hedge between the directions, if there is one."""
+    focus = FOCUS * settings.length
+    bends = []
+    if rng.random() < settings.curve_probability:
+        turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.2)
+        extent = 2 * abs(turn) * rng.uniform(*settings.curve_radius)
+        bends.append((focus + rng.uniform(-60.0, 100.0), turn, extent))
+    road = curved_road(settings.length, bends, rng.uniform(300.0, 2500.0, 2), rng.uniform(-np.pi, np.pi))
+    merge = rng.random() < settings.merge_probability
+    hedge = rng.random() < settings.median_probability
+    forward = int(rng.integers(settings.lanes[0], settings.lanes[1] + 1))
+    oncoming = int(rng.integers(settings.oncoming_lanes[0], settings.oncoming_lanes[1] + 1))
+    half = settings.median_width / 2 if hedge else 0.25
+    width = settings.lane_width
+    right = -(half + width * (np.arange(forward + merge) + 0.5))
+    left = half + width * (np.arange(oncoming) + 0.5)
+    lanes = Lanes(
+        road,
+        np.concatenate([right, left]),
+        np.repeat([1, -1], [len(right), len(left)]),
+        ending=forward if merge else -1,
+        end=focus if merge else np.inf,
+        opening=focus - rng.uniform(80.0, 150.0) if merge else 0.0,
+        approach=float(rng.choice([0.0, 25.0])) if merge else 0.0,
+    )
+    return lanes, 0.0 if hedge else None
+
+
+def _draw_disturbances(
+    lanes: Lanes, focus: float, until: float, settings: TrafficSettings, rng: np.random.Generator
+) -> tuple[tuple[StopLine, ...], tuple[SlowZone, ...]]:
+    if lanes.ending < 0 and rng.random() < settings.signal_probability:
+        red = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
+        opposite = lanes.road.length - (focus + JUNCTION)
+        return (StopLine(lanes.forward, focus, red), StopLine(lanes.oncoming, opposite, red)), ()
+    speed = float(rng.uniform(*settings.slow_speed))
+    active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)
+    return (), (SlowZone(lanes.forward, focus + 20.0, focus + 80.0, speed, active),)
+
+
+def _fill(
+    lanes: Lanes, desired_speed: float, settings: SimulatorSettings, rng: np.random.Generator
+) -> tuple[Fleet, IntArray, FloatArray]:
+    """Vehicles in platoons at equilibrium distances on all lanes: the fleet, its lanes (N,) and places s (N,), m."""
+    length = lanes.road.length
+    most = int(length / 6.0) * len(lanes.offset)
+    fleet = draw_fleet(most, desired_speed, settings.drivers, settings.traffic, rng)
+    gaps = equilibrium_gap(_start_speed(desired_speed), fleet.drivers)
+    rows, lane, s, row = [], [], [], 0
+    for number in range(len(lanes.offset)):
+        place = (lanes.opening if number == lanes.ending else length) - rng.uniform(5.0, 40.0)
+        left = 0
+        while place - fleet.length[row] > 0:
+            if left == 0:
+                left = int(rng.integers(settings.traffic.platoon_size[0], settings.traffic.platoon_size[1] + 1))
+                place -= rng.uniform(*settings.traffic.platoon_gap)
+            place -= gaps[row] + fleet.length[row]
+            rows.append(row)
+            lane.append(number)
+            s.append(place + fleet.length[row] / 2)
+            row, left = row + 1, left - 1
+    chosen = np.array(rows)
+    fleet = Fleet(fleet.kind[chosen], fleet.size[chosen], fleet.drivers.select(chosen))
+    return fleet, np.array(lane), np.array(s)

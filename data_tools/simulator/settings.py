@@ -1,0 +1,185 @@
+"""Settings of the traffic simulator. A pair (low, high) is a range from which each scene draws uniformly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from saga_fg.errors import InputError
+from saga_fg.settings import setting, settings_group
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class RoadSettings:
+    """Shape of the road, in m; traffic keeps to the right."""
+
+    length: float = setting(1000.0, "length of the simulated road, m")
+    lane_width: float = setting(3.5, "width of a lane, m")
+    lanes: tuple[int, int] = setting((2, 3), "fewest and most lanes in the ego vehicle's direction")
+    oncoming_lanes: tuple[int, int] = setting((1, 2), "fewest and most lanes in the other direction")
+    curve_probability: float = setting(0.5, "share of scenes on a curved road")
+    curve_radius: Range = setting((100.0, 300.0), "smallest radius of a curve's centre line, m")
+    merge_probability: float = setting(0.3, "share of scenes with a lane that ends (an on-ramp or a lane drop)")
+    median_probability: float = setting(0.4, "share of scenes with a hedge between the directions")
+    median_width: float = setting(3.0, "width of the strip that carries the hedge, m")
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """Means of the Intelligent Driver Model's parameters over the drivers of cars, and how much drivers differ."""
+
+    desired_speed: Range = setting((9.0, 15.0), "mean desired speed of a scene's drivers, m/s")
+    time_headway: float = setting(1.2, "desired time headway T, s")
+    minimum_gap: float = setting(2.0, "gap s0 kept at standstill, m")
+    max_acceleration: float = setting(1.5, "maximum acceleration a, m/s^2")
+    comfortable_deceleration: float = setting(2.0, "comfortable deceleration b, m/s^2")
+    spread: float = setting(0.15, "relative standard deviation of all these over drivers (log-normal)")
+    reaction_time: float = setting(0.3, "delay between what a driver sees and what his car does, s")
+    acceleration_noise: float = setting(0.2, "standard deviation of random acceleration, m/s^2")
+    noise_time: float = setting(3.0, "correlation time of the random acceleration, s")
+    politeness: float = setting(0.3, "weight of the new follower's loss in the decision to change lanes")
+    change_threshold: float = setting(0.3, "gain in acceleration that is worth a change of lanes, m/s^2")
+    safe_deceleration: float = setting(3.0, "hardest braking a lane change may cause, m/s^2")
+
+
+@dataclass(frozen=True)
+class TrafficSettings:
+    """How many vehicles there are, of which kinds, and what disturbs their flow."""
+
+    van_share: float = setting(0.12, "share of vans (labelled car) among moving vehicles")
+    truck_share: float = setting(0.14, "share of trucks")
+    bus_share: float = setting(0.08, "share of buses")
+    platoon_size: tuple[int, int] = setting((3, 9), "fewest and most vehicles in a platoon")
+    platoon_gap: Range = setting((10.0, 60.0), "extra distance between platoons, m")
+    signal_probability: float = setting(0.6, "share of scenes with a traffic light ahead; the rest have a slow zone")
+    red_duration: Range = setting((8.0, 18.0), "duration of a red phase, s")
+    green_duration: Range = setting((8.0, 16.0), "duration of a green phase, s")
+    slow_speed: Range = setting((2.0, 5.0), "speed in a slow zone while it is active, m/s")
+    slow_duration: Range = setting((5.0, 12.0), "how long a slow zone is active, and inactive, s")
+
+
+@dataclass(frozen=True)
+class PedestrianSettings:
+    """People on the pavements, alone and in groups."""
+
+    groups: tuple[int, int] = setting((6, 14), "fewest and most groups within reach of the ego vehicle")
+    group_size: tuple[int, int] = setting((1, 4), "fewest and most people in a group")
+    walking_speed: Range = setting((1.0, 1.7), "speed at which a group likes to walk, m/s")
+    pause_interval: float = setting(20.0, "mean time between a group's stops, s")
+    pause_duration: float = setting(4.0, "mean duration of a stop, s")
+    jitter: float = setting(0.25, "standard deviation of a person's place around that in the group, m")
+
+
+@dataclass(frozen=True)
+class SurroundingSettings:
+    """What stands beside the road and hides what moves on it."""
+
+    parking_probability: float = setting(0.5, "share of roadsides with a strip of parked cars")
+    parking_occupancy: float = setting(0.5, "share of parking places taken")
+    hedge_length: Range = setting((8.0, 30.0), "length of an unbroken piece of hedge, m")
+    hedge_gap: Range = setting((3.0, 15.0), "gap between pieces of hedge, m")
+    hedge_height: float = setting(2.2, "height of a hedge, m")
+    building_length: Range = setting((10.0, 30.0), "length of a building, m")
+    building_gap: Range = setting((2.0, 25.0), "gap between buildings, m")
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """One sensor with its detector. Noise is drawn along the range and bearing axes, independently each time.
+
+    The chance to detect an object is detection_probability * ramp(visible share) / (1 + exp((range - reach) / fading)),
+    the ramp rising from 0 at `hidden_share` to 1 at `clear_share`.
+    """
+
+    rate: float = setting(10.0, "frames per second, 1/s")
+    offset: float = setting(0.0, "time of the first frame after the start of the scene, s")
+    field_of_view: float = setting(2 * math.pi, "horizontal field of view, centred straight ahead, rad")
+    position: tuple[float, float, float] = setting((0.94, 0.0, 1.84), "mounting place on the vehicle (x, y, z), m")
+    max_range: float = setting(75.0, "nothing is detected beyond, m")
+    range_noise: tuple[float, float] = setting((0.10, 0.002), "range error: standard deviation at 0 m, and per m")
+    bearing_noise: tuple[float, float] = setting((0.08, 0.002), "sideways error: deviation at 0 m, m, and per m (rad)")
+    height_noise: float = setting(0.08, "standard deviation of the elevation, m")
+    size_noise: float = setting(0.05, "relative standard deviation of length, width, height")
+    yaw_noise: float = setting(0.05, "standard deviation of the heading, rad")
+    velocity_noise: float | None = setting(
+        None, "standard deviation of each velocity component, m/s; null: no velocity"
+    )
+    detection_probability: float = setting(0.97, "chance to detect a clearly visible object close by")
+    hidden_share: float = setting(0.15, "visible share up to which an object is never detected")
+    clear_share: float = setting(0.5, "visible share from which occlusion does not matter")
+    reach: float = setting(70.0, "range at which the chance to detect an object has halved, m")
+    fading: float = setting(6.0, "how gradually it falls there, m")
+    clutter_rate: float = setting(2.0, "mean number of false detections a frame")
+    true_logit: float = setting(2.0, "mean logit of the score of a clearly visible object close by")
+    clutter_logit: float = setting(-1.5, "mean logit of the score of a false detection")
+    logit_noise: float = setting(0.8, "standard deviation of the logit of the score")
+
+    def __post_init__(self) -> None:
+        if not self.rate > 0:
+            raise InputError(f"rate: expected a positive number of frames per second, got {self.rate}")
+        if not 0 < self.field_of_view <= 2 * math.pi + 1e-9:
+            raise InputError(f"field_of_view: expected an angle in (0, 2 pi] rad, got {self.field_of_view}")
+        if not 0 <= self.detection_probability <= 1:
+            raise InputError(f"detection_probability: expected a share in [0, 1], got {self.detection_probability}")
+        if not self.hidden_share < self.clear_share:
+            raise InputError(
+                f"clear_share: expected more than hidden_share {self.hidden_share}, got {self.clear_share}"
+            )
+
+
+def lidar() -> SensorSettings:
+    """A LiDAR on the roof that looks all around."""
+    return SensorSettings()
+
+
+def camera() -> SensorSettings:
+    """A front camera: good bearings, poor ranges, noisy velocities, its own clock."""
+    return SensorSettings(
+        rate=12.0,
+        offset=0.031,
+        field_of_view=math.radians(120),
+        position=(1.7, 0.0, 1.5),
+        max_range=60.0,
+        range_noise=(0.2, 0.03),
+        bearing_noise=(0.08, 0.004),
+        height_noise=0.15,
+        size_noise=0.1,
+        yaw_noise=0.15,
+        velocity_noise=1.0,
+        detection_probability=0.88,
+        reach=50.0,
+        fading=8.0,
+        clutter_rate=3.0,
+        true_logit=1.2,
+        clutter_logit=-1.2,
+        logit_noise=1.0,
+    )
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """Everything that shapes simulated scenes."""
+
+    duration: float = setting(20.0, "length of a scene, s")
+    keyframe_rate: float = setting(10.0, "moments a second at which ground truth is given and tracks are wanted, 1/s")
+    step: float = setting(0.05, "integration step, s")
+    warm_up: float = setting(15.0, "time simulated before the scene starts, s")
+    annotation_range: float = setting(70.0, "distance from the ego vehicle within which objects are annotated, m")
+    visible_share: float = setting(0.2, "an object counts as visible when a sensor sees at least this share of it")
+    road: RoadSettings = settings_group(RoadSettings, "the road")
+    drivers: DriverSettings = settings_group(DriverSettings, "how people drive")
+    traffic: TrafficSettings = settings_group(TrafficSettings, "what is on the road")
+    pedestrians: PedestrianSettings = settings_group(PedestrianSettings, "people on foot")
+    surroundings: SurroundingSettings = settings_group(SurroundingSettings, "what stands beside the road")
+    sensors: dict[str, SensorSettings] = settings_group(
+        lambda: {"lidar": lidar(), "camera": camera()}, "sensors on the ego vehicle, by name"
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("duration", "keyframe_rate", "step", "annotation_range"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if self.warm_up < 0:
+            raise InputError(f"warm_up: expected a time of at least 0 s, got {self.warm_up}")

@@ -1,0 +1,185 @@
+"""Vehicles on lanes: car following, lane changes and reactions to lights, integrated in small steps.
+
+State of a vehicle: travelled distance s of its centre, m; speed v over ground, m/s; its lane; and, while it changes
+lanes, the lane it comes from and the share q of the change it has completed. Each step of length h
+
+    v <- max(0, v + h a),     s <- s + h (v_old + v_new) / 2 / metric,     q <- q + h v / (length of the change)
+
+(ballistic update, Treiber and Kesting, Traffic Flow Dynamics, section 11.5), where the acceleration a is what the
+Intelligent Driver Model asked for a reaction time ago, plus random acceleration (an Ornstein-Uhlenbeck process).
+The offset from the centre line follows a smooth step of q, so that a vehicle moves sideways only while it rolls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.simulator.disturbances import SlowZone, StopLine
+from data_tools.simulator.fleet import Fleet
+from data_tools.simulator.idm import HARDEST_BRAKING, following_acceleration, free_acceleration
+from data_tools.simulator.lane_change import advantage, choose
+from data_tools.simulator.lanes import Lanes, smooth_step, smooth_step_slope
+from data_tools.simulator.neighbours import LaneOrder
+from data_tools.simulator.settings import DriverSettings
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+
+CHANGE_INTERVAL = 0.5  # s between two looks into the mirror
+SLOWEST_CHANGE = 2.0  # m/s below which nobody starts to change lanes
+
+
+@dataclass(frozen=True, eq=False)
+class TrafficHistory:
+    """What N vehicles did at T moments: time (T,) s and arrays (T, N).
+
+    s m, speed m/s, lane, offset d m, slope dd/ds, on_road; leader: the vehicle ahead in the lane, or -1.
+    """
+
+    time: FloatArray
+    s: FloatArray
+    speed: FloatArray
+    lane: IntArray
+    offset: FloatArray
+    slope: FloatArray
+    on_road: BoolArray
+    leader: IntArray
+
+
+class Traffic:
+    """Vehicles that drive on; `step` moves them all."""
+
+    def __init__(
+        self,
+        lanes: Lanes,
+        fleet: Fleet,
+        lane: IntArray,
+        s: FloatArray,
+        speed: FloatArray,
+        settings: DriverSettings,
+        rng: np.random.Generator,
+        stop_lines: Sequence[StopLine] = (),
+        slow_zones: Sequence[SlowZone] = (),
+        step: float = 0.05,
+        time: float = 0.0,
+    ) -> None:
+        self._lanes, self._fleet, self._settings, self._rng = lanes, fleet, settings, rng
+        self._stop_lines, self._slow_zones, self._step = stop_lines, slow_zones, step
+        n = len(fleet)
+        self.time = time
+        self.lane, self.s, self.speed = lane.copy(), s.astype(np.float64), speed.astype(np.float64)
+        self._from = np.full(n, -1)
+        self._share = np.zeros(n)
+        self._change_length = np.ones(n)
+        self._noise = settings.acceleration_noise * rng.standard_normal(n)
+        self._passes = np.zeros((len(stop_lines), n), dtype=np.bool_)  # who runs the light as it turns red
+        self._was_closed = [False] * len(stop_lines)
+        self._pending = [np.zeros(n)] * round(settings.reaction_time / step)
+        self._steps = 0
+
+    @property
+    def on_road(self) -> BoolArray:
+        return self.s < self._lanes.road.length
+
+    def order(self) -> LaneOrder:
+        """Who is where, of those still on the road."""
+        lanes = np.where(self.on_road[:, None], np.stack([self.lane, self._from], axis=1), -1)
+        return LaneOrder.of(self.s, lanes)
+
+    def lateral(self) -> tuple[FloatArray, FloatArray]:
+        """Offsets d (N,), m, and slopes dd/ds (N,)."""
+        d, slope = self._lanes.lateral(self.lane, self.s)
+        d0, slope0 = self._lanes.lateral(np.where(self._from >= 0, self._from, self.lane), self.s)
+        q = np.where(self._from >= 0, self._share, 1.0)
+        weight = smooth_step(q)
+        turn = smooth_step_slope(q) / self._change_length
+        return d0 + weight * (d - d0), slope0 + weight * (slope - slope0) + turn * (d - d0)
+
+    def step(self) -> None:
+        """Move everybody by one step of time."""
+        h = self._step
+        order = self.order()
+        d, slope = self.lateral()
+        metric = self._lanes.metric(self.lane, self.s, d, slope)
+        wish = self._wish(order, metric)
+        if self._steps % max(1, round(CHANGE_INTERVAL / h)) == 0:
+            self._start_changes(wish, order)
+        self._pending.append(wish)
+        acceleration = self._pending.pop(0)
+        decay = np.exp(-h / self._settings.noise_time)
+        kick = self._settings.acceleration_noise * np.sqrt(1 - decay**2)
+        self._noise = decay * self._noise + kick * self._rng.standard_normal(len(self.s))
+        noise = self._noise * np.clip(self.speed / 3.0, 0.0, 1.0)
+        speed = np.maximum(0.0, self.speed + h * np.maximum(acceleration + noise, -HARDEST_BRAKING))
+        travelled = h * (self.speed + speed) / 2
+        self.s = self.s + travelled / metric
+        self.speed = speed
+        self._share = self._share + travelled / self._change_length
+        self._from = np.where(self._share < 1, self._from, -1)
+        self.time += h
+        self._steps += 1
+
+    def _wish(self, order: LaneOrder, metric: FloatArray) -> FloatArray:
+        """Acceleration (N,), m/s^2, that the drivers want now; `metric` (N,) turns differences of s into metres."""
+        drivers, s, v = self._fleet.drivers, self.s, self.speed
+        limit = np.full(len(s), np.inf)
+        for zone in self._slow_zones:
+            limit = np.minimum(limit, zone.limit(self.lane, s, self.time))
+        pull = np.zeros(len(s))
+        for lane in (self.lane, self._from):
+            leader = order.ahead(lane, s)
+            gap = (s[leader] - s) * metric - (self._fleet.length[leader] + self._fleet.length) / 2
+            term = following_acceleration(v, np.maximum(gap, 0.0), v[leader], drivers)
+            pull = np.minimum(pull, np.where(leader >= 0, term, 0.0))
+        pull = np.minimum(pull, self._stops())
+        return np.maximum(free_acceleration(v, drivers, limit) + pull, -HARDEST_BRAKING)
+
+    def _stops(self) -> FloatArray:
+        """Interaction with red lights and with the end of the ending lane (N,), m/s^2."""
+        s, v, drivers = self.s, self.speed, self._fleet.drivers
+        pull = np.zeros(len(s))
+        for k, line in enumerate(self._stop_lines):
+            closed = line.closed(self.time)
+            gap = line.s - s - self._fleet.length / 2
+            if closed and not self._was_closed[k]:
+                self._passes[k] = v**2 / (2 * np.maximum(gap, 0.1)) > 1.5 * drivers.comfortable_deceleration
+            self._was_closed[k] = closed
+            if closed:
+                waits = np.isin(self.lane, line.lanes) & (gap > -0.5) & ~self._passes[k]
+                term = following_acceleration(v, np.maximum(gap, 0.0), np.zeros(len(s)), drivers)
+                pull = np.minimum(pull, np.where(waits, term, 0.0))
+        if self._lanes.ending >= 0:
+            gap = np.maximum(self._lanes.end - s - self._fleet.length / 2, 0.0)
+            term = following_acceleration(v, gap, np.zeros(len(s)), drivers)
+            pull = np.minimum(pull, np.where(self.lane == self._lanes.ending, term, 0.0))
+        return pull
+
+    def _start_changes(self, wish: FloatArray, order: LaneOrder) -> None:
+        ending = self.lane == self._lanes.ending if self._lanes.ending >= 0 else np.zeros(len(self.s), dtype=np.bool_)
+        free = (self._from < 0) & self.on_road & ((self.speed > SLOWEST_CHANGE) | ending)
+        gains, targets = [], []
+        for side in (-1, 1):
+            target = self._lanes.neighbour(self.lane, side)
+            target = np.where(free & self._lanes.may_change(self.lane, target, self.s), target, -1)
+            gains.append(advantage(self._fleet, self.s, self.speed, wish, target, ending, order, self._settings))
+            targets.append(target)
+        better = gains[1] > gains[0]
+        gain, target = np.where(better, gains[1], gains[0]), np.where(better, targets[1], targets[0])
+        rows = choose(gain, target)
+        self._from[rows] = self.lane[rows]
+        self.lane[rows] = target[rows]
+        self._share[rows] = 0.0
+        self._change_length[rows] = np.maximum(np.maximum(4.0 * self.speed[rows], 3.0 * self._fleet.length[rows]), 20.0)
+
+
+def drive(traffic: Traffic, steps: int) -> TrafficHistory:
+    """Let the vehicles drive and note `steps` + 1 moments, the present one first."""
+    columns: list[tuple[object, ...]] = []
+    for k in range(steps + 1):
+        if k:
+            traffic.step()
+        d, slope = traffic.lateral()
+        leader = traffic.order().ahead(traffic.lane, traffic.s)
+        columns.append((traffic.time, traffic.s, traffic.speed, traffic.lane.copy(), d, slope, traffic.on_road, leader))
+    return TrafficHistory(*(np.array(column) for column in zip(*columns, strict=True)))

@@ -1,0 +1,94 @@
+"""Where everything was: sampled motion of N objects, and what lies between the samples.
+
+Between two samples positions follow the cubic with the given positions and velocities at both ends (Hermite);
+velocities and headings are interpolated linearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.boxes import Boxes
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """N objects on the ground at T moments of equal spacing, in world coordinates.
+
+    id, label  (N,)
+    size       (N, 3) m
+    time       (T,) s
+    position   (T, N, 2) m
+    velocity   (T, N, 2) m/s
+    yaw        (T, N) rad, not wrapped
+    present    (T, N) whether the object exists
+    """
+
+    id: StrArray
+    label: StrArray
+    size: FloatArray
+    time: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    yaw: FloatArray
+    present: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def at(self, time: float) -> tuple[Boxes, BoolArray]:
+        """All N boxes at `time`, standing on the ground z = 0, and which of them exist (N,)."""
+        step = self.time[1] - self.time[0]
+        k = int(np.clip(np.floor((time - self.time[0]) / step), 0, len(self.time) - 2))
+        u = (time - self.time[k]) / step
+        p0, p1, v0, v1 = self.position[k], self.position[k + 1], self.velocity[k], self.velocity[k + 1]
+        position = (
+            (1 + 2 * u) * (1 - u) ** 2 * p0 + u**2 * (3 - 2 * u) * p1 + step * u * (1 - u) * ((1 - u) * v0 - u * v1)
+        )
+        boxes = Boxes(
+            self.label,
+            np.column_stack([position, self.size[:, 2] / 2]),
+            self.size,
+            (1 - u) * self.yaw[k] + u * self.yaw[k + 1],
+            (1 - u) * v0 + u * v1,
+        )
+        return boxes, self.present[k] & self.present[k + 1]
+
+    def select(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Trajectories:
+        """Some of the objects."""
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in ("id", "label", "size")},
+            **{name: getattr(self, name)[:, rows] for name in ("position", "velocity", "yaw", "present")},
+        )
+
+
+def together(parts: Sequence[Trajectories]) -> Trajectories:
+    """All objects of `parts`, which share their times."""
+    return Trajectories(
+        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("id", "label", "size")},
+        time=parts[0].time,
+        **{
+            name: np.concatenate([getattr(p, name) for p in parts], axis=1)
+            for name in ("position", "velocity", "yaw", "present")
+        },
+    )
+
+
+def standing(id: StrArray, boxes: Boxes, time: FloatArray) -> Trajectories:  # noqa: A002
+    """Objects that never move."""
+    shape = (len(time), len(boxes))
+    return Trajectories(
+        id,
+        boxes.label,
+        boxes.size,
+        time,
+        np.broadcast_to(boxes.position[:, :2], (*shape, 2)),
+        np.zeros((*shape, 2)),
+        np.broadcast_to(boxes.yaw, shape),
+        np.ones(shape, dtype=np.bool_),
+    )
