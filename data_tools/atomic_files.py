@@ -93,11 +93,13 @@ def _final(path: str | Path) -> Path:
     """`path` with links followed (so that they survive), in an existing folder."""
     try:
         final = Path(path).expanduser().resolve()
+        with suppress(FileNotFoundError, NotADirectoryError):
+            final.stat()  # asks the system, which may not like the name
         if final.parent.is_dir():
             return final
         reason = "is not a folder" if final.parent.exists() else "does not exist"
     except (OSError, RuntimeError) as error:  # name too long, a circle of links
-        raise InputError(f"{path}: not writable: {error}") from error
+        raise _not_writable(Path(path), error) from error
     raise InputError(f"{path}: not writable: the folder {final.parent} {reason}")
 
 
@@ -105,8 +107,9 @@ def _temporary(final: Path) -> Path:
     return final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.tmp")
 
 
-def _not_writable(path: Path, error: OSError) -> InputError:
-    return InputError(f"{path}: not writable: {error.strerror or error}; expected a folder one may write to")
+def _not_writable(path: Path, error: Exception) -> InputError:
+    reason = getattr(error, "strerror", None) or error
+    return InputError(f"{path}: not writable: {reason}; expected a folder one may write to")
 
 
 @contextmanager

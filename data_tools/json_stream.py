@@ -100,9 +100,12 @@ class JsonStream:
             piece = self._file.read(max(self._piece, len(rest)))
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{self._name}: expected JSON in UTF-8: {error}") from error
+        if not piece:
+            self._ended = True
+            return False
         self._before += self._at
-        self._text, self._at, self._ended = rest + piece, 0, not piece
-        return bool(piece)
+        self._text, self._at = rest + piece, 0
+        return True
 
     def _fault(self, what: str) -> InputError:
         here = self._before + self._at

@@ -47,9 +47,13 @@ def read_annotations(folder: Path, scenes: Mapping[str, SceneRecord]) -> dict[st
         if label is not None:
             name, k = moments[sample]
             try:
-                rows[name].add(k, instance, label, (*translation, *size, *rotation), lidar + radar)
-            except TypeError as error:
-                raise InputError(f"{path}: sample {sample}, instance {instance}: expected numbers") from error
+                numbers = (*translation, *size, *rotation)
+                if (len(translation), len(size), len(rotation)) != (3, 3, 4):
+                    raise TypeError("lengths")
+                rows[name].add(k, instance, label, numbers, lidar + radar)
+            except (TypeError, OverflowError) as error:
+                where = f"{path}: sample {sample}, instance {instance}"
+                raise InputError(f"{where}: expected 3, 3 and 4 numbers as translation, size, rotation") from error
     result = {}
     for name, scene in scenes.items():
         with located(f"{path}: scene {name}"):
@@ -79,8 +83,6 @@ class _Rows:
     points: array[int] = field(default_factory=lambda: array("q"))
 
     def add(self, sample: int, instance: str, label: str, numbers: tuple[float, ...], points: int) -> None:
-        if len(numbers) != 10:
-            raise InputError(f"instance {instance}: expected 3, 3 and 4 numbers of translation, size and rotation")
         self.sample.append(sample)
         self.instance.append(instance)
         self.label.append(label)

@@ -71,7 +71,7 @@ class ResultColumns:
         if strangers:
             raise InputError(f"{where}: sample_token: expected the sample's own, got {strangers[0]['sample_token']!r}")
         for name, column in columns.items():
-            self._numbers[name].append(_table(f"{where}: ", name, column))
+            self._numbers[name].append(_table(f"{where}: ", self._task, name, column))
         for name, names in ((label, labels), ("tracking_id", ids)):
             for i, value in enumerate(names):
                 if not isinstance(value, str):
@@ -89,7 +89,7 @@ class ResultColumns:
             (
                 "size",
                 (np.isfinite(columns["size"]) & (columns["size"] > 0)).all(axis=1),
-                "positive width, length, height",
+                "positive width, length, height in m",
             ),
             ("rotation", np.abs(norm - 1) <= 1e-3, "a unit quaternion (w, x, y, z)"),
             ("velocity", ~np.isinf(columns["velocity"]).any(axis=1), "finite numbers, or NaN for unknown"),
@@ -131,7 +131,7 @@ def _velocity(box: dict[str, Any]) -> Any:
     return _UNKNOWN if velocity is None else velocity
 
 
-def _table(where: str, name: str, column: Sequence[Any]) -> FloatArray:
+def _table(where: str, task: Task, name: str, column: Sequence[Any]) -> FloatArray:
     """Rows of numbers as an array of the field's width."""
     width = _NUMBERS[name]
     try:
@@ -145,7 +145,10 @@ def _table(where: str, name: str, column: Sequence[Any]) -> FloatArray:
     for i, row in enumerate(column):
         numbers = isinstance(row, list | tuple) and all(type(x) in (int, float) for x in row)
         if not numbers or len(row) != width:
-            raise InputError(f"{where}box {i}: {name}: expected {width} numbers, got {str(row)[:60]}")
+            field = f"{task}_score" if name == "score" else name
+            numerals = "a number" if width == 1 else f"{width} numbers"
+            got = row[0] if name == "score" else row
+            raise InputError(f"{where}box {i}: {field}: expected {numerals}, got {str(got)[:60]!r}")
     raise InputError(f"{where}{name}: expected numbers of ordinary magnitude")
 
 
