@@ -11,20 +11,36 @@ from data_tools.metrics.bootstrap import (
 from data_tools.metrics.consistency import coverage, coverages, nees, nees_band
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.matching import Matching, match_scene
+from data_tools.metrics.nuscenes_tracking import (
+    NuScenesTrackingMetrics,
+    NuScenesTrackingScene,
+    NuScenesTrackingSettings,
+    RecallCurves,
+    TrackingFigures,
+    nuscenes_tracking_metrics,
+)
 from data_tools.metrics.scene import SceneMetrics, SceneMetricSettings, scene_metrics, scene_metrics_by_label
+from data_tools.metrics.track_table import TrackTable
 
 __all__ = [
     "ErrorSample",
     "Interval",
     "Matching",
+    "NuScenesTrackingMetrics",
+    "NuScenesTrackingScene",
+    "NuScenesTrackingSettings",
+    "RecallCurves",
     "SceneMetricSettings",
     "SceneMetrics",
+    "TrackTable",
+    "TrackingFigures",
     "coverage",
     "coverages",
     "difference",
     "match_scene",
     "nees",
     "nees_band",
+    "nuscenes_tracking_metrics",
     "paired_bootstrap",
     "ratio_of_sums",
     "relative_change",

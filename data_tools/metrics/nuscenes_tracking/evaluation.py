@@ -1,0 +1,203 @@
+"""The nuScenes tracking metrics: AMOTA, AMOTP and the figures at the best threshold, per class and over all.
+
+For each class, thresholds on the track score are chosen such that recall takes 40 values from 0.1 to 1, by
+interpolating the scores of the matched boxes; a threshold that several recalls share is run once and counted several
+times; where a recall is not reached the worst value is charged. Written anew from the task's definition and equal to
+the official evaluation (`nuscenes.eval.tracking`, configuration `tracking_nips_2019`), whose peculiarities it keeps.
+
+Sources: https://www.nuscenes.org/tracking; Caesar et al., nuScenes, CVPR 2020; Weng et al., AB3DMOT, IROS 2020.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from data_tools.metrics.nuscenes_tracking.figures import RecallCurves, TrackingFigures
+from data_tools.metrics.nuscenes_tracking.settings import NuScenesTrackingSettings
+from data_tools.metrics.nuscenes_tracking.sightings import sightings
+from data_tools.metrics.nuscenes_tracking.spans import span_figures
+from data_tools.metrics.nuscenes_tracking.sweep import Rows, Sweep, candidate_pairs, sweep
+from data_tools.metrics.track_table import TrackTable
+from saga_fg.arrays import FloatArray, checked
+from saga_fg.boxes import Boxes
+from saga_fg.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class NuScenesTrackingScene:
+    """One scene to score, everything in world coordinates.
+
+    timestamps    (K,) s, increasing
+    ego_position  (K, 2) of the vehicle when its LiDAR fired, m
+    truth         true boxes with at least one LiDAR or radar point
+    found         the tracker's boxes
+    racks         boxes of bicycle racks at each of the K moments; empty: there are none
+    """
+
+    timestamps: FloatArray
+    ego_position: FloatArray
+    truth: TrackTable
+    found: TrackTable
+    racks: Sequence[Boxes] = ()
+
+    def __post_init__(self) -> None:
+        timestamps = checked("timestamps", self.timestamps, (None,))
+        moments = len(timestamps)
+        object.__setattr__(self, "timestamps", timestamps)
+        object.__setattr__(self, "ego_position", checked("ego_position", self.ego_position, (moments, 2)))
+        if (np.diff(timestamps) <= 0).any():
+            raise InputError("timestamps: expected increasing times")
+        if len(self.racks) not in (0, moments):
+            raise InputError(f"racks: expected one entry per moment ({moments}) or none, got {len(self.racks)}")
+        for name in ("truth", "found"):
+            last = int(getattr(self, name).moment.max(initial=-1))
+            if last >= moments:
+                raise InputError(f"{name}: expected moments below {moments}, got {last}")
+
+
+@dataclass(frozen=True, eq=False)
+class NuScenesTrackingMetrics:
+    """The result: `overall` figures, figures `per_class`, and the `curves` they are drawn from (scored classes)."""
+
+    overall: TrackingFigures
+    per_class: Mapping[str, TrackingFigures]
+    curves: Mapping[str, RecallCurves]
+
+
+def nuscenes_tracking_metrics(
+    scenes: Sequence[NuScenesTrackingScene], settings: NuScenesTrackingSettings | None = None
+) -> NuScenesTrackingMetrics:
+    """Score the tracks of `scenes` together. Classes without true boxes have no figures (NaN) and no curves."""
+    settings = settings or NuScenesTrackingSettings()
+    class_range = dict(settings.class_range)
+    true, found = (
+        Rows.of(
+            [
+                sightings(table, scene.ego_position, scene.racks, scene.timestamps, class_range)
+                for scene in scenes
+                for table in [getattr(scene, name)]
+            ]
+        )
+        for name in ("truth", "found")
+    )
+    pairs = candidate_pairs(true, found, settings.gate)
+    everything = sweep(true, found, pairs, np.full((len(class_range), 1), -np.inf))
+    recalls = np.linspace(settings.min_recall, 1, settings.thresholds).round(12)
+    wanted = np.stack(
+        [_thresholds(true, found, everything, label, recalls) for label in range(len(class_range))]
+    ).reshape(len(class_range), settings.thresholds)
+    matched = sweep(true, found, pairs, _without_repeats(wanted))
+    per_class, curves = {}, {}
+    for label, name in enumerate(class_range):
+        if (true.sightings.label == label).any():
+            columns = _columns(true, found, matched, wanted[label], label, settings)
+            per_class[name] = _summary(columns, settings)
+            curves[name] = _curves(columns, recalls[::-1], wanted[label])
+        else:
+            per_class[name] = TrackingFigures.undefined()
+    return NuScenesTrackingMetrics(TrackingFigures.over_classes(per_class.values()), per_class, curves)
+
+
+def _thresholds(true: Rows, found: Rows, everything: Sweep, label: int, recalls: FloatArray) -> FloatArray:
+    """Score thresholds (T,) of a class for the recalls from high to low, NaN where a recall is not reached."""
+    rows = true.sightings.label == label
+    matches = rows & (everything.partner[:, 0] >= 0) & ~everything.switched[:, 0]
+    scores = np.sort(found.sightings.score[everything.partner[matches, 0]])[::-1]
+    if len(scores) == 0:
+        return np.full(len(recalls), np.nan)
+    reached = np.arange(1, len(scores) + 1) / int(rows.sum())
+    thresholds = np.interp(recalls, reached, scores, right=0)
+    thresholds[recalls > reached.max()] = np.nan
+    return np.asarray(thresholds[::-1])
+
+
+def _without_repeats(thresholds: FloatArray) -> FloatArray:
+    """Thresholds (classes, T), in order, with NaN in place of each repeated one: nothing is present there."""
+    repeated = np.diff(thresholds, axis=1, prepend=np.nan) == 0
+    return np.where(repeated, np.nan, thresholds)
+
+
+def _columns(
+    true: Rows, found: Rows, matched: Sweep, thresholds: FloatArray, label: int, settings: NuScenesTrackingSettings
+) -> dict[str, FloatArray]:
+    """The figures of one class at each threshold (T,), NaN where the recall is not reached; a repeat like its first."""
+    rows = np.flatnonzero(true.sightings.label == label)
+    rows = rows[np.lexsort((true.sightings.moment[rows], true.sightings.identity[rows]))]
+    partner, switched = matched.partner[rows], matched.switched[rows]
+    tracked = partner >= 0
+    detections, ids = tracked.sum(axis=0), switched.sum(axis=0)
+    tp, fn = detections - ids, len(rows) - detections
+    frames, present = _frames_and_boxes(true, found, thresholds, label)
+    fp = present - detections
+    spans = span_figures(tracked, true.sightings.identity[rows], settings.sample_period)
+    gt = len(rows)
+    recall = tp / gt
+    with np.errstate(invalid="ignore", divide="ignore"):
+        motar = np.maximum(0.0, 1.0 - ((fn + ids + fp) - (1.0 - recall) * gt) / (recall * gt))
+        columns = {
+            "recall": detections / gt,
+            "motar": np.where(tp > 0, motar, np.nan),
+            "gt": np.full(len(thresholds), gt),
+            "mota": np.maximum(0.0, 1.0 - (fn + ids + fp) / gt),
+            "motp": matched.distance[label] / detections,
+            "mt": spans.mostly_tracked,
+            "ml": spans.mostly_lost,
+            "faf": fp / frames * 100.0,
+            "tp": tp,
+            "fp": fp,
+            "fn": fn,
+            "ids": ids,
+            "frag": spans.fragments,
+            "tid": spans.initialisation,
+            "lgd": spans.longest_gap,
+        }
+    if np.isnan(thresholds).all():
+        worst = _never_matched(gt, len(np.unique(true.sightings.identity[rows])), settings)
+        return {name: np.full(len(thresholds), worst[name]) for name in columns}
+    source = np.maximum.accumulate(
+        np.where(np.diff(thresholds, prepend=np.nan) == 0, 0, np.arange(len(thresholds)))
+    )  # the first column of each run of equal thresholds
+    reached = ~np.isnan(thresholds)
+    return {name: np.where(reached, column[source], np.nan) for name, column in columns.items()}
+
+
+def _frames_and_boxes(true: Rows, found: Rows, thresholds: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
+    """At each threshold (T,): frames with a true or found box of the class, and found boxes."""
+    scenes = int(max(true.scene.max(initial=0), found.scene.max(initial=0))) + 1
+    frame_of = [rows.sightings.moment * scenes + rows.scene for rows in (true, found)]
+    with_truth = np.unique(frame_of[0][true.sightings.label == label])
+    rows = np.flatnonzero(found.sightings.label == label)
+    present = found.sightings.score[rows][:, None] >= thresholds
+    elsewhere = ~np.isin(frame_of[1][rows], with_truth)
+    frames = np.full(len(thresholds), float(len(with_truth)))
+    if elsewhere.any():
+        start = np.flatnonzero(np.diff(frame_of[1][rows][elsewhere], prepend=-1))
+        frames += np.logical_or.reduceat(present[elsewhere], start, axis=0).sum(axis=0)
+    return frames, present.sum(axis=0).astype(np.float64)
+
+
+def _never_matched(gt: int, objects: int, settings: NuScenesTrackingSettings) -> dict[str, float]:
+    """The figures charged to a class of which no box is ever matched."""
+    unknown = dict.fromkeys(("fp", "ids", "frag"), float("nan"))
+    nothing = dict.fromkeys(("recall", "motar", "mota", "mt", "tp"), 0.0)
+    duration = dict.fromkeys(("tid", "lgd"), settings.worst_duration)
+    totals = {"gt": float(gt), "fn": float(gt), "ml": float(objects)}
+    return {**unknown, **nothing, **duration, **totals, "motp": settings.worst_motp, "faf": settings.worst_faf}
+
+
+def _summary(columns: Mapping[str, FloatArray], settings: NuScenesTrackingSettings) -> TrackingFigures:
+    """The figures at the first threshold with the highest MOTA, and the means over the sweep."""
+    best = int(np.nanargmax(columns["mota"]))
+    return TrackingFigures(
+        amota=float(np.mean(np.nan_to_num(columns["motar"], nan=0.0))),
+        amotp=float(np.mean(np.nan_to_num(columns["motp"], nan=settings.worst_motp))),
+        **{name: float(column[best]) for name, column in columns.items()},
+    )
+
+
+def _curves(columns: Mapping[str, FloatArray], recalls: FloatArray, thresholds: FloatArray) -> RecallCurves:
+    shown = {field.name: columns[field.name] for field in fields(RecallCurves) if field.name in columns}
+    return RecallCurves(hypothetical_recall=recalls.copy(), score=thresholds, **shown)

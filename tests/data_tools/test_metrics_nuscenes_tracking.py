@@ -1,0 +1,326 @@
+"""The nuScenes tracking metrics: cases worked out by hand, and a plain loop-by-loop reading of the definition."""
+
+import math
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
+
+from data_tools.metrics import (
+    NuScenesTrackingScene,
+    NuScenesTrackingSettings,
+    TrackingFigures,
+    TrackTable,
+    nuscenes_tracking_metrics,
+)
+from saga_fg import Annotations, Boxes, InputError, Tracks
+
+
+def table(rows):
+    """TrackTable from (moment, id, label, x, y, score), in order of moment."""
+    moment, names, label, x, y, score = zip(*rows, strict=True) if rows else ((),) * 6
+    position = np.stack([x, y, np.zeros(len(x))], axis=1) if rows else np.empty((0, 3))
+    return TrackTable(
+        np.array(moment, dtype=np.int64), np.array(names, dtype=str), Boxes.of(label, position), np.array(score, float)
+    )
+
+
+def scene(truth, found, moments=None, **options):
+    """A scene at 2 Hz with the vehicle in the origin."""
+    n = moments or 1 + max(row[0] for row in (*truth, *found))
+    return NuScenesTrackingScene(
+        np.arange(n) * 0.5,
+        np.zeros((n, 2)),
+        table([(*row, 0.0)[:6] for row in truth]),
+        table(found),
+        **options,
+    )
+
+
+def figures(truth, found, label="car", **options):
+    return nuscenes_tracking_metrics([scene(truth, found, **options)]).per_class[label]
+
+
+CAR = [(k, "a", "car", 10.0 + k, 0.0) for k in range(4)]
+
+
+def test_perfect_tracks():
+    f = figures(CAR, [(*row, 0.9) for row in CAR])
+    assert (f.amota, f.mota, f.motar, f.recall) == (1.0, 1.0, 1.0, 1.0)
+    assert f.motp == pytest.approx(0.0, abs=1e-6)
+    assert (f.gt, f.tp, f.fp, f.fn, f.ids, f.frag, f.mt, f.ml, f.faf, f.tid, f.lgd) == (4, 4, 0, 0, 0, 0, 1, 0, 0, 0, 0)
+
+
+def test_counts_by_hand():
+    # The object is found at moments 1 and 3 by different tracks, 0.5 m off; a false alarm at moment 0.
+    found = [
+        (0, "x", "car", 40.0, 0.0, 0.9),
+        (1, "t", "car", 11.0, 0.5, 0.9),
+        (3, "u", "car", 13.0, 0.5, 0.9),
+    ]
+    f = figures(CAR, found)
+    assert (f.gt, f.tp, f.fp, f.fn, f.ids, f.frag) == (4, 1, 1, 2, 1, 1)
+    assert f.motp == pytest.approx(0.5)
+    assert f.recall == pytest.approx(0.5)
+    assert f.mota == pytest.approx(0.0)
+    assert f.motar == 0.0  # 1 - (2 + 1 + 1 - 0.75 * 4) / 1
+    assert (f.mt, f.ml) == (0, 0)
+    assert f.faf == pytest.approx(25.0)
+    assert (f.tid, f.lgd) == (0.5, 0.5)
+    # One match that is no switch: recall 0.25 is reached, the 40 values up to 1 beyond it are not.
+    reached = np.sum(np.linspace(0.1, 1, 40) <= 0.25)
+    assert f.amota == 0.0
+    assert f.amotp == pytest.approx((reached * 0.5 + (40 - reached) * 2.0) / 40)
+
+
+def test_a_low_score_is_left_out_at_low_recall():
+    truth = [(k, name, "car", 10.0 * (1 + n), 0.0) for k in range(2) for n, name in enumerate("ab")]
+    found = [(k, name, "car", 10.0 * (1 + n), 0.0, 0.9 - 0.5 * n) for k in range(2) for n, name in enumerate("ab")]
+    found += [(k, "z", "car", 40.0, 0.0, 0.5) for k in range(2)]  # false, between the two in score
+    metrics = nuscenes_tracking_metrics([scene(truth, sorted(found))])
+    curve = metrics.curves["car"]
+    assert curve.hypothetical_recall[[0, -1]].tolist() == [1.0, 0.1]
+    assert set(curve.fp) == {0.0, 2.0}
+    assert (np.diff(curve.score) >= 0).all()
+    assert metrics.per_class["car"].mota == pytest.approx(
+        0.5
+    )  # 2 false alarms of 4, or 2 of 4 missed: high recall wins
+    assert metrics.per_class["car"].recall == 1.0
+
+
+def test_gaps_are_filled_with_the_official_weights():
+    # Truth is unseen at moment 1, 1 / 4 of the way from x = 10 to x = 20; the official weights put it at 3 / 4.
+    truth = [(0, "a", "car", 10.0, 0.0), (4, "a", "car", 20.0, 0.0)]
+    found = [(1, "t", "car", 17.5, 0.0, 0.9)]
+    f = figures(truth, found)
+    assert (f.gt, f.tp) == (5, 1)
+    assert f.motp == pytest.approx(0.0, abs=1e-6)
+
+
+def test_gaps_of_tracks_are_filled_too():
+    found = [(0, "t", "car", 10.0, 0.0, 0.9), (3, "t", "car", 13.0, 0.0, 0.5)]
+    f = figures(CAR, found)
+    assert (f.tp, f.fn) == (4, 0)
+    assert f.motp == pytest.approx(0.5)  # 12 for 11 and 11 for 12 inside, exact at the ends
+
+
+def test_range_depends_on_the_class_and_is_measured_from_the_vehicle():
+    truth = [(0, name, name, 45.0, 0.0) for name in ("car", "pedestrian")]
+    metrics = nuscenes_tracking_metrics([scene(truth, [])])
+    assert metrics.per_class["car"].gt == 1
+    assert math.isnan(metrics.per_class["pedestrian"].gt)
+    limit = NuScenesTrackingSettings(class_range={"car": 45.0})
+    assert math.isnan(nuscenes_tracking_metrics([scene(truth, [])], limit).per_class["car"].gt)
+
+
+def test_bicycles_in_a_rack_are_left_out_on_both_sides():
+    rack = Boxes.of(["rack"], [(10, 0, 0)], [(4, 1, 2)], [math.pi / 2])
+    truth = [(0, "in", "bicycle", 10.4, 1.9), (0, "out", "bicycle", 11.9, 0.0), (0, "car", "car", 10.0, 1.0)]
+    found = [(0, "t", "bicycle", 10.4, -1.9, 0.9)]
+    metrics = nuscenes_tracking_metrics([scene(truth, found, racks=[rack])])
+    assert metrics.per_class["bicycle"].gt == 1
+    assert metrics.per_class["bicycle"].recall == 0
+    assert metrics.per_class["car"].gt == 1
+    assert nuscenes_tracking_metrics([scene(truth, found)]).per_class["bicycle"].gt == 2
+
+
+def test_a_class_that_is_never_matched_gets_the_worst_figures():
+    f = figures(CAR, [(0, "t", "car", 30.0, 0.0, 0.9)])
+    assert (f.amota, f.amotp, f.motp, f.recall, f.tp, f.fn, f.ml, f.faf, f.tid, f.lgd) == (
+        0,
+        2,
+        2,
+        0,
+        0,
+        4,
+        1,
+        500,
+        20,
+        20,
+    )
+    assert math.isnan(f.fp)
+    assert math.isnan(f.ids)
+    assert math.isnan(f.frag)
+
+
+def test_classes_without_truth_do_not_count():
+    metrics = nuscenes_tracking_metrics([scene(CAR, [(*row, 0.9) for row in CAR] + [(3, "b", "bus", 5.0, 5.0, 0.9)])])
+    assert metrics.overall.amota == 1.0
+    assert metrics.overall.fp == 0
+    assert math.isnan(metrics.per_class["bus"].amota)
+    assert set(metrics.curves) == {"car"}
+
+
+def test_nothing_at_all():
+    metrics = nuscenes_tracking_metrics([scene([], [], moments=2)])
+    assert math.isnan(metrics.overall.amota)
+    assert metrics.overall.gt == 0
+
+
+def test_tables_from_annotations_and_tracks():
+    boxes = Boxes.of(["car", "car"], [(1, 2, 0), (3, 4, 0)])
+    truth = TrackTable.of_annotations(
+        [Annotations(np.array(["a", "b"]), boxes, np.array([True, False]))] * 2, hidden=False
+    )
+    assert truth.id.tolist() == ["a", "a"]
+    assert truth.moment.tolist() == [0, 1]
+    covariance = np.tile(np.eye(2), (2, 1, 1))
+    tracks = Tracks(0.0, np.array([4, 5]), boxes, np.array([0.5, 0.7]), covariance, covariance, np.zeros(2))
+    found = TrackTable.of_tracks([tracks, Tracks.empty(1.0), tracks])
+    assert found.id.tolist() == ["4", "5", "4", "5"]
+    assert found.moment.tolist() == [0, 0, 2, 2]
+    assert len(TrackTable.of_tracks([])) == len(TrackTable.of_annotations([])) == 0
+
+
+@pytest.mark.parametrize(
+    ("rows", "text"),
+    [
+        ([(1, "a", "car", 0, 0, 0), (0, "b", "car", 0, 0, 0)], "never decrease"),
+        ([(0, "a", "car", 0, 0, 0), (1, "b", "car", 0, 0, 0), (1, "b", "car", 1, 0, 0)], r"id\[2\].*'b' occurs twice"),
+    ],
+)
+def test_bad_tables(rows, text):
+    with pytest.raises(InputError, match=text):
+        table(rows)
+
+
+def test_bad_scenes():
+    with pytest.raises(InputError, match="found: expected moments below 2, got 3"):
+        scene([], [(3, "t", "car", 0.0, 0.0, 0.9)], moments=2)
+    with pytest.raises(InputError, match="racks"):
+        scene([], [], moments=2, racks=[Boxes.empty()])
+    with pytest.raises(InputError, match="increasing"):
+        NuScenesTrackingScene(np.zeros(2), np.zeros((2, 2)), table([]), table([]))
+
+
+def plain_match(truth, found, threshold):
+    """CLEAR matching of one scene, one threshold, one class, object by object.
+
+    truth and found: {moment: {id: (x, y)}}, found with scores: {moment: {id: (x, y, score)}}. Returns, per object, its
+    events in order: None (missed) or (track, switched, distance); the scores of the plain matches; false alarms.
+    """
+    memory, events, scores, false_alarms = {}, {}, [], 0
+    for k in sorted(set(truth) | set(found)):
+        objects = truth.get(k, {})
+        tracks = {i: v for i, v in found.get(k, {}).items() if v[2] >= threshold}
+        pairs = {}
+        for o, xy in objects.items():
+            t = memory.get(o)
+            if t in tracks and t not in pairs.values() and math.dist(xy, tracks[t][:2]) < 2.0:
+                pairs[o] = t
+        kept = set(pairs)
+        left = [o for o in objects if o not in pairs]
+        free = [t for t in tracks if t not in pairs.values()]
+        cost = np.array([[math.dist(objects[o], tracks[t][:2]) for t in free] for o in left]).reshape(
+            len(left), len(free)
+        )
+        for r, c in zip(*linear_sum_assignment(np.where(cost < 2.0, cost, 1e6)), strict=True):
+            if cost[r, c] < 2.0:
+                pairs[left[r]] = free[c]
+        for o, xy in objects.items():
+            if o not in pairs:
+                events.setdefault(o, []).append(None)
+                continue
+            t = pairs[o]
+            switched = o not in kept and o in memory
+            events.setdefault(o, []).append((t, switched, math.dist(xy, tracks[t][:2])))
+            if not switched:
+                scores.append(tracks[t][2])
+            memory[o] = t
+        false_alarms += len(tracks) - len(pairs)
+    return events, scores, false_alarms
+
+
+def plain_figures(truth, found):
+    """The figures of one class in one scene without gaps, by the definition, one threshold after the other."""
+    gt = sum(map(len, truth.values()))
+    _, scores, _ = plain_match(truth, found, -math.inf)
+    scores = sorted(scores, reverse=True)
+    reached = [(n + 1) / gt for n in range(len(scores))]
+    rows = []
+    for recall in np.linspace(0.1, 1, 40).round(12)[::-1]:
+        if not scores or recall > reached[-1]:
+            rows.append(None)
+            continue
+        threshold = float(np.interp(recall, reached, scores))
+        events, _, fp = plain_match(truth, found, threshold)
+        hits = [event for sequence in events.values() for event in sequence if event]
+        ids = sum(switched for _, switched, _ in hits)
+        tp, fn = len(hits) - ids, gt - len(hits)
+        frag, delays, gaps, ratios = 0, [], [], []
+        for sequence in events.values():
+            shown = "".join("x" if event else "." for event in sequence)
+            ratios.append(shown.count("x") / len(shown))
+            frag += shown.strip(".").count("x.")
+            if "x" in shown:
+                delays.append(0.5 * shown.index("x"))
+                gaps.append(0.5 * max(map(len, shown.split("x"))))
+        present = {k for k, tracks in found.items() if any(v[2] >= threshold for v in tracks.values())}
+        frames = len({k for k, objects in truth.items() if objects} | present)
+        rows.append(
+            {
+                "recall": len(hits) / gt,
+                "motar": max(0.0, 1 - (fn + ids + fp - (gt - tp)) / tp) if tp else math.nan,
+                "gt": gt,
+                "mota": max(0.0, 1 - (fn + ids + fp) / gt),
+                "motp": sum(d for _, _, d in hits) / len(hits) if hits else math.nan,
+                "mt": sum(r >= 0.8 for r in ratios),
+                "ml": sum(r < 0.2 for r in ratios),
+                "faf": 100 * fp / frames,
+                "tp": tp,
+                "fp": fp,
+                "fn": fn,
+                "ids": ids,
+                "frag": frag,
+                "tid": float(np.mean(delays)) if delays else math.nan,
+                "lgd": float(np.mean(gaps)) if gaps else math.nan,
+            }
+        )
+    run = [row for row in rows if row]
+    if not run:
+        return None
+    best = max(run, key=lambda row: row["mota"])
+    amota = np.mean([0.0 if row is None or math.isnan(row["motar"]) else row["motar"] for row in rows])
+    amotp = np.mean([2.0 if row is None or math.isnan(row["motp"]) else row["motp"] for row in rows])
+    return TrackingFigures(amota=float(amota), amotp=float(amotp), **best)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_equals_a_plain_reading_of_the_definition(seed):
+    rng = np.random.default_rng(seed)
+    moments, objects, false = rng.integers(1, 9), rng.integers(1, 7), rng.integers(0, 4)
+    start, speed = rng.uniform(-4, 4, (objects, 2)), rng.uniform(-1, 1, (objects, 2))
+    score = rng.integers(0, 8, size=4 * objects + false) / 8  # few values: thresholds repeat; means are exact
+    truth, found = {}, {}
+    names = list(range(objects))
+    for k in range(moments):
+        truth[k] = {o: tuple(start[o] + k * speed[o]) for o in range(objects)}
+        swap = rng.random(objects) < 0.2
+        names = [n + objects if s and n + objects < 4 * objects else n for n, s in zip(names, swap, strict=True)]
+        seen = {names[o]: tuple(truth[k][o] + rng.normal(0, 0.7, 2)) for o in range(objects)}
+        seen |= {4 * objects + f: tuple(rng.uniform(-5, 5, 2)) for f in range(false)}
+        found[k] = {t: (*xy, float(score[t])) for t, xy in seen.items()}
+    expected = plain_figures(truth, found)
+    f = figures(
+        [(k, str(o), "car", *xy) for k, row in truth.items() for o, xy in row.items()],
+        [(k, str(t), "car", *row) for k, tracks in found.items() for t, row in tracks.items()],
+    )
+    if expected is None:
+        assert f.amota == 0
+        assert f.amotp == 2
+        return
+    for field in fields(TrackingFigures):
+        assert getattr(f, field.name) == pytest.approx(getattr(expected, field.name), abs=1e-6, nan_ok=True), field.name
+
+
+def test_scenes_are_scored_together_and_identities_are_apart():
+    # The same names in both scenes, by different tracks: no switch between scenes.
+    first = scene(CAR, [(*row, 0.9) for row in CAR])
+    second = scene(CAR, [(k, "other", *rest, 0.8) for k, _, *rest in CAR])
+    metrics = nuscenes_tracking_metrics([first, second])
+    assert metrics.overall.ids == 0
+    assert metrics.overall.tp == 8
+    assert metrics.overall.mt == 2
