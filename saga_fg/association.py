@@ -1,0 +1,59 @@
+"""Association: which detection belongs to which track.
+
+    d^2 = (z - H m)^T S^-1 (z - H m),   S = H P H^T + R
+
+A pair is possible where d^2 is inside the chi-square gate and the centres are closer than a cap; the assignment is the
+one of least total cost, where an unmatched track or detection costs as much as a pair at the gate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """track (k,) and detection (k,): rows that belong together; distance (k,): their d^2."""
+
+    track: IntArray
+    detection: IntArray
+    distance: FloatArray
+
+
+def mahalanobis(
+    position: FloatArray, covariance: FloatArray, measured: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Squared distances and log det S, both (n, m), of n predicted positions and m measured ones in the plane.
+
+    position (n, 2), covariance (n, 2, 2), measured (m, 2), noise (m, 2, 2)
+    """
+    dx = measured[None, :, 0] - position[:, None, 0]
+    dy = measured[None, :, 1] - position[:, None, 1]
+    S = covariance[:, None] + noise[None]
+    a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
+    det = a * c - b * b
+    return (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det, np.log(det)
+
+
+def gate(probability: float, dim: int = 2) -> float:
+    """The chi-square gate that lets `probability` of the true pairs through."""
+    return float(chi2.ppf(probability, dim))
+
+
+def assign(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the assignment of least cost (n, m) among possible pairs.
+
+    Leaving a pair out costs `unmatched` (a number, or one per track (n, 1)); only pairs cheaper than that are matched.
+    """
+    if not possible.any():
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    gain = np.where(possible, np.minimum(cost - unmatched, 0.0), 0.0)
+    rows, columns = linear_sum_assignment(gain)
+    matched = gain[rows, columns] < 0
+    return rows[matched].astype(np.int64), columns[matched].astype(np.int64)

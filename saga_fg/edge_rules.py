@@ -1,0 +1,142 @@
+r"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
+
+    rate_ij = rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
+
+A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the tracker in place of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.geometry import wrap_angle
+from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
+from saga_fg.scene_graph import Edges, SceneGraph
+from saga_fg.settings import setting, settings_group
+
+VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
+
+
+class Pairs(NamedTuple):
+    """E directed edges source -> target (rows of a `NodeTable`) with their rates, 1/s."""
+
+    target: IntArray
+    source: IntArray
+    rate: FloatArray
+
+
+class EdgeRule(Protocol):
+    """Chooses edges from the estimates at the start of an interval."""
+
+    @property
+    def interaction(self) -> Interaction: ...
+
+    def pairs(self, nodes: NodeTable) -> Pairs: ...
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Moving objects that are close and head the same way share something, by default their velocity."""
+
+    interaction: SharedVelocity | CarFollowing = settings_group(SharedVelocity, "interaction function of the edges")
+    rate: float = setting(0.3, "strength of an edge at distance and heading difference zero, 1/s")
+    distance_scale: float = setting(8.0, "sigma of the distance kernel, m")
+    heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
+    speed_scale: float = setting(3.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
+    max_distance: float = setting(20.0, "no edge beyond this distance, m")
+    min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
+    max_degree: int = setting(4, "edges kept per influenced node, strongest first")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        able = np.isin(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
+        target, source, distance = _close_pairs(nodes.position, able, self.max_distance)
+        turn = wrap_angle(nodes.heading[target] - nodes.heading[source])
+        difference = np.hypot(*(nodes.velocity[target] - nodes.velocity[source]).T)
+        exponent = (distance / self.distance_scale) ** 2 + (turn / self.heading_scale) ** 2
+        rate = self.rate * np.exp(-(exponent + (difference / self.speed_scale) ** 2) / 2)
+        return _strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
+
+
+@dataclass(frozen=True)
+class Following:
+    """A vehicle is led by the nearest vehicle ahead in its lane, as far as headings tell the lane."""
+
+    interaction: SharedVelocity | CarFollowing = settings_group(CarFollowing, "interaction function of the edges")
+    rate: float = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
+    max_gap: float = setting(40.0, "no leader further ahead than this, centre to centre, m")
+    gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
+    lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
+    heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        able = np.isin(nodes.label, self.classes)
+        target, source, _ = _close_pairs(nodes.position, able, self.max_gap)
+        offset = nodes.position[source] - nodes.position[target]
+        heading = nodes.heading[target]
+        c, s = np.cos(heading), np.sin(heading)
+        ahead, lateral = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
+        turn = wrap_angle(heading - nodes.heading[source])
+        # in a bend the leader has turned by `turn`: its lateral offset is that of the arc, ahead * tan(turn / 2)
+        lateral = lateral + ahead * np.tan(np.clip(turn, -1.5, 1.5) / 2)
+        led = (ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(turn) < 3 * self.heading_scale)
+        exponent = (
+            (ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (turn / self.heading_scale) ** 2
+        )
+        rate = np.where(led, self.rate * np.exp(-exponent / 2), 0.0)
+        nearest = _nearest_leader(target, np.where(led, ahead + 10 * np.abs(lateral), np.inf), len(nodes))
+        return Pairs(target[nearest], source[nearest], rate[nearest])
+
+
+def build_graph(nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1e-3) -> SceneGraph:
+    """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out."""
+    groups: list[Edges] = []
+    if len(nodes) > 1:
+        kinds: dict[int, int] = {}
+        kind = np.array([kinds.setdefault(id(t), len(kinds)) for t in nodes.types])
+        for rule in rules:
+            target, source, rate = rule.pairs(nodes)
+            keep = rate >= min_rate
+            target, source, rate = target[keep], source[keep], rate[keep]
+            pair_kind = kind[target] * len(kinds) + kind[source]
+            for k in np.unique(pair_kind):
+                mine = pair_kind == k
+                t, s = target[mine], source[mine]
+                if rule.interaction.applies(nodes.types[t[0]], nodes.types[s[0]]):
+                    name = type(rule.interaction).__name__
+                    groups.append(Edges(name, t, s, rate[mine], *rule.interaction.triples(nodes, t, s)))
+    return SceneGraph(nodes.id, nodes.types, tuple(groups))
+
+
+def _close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """All ordered pairs of able nodes within `radius` m: target rows, source rows, distances."""
+    rows = np.flatnonzero(able)
+    if len(rows) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+    pairs = cKDTree(position[rows]).query_pairs(radius, output_type="ndarray")
+    a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
+    distance = np.hypot(*(position[a] - position[b]).T)
+    return np.concatenate([a, b]), np.concatenate([b, a]), np.concatenate([distance, distance])
+
+
+def _strongest(pairs: Pairs, n: int, degree: int) -> Pairs:
+    """At most `degree` edges into each node, the strongest."""
+    order = np.lexsort((-pairs.rate, pairs.target))
+    rank = np.arange(len(order)) - np.searchsorted(pairs.target[order], np.arange(n))[pairs.target[order]]
+    kept = order[rank < degree]
+    return Pairs(pairs.target[kept], pairs.source[kept], pairs.rate[kept])
+
+
+def _nearest_leader(target: IntArray, distance: FloatArray, n: int) -> IntArray:
+    """For every target that has a leader at finite distance, the index of the nearest one's pair."""
+    order = np.lexsort((distance, target))
+    first = np.unique(target[order], return_index=True)[1]
+    nearest = order[first]
+    return np.asarray(nearest[np.isfinite(distance[nearest])])

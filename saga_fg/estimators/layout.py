@@ -1,0 +1,77 @@
+"""Where each node's state sits in a joint state vector."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_ids
+from saga_fg.errors import InputError, UnknownNodeError
+
+
+class Layout:
+    """Ids of the nodes in order, the sizes of their states, and their places in the joint state. Immutable."""
+
+    def __init__(self, nodes: ArrayLike = (), dims: ArrayLike = ()) -> None:
+        self.nodes: IntArray = checked_ids("nodes", nodes)
+        self.dims: IntArray = np.asarray(dims, dtype=np.int64)
+        self.offsets: IntArray = np.concatenate([[0], np.cumsum(self.dims)]).astype(np.int64)
+        self._row = {int(node): row for row, node in enumerate(self.nodes)}
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def size(self) -> int:
+        """Size D of the joint state."""
+        return int(self.offsets[-1])
+
+    def rows(self, nodes: ArrayLike) -> IntArray:
+        """Rows of some node ids; raises `UnknownNodeError` naming the first that is not here."""
+        ids = np.asarray(nodes)
+        if ids.ndim != 1 or (ids.size and ids.dtype.kind not in "iu"):
+            raise InputError(f"nodes: expected a list of integer ids, got {nodes!r}")
+        try:
+            return np.array([self._row[node] for node in ids.tolist()], dtype=np.int64)
+        except KeyError as error:
+            raise UnknownNodeError(f"node {error.args[0]} is not in the estimator") from None
+
+    def spans(self, rows: IntArray) -> IntArray:
+        """(k, d) places in the joint state of rows whose states have equal size d; `InputError` if they have not."""
+        dims = self.dims[rows]
+        if len(rows) and (dims != dims[0]).any():
+            raise InputError(f"nodes: expected states of equal size, got sizes {sorted(set(dims.tolist()))}")
+        return np.asarray(self.offsets[rows][:, None] + np.arange(dims[0] if len(rows) else 0))
+
+    def places(self, rows: IntArray) -> IntArray:
+        """Places in the joint state of rows of any sizes, stacked."""
+        if len(rows) == 0:
+            return np.empty(0, dtype=np.int64)
+        return np.concatenate([np.arange(self.offsets[row], self.offsets[row + 1]) for row in rows])
+
+    def extended(self, nodes: ArrayLike, dim: int) -> Layout:
+        """With further nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
+        ids = checked_ids("nodes", nodes)
+        for node in ids.tolist():
+            if node in self._row:
+                raise InputError(f"node {node} is in the estimator already")
+        return Layout(np.concatenate([self.nodes, ids]), np.concatenate([self.dims, np.full(len(ids), dim)]))
+
+    def without(self, rows: IntArray) -> Layout:
+        keep = np.ones(len(self), dtype=bool)
+        keep[rows] = False
+        return Layout(self.nodes[keep], self.dims[keep])
+
+
+def checked_prior(nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Means (k, d) and symmetric positive definite covariances (k, d, d) of new nodes, or `InputError`."""
+    k = len(np.asarray(nodes))
+    mean = checked("means", means, (k, None))
+    covariance = checked("covariances", covariances, (k, mean.shape[1], mean.shape[1]))
+    if k and not np.allclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-9, atol=1e-300):
+        raise InputError("covariances: expected symmetric matrices")
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise InputError("covariances: expected positive definite matrices") from None
+    return mean, covariance

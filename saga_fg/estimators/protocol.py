@@ -1,0 +1,100 @@
+"""The role of an estimator: hold the joint state of all nodes, move it by a transition, correct it by measurements.
+
+    predict   x <- F x + b + q,  q ~ N(0, Q)          the graph's dynamics over an interval
+    update    z = H x_node + v,  v ~ N(0, R)           what a sensor says of some nodes
+
+Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md for the figures).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from saga_fg.arrays import FloatArray, IntArray, checked
+from saga_fg.errors import InputError
+from saga_fg.transition import Transition
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """m independent linear measurements of nodes whose states have equal size d: z = H x_node + v, v ~ N(0, R).
+
+    nodes (m,) ids, may repeat; z (m, k); H (m, k, d) or (k, d) for all; R (m, k, k) or (k, k) for all
+
+    Raises `InputError` for wrong shapes, numbers that are not finite, or an R that is not symmetric positive definite.
+    """
+
+    nodes: IntArray
+    z: FloatArray
+    H: FloatArray
+    R: FloatArray
+
+    def __post_init__(self) -> None:
+        nodes = np.array(self.nodes)
+        if nodes.size == 0:
+            nodes = nodes.astype(np.int64)
+        if nodes.ndim != 1 or nodes.dtype.kind not in "iu":
+            raise InputError(f"nodes: expected a list of integer ids, got shape {nodes.shape} of {nodes.dtype}")
+        m = len(nodes)
+        z = checked("z", self.z, (m, None))
+        k = z.shape[1]
+        H, R = (np.asarray(value, dtype=np.float64) for value in (self.H, self.R))
+        H = checked("H", np.broadcast_to(H, (m, *H.shape)) if H.ndim == 2 else H, (m, k, None))
+        R = checked("R", np.broadcast_to(R, (m, *R.shape)) if R.ndim == 2 else R, (m, k, k))
+        if m and not np.allclose(R, np.swapaxes(R, 1, 2), rtol=1e-9, atol=0):
+            raise InputError("R: expected symmetric matrices")
+        try:
+            np.linalg.cholesky(R)
+        except np.linalg.LinAlgError:
+            bad = int(np.argmin(np.linalg.eigvalsh(R)[:, 0]))
+            raise InputError(f"R[{bad}]: expected a positive definite matrix, got {R[bad].tolist()}") from None
+        for name, array in (("nodes", nodes.astype(np.int64)), ("z", z), ("H", H), ("R", R)):
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+
+class Estimator(Protocol):
+    """The joint state of all nodes. Every method raises `InputError` or `UnknownNodeError` and then changes nothing."""
+
+    @property
+    def nodes(self) -> IntArray:
+        """(n,) ids in the order of the joint state."""
+        ...
+
+    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+        """Nodes that appear, independent of all others: ids (k,), means (k, d), covariances (k, d, d)."""
+        ...
+
+    def predict(self, transition: Transition) -> None:
+        """Move all nodes by a transition over exactly the present nodes, in any order."""
+        ...
+
+    def update(self, measurements: Measurements) -> float:
+        """Take in measurements; returns the log-likelihood of their innovation."""
+        ...
+
+    def marginalise(self, nodes: ArrayLike) -> None:
+        """Nodes that disappear: integrated out, so that what they told of their neighbours stays."""
+        ...
+
+    def mean(self, nodes: ArrayLike) -> FloatArray:
+        """(k, d) means of nodes of equal size d."""
+        ...
+
+    def covariance(self, nodes: ArrayLike) -> FloatArray:
+        """(k, d, d) marginal covariances of nodes of equal size d."""
+        ...
+
+    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
+        """Stacked mean of some nodes, in the order given, of any sizes."""
+        ...
+
+    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
+        """Joint covariance of some nodes, in the order given, of any sizes."""
+        ...

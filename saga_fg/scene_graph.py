@@ -1,0 +1,127 @@
+"""The scene graph G_t = (V_t, E_t): typed nodes, and directed edges (source j -> target i) that act on the dynamics.
+
+    dx_i/dt = A_i x_i + sum_j rate_ij ( A_self x_i + A_other x_j + b ) + noise
+
+An edge carries its rate (1/s, never per step) and the triple (A_self, A_other, b) of its interaction function, already
+evaluated at the estimate at the start of an interval. A graph is therefore a complete, frozen record of the
+dynamics of an interval: it can be discretised over any dt, and again over parts of it when a measurement comes late.
+Only nodes are estimated (Sani et al., SAGA-KF, ICPR 2024), edges are inputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_ids
+from saga_fg.errors import InputError
+from saga_fg.node import NodeType
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """E edges of one interaction between nodes of equal state sizes d_i (targets) and d_j (sources).
+
+    interaction  name of the interaction function
+    target       (E,) rows of the influenced nodes in the graph
+    source       (E,) rows of the influencing nodes
+    rate         (E,) kappa_ij >= 0, 1/s
+    A_self       (E, d_i, d_i), A_other (E, d_i, d_j), b (E, d_i)
+    """
+
+    interaction: str
+    target: IntArray
+    source: IntArray
+    rate: FloatArray
+    A_self: FloatArray
+    A_other: FloatArray
+    b: FloatArray
+
+    def __post_init__(self) -> None:
+        count = len(np.asarray(self.target))
+        what = f"edges of {self.interaction}"
+        for name in ("target", "source"):
+            array = np.array(getattr(self, name), dtype=np.int64)
+            if array.shape != (count,):
+                raise InputError(f"{what}: {name}: expected {count} rows, got shape {array.shape}")
+            object.__setattr__(self, name, array)
+        rate = checked(f"{what}: rate", self.rate, (count,))
+        if (rate < 0).any():
+            raise InputError(
+                f"{what}: rate[{int(np.argmax(rate < 0))}]: expected a rate >= 0 in 1/s, got {rate.min():g}"
+            )
+        if (self.target == self.source).any():
+            raise InputError(
+                f"{what}: node row {int(self.target[self.target == self.source][0])} has an edge to itself"
+            )
+        d_i, d_j = np.shape(self.A_other)[1:] if np.ndim(self.A_other) == 3 else (0, 0)
+        object.__setattr__(self, "rate", rate)
+        for name, shape in (("A_self", (count, d_i, d_i)), ("A_other", (count, d_i, d_j)), ("b", (count, d_i))):
+            object.__setattr__(self, name, checked(f"{what}: {name}", getattr(self, name), shape))
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneGraph:
+    """Nodes and edges at the start of an interval.
+
+    nodes  (n,) ids, unique
+    types  n node types
+    edges  one or more groups of edges, by rows of `nodes`
+
+    Raises `InputError` for edges that name a row the graph has not, or triples whose sizes don't fit the nodes.
+    """
+
+    nodes: IntArray
+    types: tuple[NodeType, ...]
+    edges: tuple[Edges, ...] = ()
+
+    def __post_init__(self) -> None:
+        nodes = checked_ids("nodes", self.nodes)
+        object.__setattr__(self, "nodes", nodes)
+        object.__setattr__(self, "types", tuple(self.types))
+        if len(self.types) != len(nodes):
+            raise InputError(f"types: expected {len(nodes)} node types, got {len(self.types)}")
+        for group in self.edges:
+            for name, rows, dim in (
+                ("target", group.target, group.A_other.shape[1]),
+                ("source", group.source, group.A_other.shape[2]),
+            ):
+                if len(rows) == 0:
+                    continue
+                if rows.min() < 0 or rows.max() >= len(nodes):
+                    raise InputError(
+                        f"edges of {group.interaction}: {name}: row {int(rows.max())} is outside {len(nodes)} nodes"
+                    )
+                if (self.dims[rows] != dim).any():
+                    bad = int(rows[np.argmax(self.dims[rows] != dim)])
+                    raise InputError(
+                        f"edges of {group.interaction}: {name}: node {int(nodes[bad])} has {self.dims[bad]} "
+                        f"components, the interaction {dim}"
+                    )
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    @cached_property
+    def dims(self) -> IntArray:
+        """(n,) sizes of the nodes' states."""
+        return np.array([t.dim for t in self.types], dtype=np.int64)
+
+    @property
+    def edge_count(self) -> int:
+        return sum(len(group) for group in self.edges)
+
+    def without_edges(self) -> SceneGraph:
+        """The same nodes, moving on their own: the classical filter's graph."""
+        return SceneGraph(self.nodes, self.types)
+
+    @staticmethod
+    def of(nodes: Sequence[int] | IntArray, node_type: NodeType, edges: Sequence[Edges] = ()) -> SceneGraph:
+        """A graph whose nodes are all of one type."""
+        return SceneGraph(np.asarray(nodes, dtype=np.int64), (node_type,) * len(nodes), tuple(edges))

@@ -1,0 +1,120 @@
+r"""Sensors: all that a sensor contributes to the filter is what it observes, how well, where, and when.
+
+    z = H x + v,   v ~ N(0, R)
+    R = s(score)^2 ( position^2 I + (range_noise r)^2 u u^T + (bearing_noise r)^2 n n^T )
+
+with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. The motion of the
+world never depends on which sensor speaks, so a new sensor is a few lines of configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.geometry import inverse_transform, wrap_angle, yaw_transform
+from saga_fg.settings import setting, settings_group
+
+DEFAULT = "default"  # key of the settings for every class that has none of its own
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Standard deviations of what a sensor measures of a class of objects."""
+
+    position: float = setting(0.3, "standard deviation of a position, every direction, m")
+    range_noise: float = setting(0.0, "standard deviation along the line of sight, m per m of range")
+    bearing_noise: float = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
+    velocity: float = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
+    low_score: float = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
+    yaw: float = setting(0.2, "standard deviation of the heading, rad")
+    height: float = setting(0.2, "standard deviation of the centre's height, m")
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """What a sensor can see, in its own frame."""
+
+    min_azimuth: float = setting(-np.pi, "rad, from straight ahead, left positive")
+    max_azimuth: float = setting(np.pi, "rad")
+    max_range: float = setting(80.0, "m")
+
+
+@dataclass(frozen=True)
+class Extrinsics:
+    """Pose of the sensor on the vehicle, ego_T_sensor, for detections given in sensor coordinates."""
+
+    x: float = setting(0.0, "m ahead")
+    y: float = setting(0.0, "m to the left")
+    z: float = setting(0.0, "m up")
+    yaw: float = setting(0.0, "rad")
+
+    @property
+    def ego_T_sensor(self) -> FloatArray:
+        """(4, 4)"""
+        return yaw_transform(self.x, self.y, self.z, self.yaw)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor's model."""
+
+    noise: Mapping[str, NoiseModel] = field(
+        default_factory=lambda: {DEFAULT: NoiseModel()},
+        metadata={"comment": "by class; the entry named default serves all others"},
+    )
+    use_velocity: bool = setting(True, "take in the velocity where the detector measured one")
+    detection_probability: float = setting(0.9, "chance that a visible object in the field of view is detected")
+    score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
+    field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
+    extrinsics: Extrinsics = settings_group(Extrinsics, "where it sits, for detections in sensor coordinates")
+    time_offset: float = setting(0.0, "added to the sensor's timestamps to get the time of measurement, s")
+
+    def probability(self, score: FloatArray) -> FloatArray:
+        """The detector's scores (N,) as probabilities in [0.001, 0.999]."""
+        p = score if self.score == "probability" else 1 / (1 + np.exp(-np.clip(score, -50, 50)))
+        return np.clip(p, 1e-3, 1 - 1e-3)
+
+    def deviations(self, label: StrArray, name: str) -> FloatArray:
+        """(N,) the noise parameter `name` of each class."""
+        fallback = self.noise.get(DEFAULT, NoiseModel())
+        classes, index = np.unique(label, return_inverse=True)
+        values = [getattr(self.noise.get(str(c), fallback), name) for c in classes]
+        return np.asarray(values, dtype=np.float64)[index] if len(label) else np.empty(0)
+
+    def position_covariance(
+        self, label: StrArray, position: FloatArray, probability: FloatArray, origin: FloatArray
+    ) -> FloatArray:
+        """R (N, 2, 2), m^2, of positions (N, 2) seen from the sensor's place `origin` (2,), all in one frame."""
+        offset = position - origin
+        distance = np.hypot(*offset.T)
+        u = offset / np.maximum(distance, 1e-9)[:, None]
+        n = np.stack([-u[:, 1], u[:, 0]], axis=-1)
+        along = (self.deviations(label, "range_noise") * distance)[:, None] * u
+        across = (self.deviations(label, "bearing_noise") * distance)[:, None] * n
+        R = (self.deviations(label, "position") ** 2)[:, None, None] * np.eye(2)
+        R = R + along[:, :, None] * along[:, None, :] + across[:, :, None] * across[:, None, :]
+        return np.asarray(R * self._score_factor(label, probability)[:, None, None])
+
+    def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
+        """R (N, 2, 2), (m/s)^2."""
+        variance = self.deviations(label, "velocity") ** 2 * self._score_factor(label, probability)
+        return np.asarray(variance[:, None, None] * np.eye(2))
+
+    def _score_factor(self, label: StrArray, probability: FloatArray) -> FloatArray:
+        return np.asarray((1 + self.deviations(label, "low_score") * (1 - probability)) ** 2)
+
+    def sees(self, position: FloatArray, world_T_ego: FloatArray | None) -> BoolArray:
+        """Which positions (N, 2), world, lie in the field of view; all of them where the pose is unknown."""
+        if world_T_ego is None:
+            return np.ones(len(position), dtype=bool)
+        sensor_T_world = inverse_transform(world_T_ego @ self.extrinsics.ego_T_sensor)
+        local = position @ sensor_T_world[:2, :2].T + sensor_T_world[:2, 3]
+        view = self.field_of_view
+        middle, half = (view.min_azimuth + view.max_azimuth) / 2, (view.max_azimuth - view.min_azimuth) / 2
+        azimuth = np.abs(wrap_angle(np.arctan2(local[:, 1], local[:, 0]) - middle))
+        return np.asarray((np.hypot(*local.T) <= view.max_range) & (azimuth <= half + 1e-9))

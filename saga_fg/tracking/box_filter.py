@@ -1,0 +1,91 @@
+"""The part of a track that the graph does not couple: size, height and heading, filtered object by object.
+
+size      running mean weighted by detection probability
+height    scalar Kalman filter, random walk
+heading   scalar Kalman filter on the circle, random walk; a detector's heading may be off by half a turn, so that a
+          measurement is first turned to the side of the estimate, and the estimate to the side of the motion
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.geometry import wrap_angle
+
+HEIGHT_DRIFT = 0.1  # standard deviation after one second, m
+MOVING = 2.0  # speed from which the motion tells front from rear, m/s
+
+
+@dataclass(eq=False)
+class BoxFilter:
+    """Columns over n tracks: size (n, 3), size_weight (n,), z, z_variance, yaw, yaw_variance (n,); NaN is unknown."""
+
+    size: FloatArray
+    size_weight: FloatArray
+    z: FloatArray
+    z_variance: FloatArray
+    yaw: FloatArray
+    yaw_variance: FloatArray
+
+    @classmethod
+    def born(
+        cls,
+        size: FloatArray,
+        weight: FloatArray,
+        z: FloatArray,
+        z_noise: FloatArray,
+        yaw: FloatArray,
+        yaw_noise: FloatArray,
+    ) -> BoxFilter:
+        """Filters of new tracks from their first detections; noises are standard deviations."""
+        return cls(size.copy(), weight.copy(), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2)
+
+    def select(self, rows: IntArray | BoolArray) -> BoxFilter:
+        return BoxFilter(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def extended(self, other: BoxFilter) -> BoxFilter:
+        return BoxFilter(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+    def predict(self, dt: float, yaw_drift: FloatArray) -> None:
+        self.z_variance = self.z_variance + HEIGHT_DRIFT**2 * dt
+        self.yaw_variance = self.yaw_variance + yaw_drift**2 * dt
+
+    def update(
+        self,
+        rows: IntArray,
+        size: FloatArray,
+        weight: FloatArray,
+        z: FloatArray,
+        z_noise: FloatArray,
+        yaw: FloatArray,
+        yaw_noise: FloatArray,
+    ) -> None:
+        """Take in one detection each for the tracks `rows` (k,)."""
+        total = self.size_weight[rows] + weight
+        known: BoolArray = np.isfinite(size).all(axis=1)
+        old = np.where(np.isfinite(self.size[rows]), self.size[rows], size)
+        mixed = old + (weight / total)[:, None] * (size - old)
+        self.size[rows] = np.where(known[:, None], mixed, self.size[rows])
+        self.size_weight[rows] = np.where(known, np.minimum(total, 20.0), self.size_weight[rows])
+        gain = self.z_variance[rows] / (self.z_variance[rows] + z_noise**2)
+        self.z[rows] += gain * (z - self.z[rows])
+        self.z_variance[rows] *= 1 - gain
+        self._update_yaw(rows, yaw, yaw_noise**2)
+
+    def _update_yaw(self, rows: IntArray, yaw: FloatArray, variance: FloatArray) -> None:
+        rows, yaw, variance = rows[np.isfinite(yaw)], yaw[np.isfinite(yaw)], variance[np.isfinite(yaw)]
+        first = ~np.isfinite(self.yaw[rows])
+        self.yaw[rows[first]], self.yaw_variance[rows[first]] = yaw[first], variance[first]
+        difference = wrap_angle(yaw - self.yaw[rows])
+        difference = np.where(np.abs(difference) > np.pi / 2, wrap_angle(difference + np.pi), difference)
+        gain = self.yaw_variance[rows] / (self.yaw_variance[rows] + variance)
+        self.yaw[rows] = wrap_angle(self.yaw[rows] + gain * difference)
+        self.yaw_variance[rows] *= 1 - gain
+
+    def face_motion(self, velocity: FloatArray) -> None:
+        """Turn headings round that point against a clear motion; velocity (n, 2)."""
+        along = np.cos(self.yaw) * velocity[:, 0] + np.sin(self.yaw) * velocity[:, 1]
+        self.yaw = np.where(along < -MOVING, wrap_angle(self.yaw + np.pi), self.yaw)

@@ -1,0 +1,123 @@
+"""The greedy nearest-centre tracker of CenterPoint (Yin, Zhou, Kraehenbuehl, CVPR 2021, section 4.2).
+
+Detections, strongest first, take the nearest free track of their class, where tracks are projected by their velocity;
+velocity comes from the detector or, where it measured none, from the difference of the last two positions. There is no
+filter: a track is where its last detection was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.boxes import Boxes
+from saga_fg.frame import Frame
+from saga_fg.sensor import DEFAULT, Sensor
+from saga_fg.track import Tracks
+from saga_fg.tracking.settings import GreedySettings
+
+NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 and (m/s)^2
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """n tracks: where they were last seen."""
+
+    id: IntArray
+    label: StrArray
+    position: FloatArray
+    size: FloatArray
+    yaw: FloatArray
+    velocity: FloatArray
+    score: FloatArray
+    last_seen: FloatArray
+
+    def select(self, rows: IntArray) -> _Memory:
+        return _Memory(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def extended(self, other: _Memory) -> _Memory:
+        return _Memory(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+
+class GreedyTracker:
+    """Same methods as `saga_fg.tracking.Tracker`; frames are in order of time."""
+
+    def __init__(self, settings: GreedySettings | None = None, sensors: Mapping[str, Sensor] | None = None) -> None:
+        self.settings = settings or GreedySettings()
+        self.sensors = dict(sensors or {})
+        self._next_id = 1
+        self._time = -np.inf
+        empty = Boxes.empty()
+        none = np.empty(0)
+        self._memory = _Memory(
+            np.empty(0, dtype=np.int64), empty.label, empty.position, empty.size, none, empty.velocity, none, none
+        )
+
+    def step(self, frame: Frame) -> Tracks:
+        """Take in one frame; returns the tracks seen in it, in world coordinates."""
+        sensor = self.sensors.get(frame.sensor) or self.sensors.get(DEFAULT) or Sensor()
+        now = self._time = max(self._time, frame.timestamp + sensor.time_offset)
+        detections = frame.detections
+        if frame.coordinates != "world":
+            assert frame.world_T_ego is not None
+            ego_T_source = sensor.extrinsics.ego_T_sensor if frame.coordinates == "sensor" else np.eye(4)
+            detections = detections.transformed(frame.world_T_ego @ ego_T_source)
+        p = sensor.probability(detections.score)
+        rows = np.flatnonzero(p >= self.settings.min_score)
+        boxes, p = detections.boxes.select(rows), p[rows]
+        memory = self._memory
+        match = self._match(boxes, p, now)
+        seen = match >= 0
+        velocity = boxes.velocity.copy()
+        elapsed = now - memory.last_seen[match[seen]]
+        moved = boxes.position[seen, :2] - memory.position[match[seen], :2]
+        previous = memory.velocity[match[seen]]
+        difference = np.where(elapsed[:, None] > 1e-6, moved / np.maximum(elapsed, 1e-6)[:, None], previous)
+        velocity[seen] = np.where(np.isfinite(velocity[seen]), velocity[seen], difference)
+        velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+        ids = np.empty(len(boxes), dtype=np.int64)
+        ids[seen] = memory.id[match[seen]]
+        ids[~seen] = np.arange(self._next_id, self._next_id + int((~seen).sum()))
+        self._next_id += int((~seen).sum())
+        fresh = _Memory(ids, boxes.label, boxes.position, boxes.size, boxes.yaw, velocity, p, np.full(len(boxes), now))
+        unseen = np.ones(len(memory.id), dtype=bool)
+        unseen[match[seen]] = False
+        kept = np.flatnonzero(unseen & (now - memory.last_seen <= self.settings.max_coasting))
+        self._memory = fresh.extended(memory.select(kept))
+        return _tracks(fresh, now)
+
+    def tracks(self, timestamp: float) -> Tracks:
+        """The tracks seen in the newest frame, projected to `timestamp` (s)."""
+        newest = self._memory.select(np.flatnonzero(self._memory.last_seen == self._time))
+        return _tracks(newest, timestamp)
+
+    def _match(self, boxes: Boxes, p: FloatArray, now: float) -> IntArray:
+        """(m,) row of the track each detection takes, or -1."""
+        match = np.full(len(boxes), -1, dtype=np.int64)
+        memory = self._memory
+        if len(memory.id) == 0 or len(boxes) == 0:
+            return match
+        projected = memory.position[:, :2] + memory.velocity * (now - memory.last_seen)[:, None]
+        distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - projected[None], -1, 0))
+        limits = self.settings.max_distance
+        limit = np.array([limits.get(str(label), limits[DEFAULT]) for label in boxes.label])
+        possible = (boxes.label[:, None] == memory.label[None]) & (distance <= limit[:, None])
+        distance = np.where(possible, distance, np.inf)
+        for d in np.argsort(-p, kind="stable"):
+            t = int(distance[d].argmin())
+            if np.isfinite(distance[d, t]):
+                match[d] = t
+                distance[:, t] = np.inf
+        return match
+
+
+def _tracks(memory: _Memory, timestamp: float) -> Tracks:
+    ahead = timestamp - memory.last_seen
+    position = memory.position.copy()
+    position[:, :2] += memory.velocity * ahead[:, None]
+    nominal = np.tile(NOMINAL_VARIANCE * np.eye(2), (len(memory.id), 1, 1))
+    boxes = Boxes(memory.label, position, memory.size, memory.yaw, memory.velocity)
+    return Tracks(timestamp, memory.id, boxes, memory.score, nominal, nominal, np.maximum(ahead, 0.0))

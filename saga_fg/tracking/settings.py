@@ -1,0 +1,68 @@
+"""Settings of the trackers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.node import ConstantAcceleration, ConstantVelocity
+from saga_fg.sensor import DEFAULT
+from saga_fg.settings import setting, settings_group
+
+
+@dataclass(frozen=True)
+class ClassSettings:
+    """How objects of one class move, are born, matched and given up."""
+
+    motion: ConstantVelocity | ConstantAcceleration = settings_group(
+        lambda: ConstantVelocity(acceleration_noise=2.0), "own motion"
+    )
+    birth_speed: float = setting(
+        5.0, "standard deviation of a velocity component at birth where it is not measured, m/s"
+    )
+    min_score: float = setting(0.0, "detections with a lower probability are not used at all")
+    birth_score: float = setting(0.1, "detections with a lower probability start no track")
+    duplicate_distance: float = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
+    gate: float = setting(0.999, "share of true pairs that the chi-square gate lets through")
+    max_distance: float = setting(4.0, "no match beyond this distance between prediction and detection, m")
+    max_coasting: float = setting(1.2, "a track without detection is given up after this time, s")
+    yaw_drift: float = setting(0.3, "how fast the heading changes, standard deviation after one second, rad")
+
+
+@dataclass(frozen=True)
+class ExistenceSettings:
+    """The probability that a track is a real object."""
+
+    lifetime: float = setting(30.0, "mean time after which an object leaves unseen, s")
+    clutter_score: float = setting(0.2, "probability score at which a matched detection neither helps nor hurts")
+    confirm: float = setting(0.0, "tracks are reported from this existence probability on")
+    give_up: float = setting(0.02, "tracks below this existence probability are removed")
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Everything the tracker can be told; `edges` empty is the classical filter of independent objects."""
+
+    classes: Mapping[str, ClassSettings] = field(
+        default_factory=lambda: {DEFAULT: ClassSettings()},
+        metadata={"comment": "by class; the entry named default serves all others"},
+    )
+    edges: tuple[Following | Neighbours, ...] = settings_group(
+        lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
+    )
+    existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
+    max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
+    report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
+
+
+@dataclass(frozen=True)
+class GreedySettings:
+    """The greedy nearest-centre tracker (Yin et al., CenterPoint, CVPR 2021, section 4.2)."""
+
+    max_distance: Mapping[str, float] = field(
+        default_factory=lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
+        metadata={"comment": "largest distance between prediction and detection by class, m"},
+    )
+    max_coasting: float = setting(1.2, "a track without detection is kept this long, s")
+    min_score: float = setting(0.0, "detections with a lower probability are not used")
