@@ -24,7 +24,7 @@ class StopLine:
 
 @dataclass(frozen=True, eq=False)
 class SlowZone:
-    """A stretch [start, end), m, of some lanes where nobody wants to exceed `speed`, m/s, in the intervals (K, 2), s."""
+    """A stretch [start, end), m, of some lanes where nobody wants to exceed `speed`, m/s, in intervals (K, 2), s."""
 
     lanes: IntArray
     start: float

@@ -87,13 +87,19 @@ def _draw_lanes(settings: RoadSettings, rng: np.random.Generator) -> tuple[Lanes
 def _draw_disturbances(
     lanes: Lanes, focus: float, until: float, settings: TrafficSettings, rng: np.random.Generator
 ) -> tuple[tuple[StopLine, ...], tuple[SlowZone, ...]]:
+    opposite = lanes.road.length - (focus + JUNCTION)
     if lanes.ending < 0 and rng.random() < settings.signal_probability:
         red = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
-        opposite = lanes.road.length - (focus + JUNCTION)
         return (StopLine(lanes.forward, focus, red), StopLine(lanes.oncoming, opposite, red)), ()
-    speed = float(rng.uniform(*settings.slow_speed))
-    active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)
-    return (), (SlowZone(lanes.forward, focus + 20.0, focus + 80.0, speed, active),)
+    zones = []
+    lane_wise = rng.random() < settings.lane_wise_probability
+    for lanes_of_direction, start in ((lanes.forward, focus + 20.0), (lanes.oncoming, opposite - 40.0)):
+        groups = lanes_of_direction[:, None] if lane_wise else [lanes_of_direction]
+        for group in groups:
+            speed = float(rng.uniform(*settings.slow_speed))
+            active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)
+            zones.append(SlowZone(group, start, start + 60.0, speed, active))
+    return (), tuple(zones)
 
 
 def _fill(

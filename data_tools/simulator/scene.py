@@ -1,8 +1,9 @@
 """Scenes assembled: traffic, people and surroundings simulated, looked at by sensors on one of the cars.
 
 Annotators who see a whole recording label an object from the first moment they see it to the last, also where it is
-hidden in between. So does the ground truth here: an object is annotated from the first to the last keyframe at which
-some sensor sees enough of it, wherever it is within the annotation range.
+hidden in between unless it stays hidden for long. So does the ground truth here: an object is annotated at the
+keyframes at which some sensor sees enough of it, and where it is hidden for a while between two of these, always
+within the annotation range.
 """
 
 from __future__ import annotations
@@ -188,13 +189,20 @@ def _annotate(
         distance = np.linalg.norm(boxes.position[:, :2] - pose[:2, 3], axis=1)
         near[k] = distance <= settings.annotation_range
     visible &= near
-    first = np.maximum.accumulate(visible, axis=0)
-    last = np.maximum.accumulate(visible[::-1], axis=0)[::-1]
-    annotated = first & last & near
+    annotated = near & _bridged(keyframes, visible, settings.longest_gap)
     return tuple(
         Annotations(world.objects.id[rows], boxes.select(rows), visible[k, rows])
         for k, (boxes, rows) in enumerate(zip(moments, annotated, strict=True))
     )
+
+
+def _bridged(time: FloatArray, visible: BoolArray, longest: float) -> BoolArray:
+    """Where (K, N) objects are visible, or hidden between two sightings at most `longest` s apart."""
+    seen = np.where(visible, time[:, None], np.nan)
+    before = np.fmax.accumulate(seen, axis=0)
+    after = np.fmin.accumulate(seen[::-1], axis=0)[::-1]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(after - before <= longest + 1e-9)
 
 
 def _times(duration: float, rate: float, offset: float) -> FloatArray:

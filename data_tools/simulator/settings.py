@@ -17,12 +17,12 @@ class RoadSettings:
 
     length: float = setting(1000.0, "length of the simulated road, m")
     lane_width: float = setting(3.5, "width of a lane, m")
-    lanes: tuple[int, int] = setting((2, 3), "fewest and most lanes in the ego vehicle's direction")
-    oncoming_lanes: tuple[int, int] = setting((1, 2), "fewest and most lanes in the other direction")
+    lanes: tuple[int, int] = setting((2, 4), "fewest and most lanes in the ego vehicle's direction")
+    oncoming_lanes: tuple[int, int] = setting((1, 3), "fewest and most lanes in the other direction")
     curve_probability: float = setting(0.5, "share of scenes on a curved road")
     curve_radius: Range = setting((100.0, 300.0), "smallest radius of a curve's centre line, m")
     merge_probability: float = setting(0.3, "share of scenes with a lane that ends (an on-ramp or a lane drop)")
-    median_probability: float = setting(0.4, "share of scenes with a hedge between the directions")
+    median_probability: float = setting(0.5, "share of scenes with a hedge between the directions")
     median_width: float = setting(3.0, "width of the strip that carries the hedge, m")
 
 
@@ -48,14 +48,15 @@ class DriverSettings:
 class TrafficSettings:
     """How many vehicles there are, of which kinds, and what disturbs their flow."""
 
-    van_share: float = setting(0.12, "share of vans (labelled car) among moving vehicles")
-    truck_share: float = setting(0.14, "share of trucks")
+    van_share: float = setting(0.15, "share of vans (labelled car) among moving vehicles")
+    truck_share: float = setting(0.18, "share of trucks")
     bus_share: float = setting(0.08, "share of buses")
     platoon_size: tuple[int, int] = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: Range = setting((10.0, 60.0), "extra distance between platoons, m")
     signal_probability: float = setting(0.6, "share of scenes with a traffic light ahead; the rest have a slow zone")
     red_duration: Range = setting((8.0, 18.0), "duration of a red phase, s")
     green_duration: Range = setting((8.0, 16.0), "duration of a green phase, s")
+    lane_wise_probability: float = setting(0.5, "share of the scenes with slow zones where each lane has its own")
     slow_speed: Range = setting((2.0, 5.0), "speed in a slow zone while it is active, m/s")
     slow_duration: Range = setting((5.0, 12.0), "how long a slow zone is active, and inactive, s")
 
@@ -64,7 +65,7 @@ class TrafficSettings:
 class PedestrianSettings:
     """People on the pavements, alone and in groups."""
 
-    groups: tuple[int, int] = setting((6, 14), "fewest and most groups within reach of the ego vehicle")
+    groups: tuple[int, int] = setting((4, 10), "fewest and most groups within reach of the ego vehicle")
     group_size: tuple[int, int] = setting((1, 4), "fewest and most people in a group")
     walking_speed: Range = setting((1.0, 1.7), "speed at which a group likes to walk, m/s")
     pause_interval: float = setting(20.0, "mean time between a group's stops, s")
@@ -78,8 +79,8 @@ class SurroundingSettings:
 
     parking_probability: float = setting(0.5, "share of roadsides with a strip of parked cars")
     parking_occupancy: float = setting(0.5, "share of parking places taken")
-    hedge_length: Range = setting((8.0, 30.0), "length of an unbroken piece of hedge, m")
-    hedge_gap: Range = setting((3.0, 15.0), "gap between pieces of hedge, m")
+    hedge_length: Range = setting((4.0, 14.0), "length of an unbroken piece of hedge, m")
+    hedge_gap: Range = setting((5.0, 18.0), "gap between pieces of hedge, m")
     hedge_height: float = setting(2.2, "height of a hedge, m")
     building_length: Range = setting((10.0, 30.0), "length of a building, m")
     building_gap: Range = setting((2.0, 25.0), "gap between buildings, m")
@@ -167,7 +168,8 @@ class SimulatorSettings:
     step: float = setting(0.05, "integration step, s")
     warm_up: float = setting(15.0, "time simulated before the scene starts, s")
     annotation_range: float = setting(70.0, "distance from the ego vehicle within which objects are annotated, m")
-    visible_share: float = setting(0.2, "an object counts as visible when a sensor sees at least this share of it")
+    visible_share: float = setting(0.25, "an object counts as visible when a sensor sees at least this share of it")
+    longest_gap: float = setting(5.0, "an object hidden for longer is not annotated meanwhile, s")
     road: RoadSettings = settings_group(RoadSettings, "the road")
     drivers: DriverSettings = settings_group(DriverSettings, "how people drive")
     traffic: TrafficSettings = settings_group(TrafficSettings, "what is on the road")
