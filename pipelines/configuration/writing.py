@@ -14,7 +14,17 @@ from typing import Any
 import yaml
 
 from pipelines.configuration.reading import DEFAULT_ENTRY
-from pipelines.configuration.schema import Listing, Nullable, Schema, Section, Table, kind_of, settings_of
+from pipelines.configuration.schema import (
+    Choice,
+    Listing,
+    Nullable,
+    Schema,
+    Section,
+    Setting,
+    Table,
+    kind_of,
+    settings_of,
+)
 
 WIDTH = 110
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./ -]*(?<! )")
@@ -23,7 +33,14 @@ _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./ -]*(?<! )")
 def write_settings(settings: Any, comments: bool = True) -> str:
     """The YAML text of a settings dataclass; `read_settings(type(settings), text)` gives back an equal one."""
     cls = type(settings)
-    return "\n".join(_section_lines(Section((cls,)), settings, cls(), comments)) + "\n"
+    lines = _section_lines(Section((cls,)), settings, cls(), comments)
+    starts = [k for k, line in enumerate(lines) if line.endswith(":") and not line.startswith((" ", "#"))]
+    for start in reversed(starts):  # air between the sections of the top level
+        while start > 0 and lines[start - 1].startswith("#"):
+            start -= 1
+        if start > 0:
+            lines.insert(start, "")
+    return "\n".join(lines) + "\n"
 
 
 def scalar_text(value: Any) -> str:
@@ -63,8 +80,15 @@ def _section_lines(schema: Section, settings: Any, base: Any, comments: bool) ->
             continue
         before = getattr(base, item.name) if same else None if item.required else item.default()
         lines = _entry_lines(item.name, _form(item.schema, getattr(settings, item.name), before, comments))
-        entries.append((lines, item.comment if comments else ""))
+        entries.append((lines, _comment(item) if comments else ""))
     return _with_comments(entries)
+
+
+def _comment(item: Setting) -> str:
+    schema = item.schema.value if isinstance(item.schema, Nullable) else item.schema
+    if not isinstance(schema, Choice):
+        return item.comment
+    return f"{item.comment} ({' | '.join(scalar_text(option) for option in schema.options)})"
 
 
 def _form(schema: Schema, value: Any, base: Any, comments: bool) -> str | list[str]:

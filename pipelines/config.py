@@ -1,0 +1,46 @@
+"""The configuration of tracking: the settings of every part, composed, and the defaults shipped for kinds of data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+from pipelines.configuration import load_settings, read_settings
+from pipelines.tracking import OnlineTracker
+from saga_fg.sensor import DEFAULT, Sensor
+from saga_fg.settings import settings_group
+from saga_fg.tracking import GreedySettings, GreedyTracker, Tracker, TrackerSettings
+
+Method = Literal["saga", "kf", "centerpoint"]
+Family = Literal["nuscenes", "kitti", "simulated", "file"]
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Everything that shapes tracking."""
+
+    tracker: TrackerSettings = settings_group(TrackerSettings, "methods saga and kf (kf leaves the edges out)")
+    greedy: GreedySettings = settings_group(GreedySettings, "method centerpoint")
+    sensors: Mapping[str, Sensor] = settings_group(
+        lambda: {DEFAULT: Sensor()}, "models of the sensors by name; the entry named default serves all others"
+    )
+
+    def new_tracker(self, method: Method) -> OnlineTracker:
+        """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre)."""
+        if method == "centerpoint":
+            return GreedyTracker(self.greedy, self.sensors)
+        settings = self.tracker if method == "saga" else replace(self.tracker, edges=())
+        return Tracker(settings, self.sensors)
+
+
+def load_config(family: Family, path: Path | None = None) -> TrackConfig:
+    """The defaults shipped for a kind of data, with what a YAML file overrides.
+
+    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    """
+    shipped = files("pipelines") / "configs" / f"{family}.yaml"
+    config = read_settings(TrackConfig, shipped.read_text(encoding="utf-8"), shipped.name)
+    return config if path is None else load_settings(TrackConfig, path, config)

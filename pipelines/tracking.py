@@ -1,0 +1,76 @@
+"""Online tracking of recorded scenes: frames in order of time into a tracker, tracks at every moment of the scene.
+
+At a moment t of the scene, every frame up to and including t has been taken in; the tracks reported are the tracker's
+state at t, predicted there where the last frame is older. Nothing later than t has any influence.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from threadpoolctl import threadpool_limits
+
+from saga_fg.dataset import Dataset, Scene
+from saga_fg.frame import Frame
+from saga_fg.track import Tracks
+
+Progress = Callable[[str, int, int], None]
+"""Called with the scene's name, the number of its frames done, and the number of all its frames."""
+
+
+class OnlineTracker(Protocol):
+    """A tracker that takes one frame at a time, of any sensor."""
+
+    def step(self, frame: Frame) -> Tracks:
+        """Take in a frame; the tracks at its time."""
+        ...
+
+    def tracks(self, timestamp: float) -> Tracks:
+        """The tracks predicted to `timestamp` (s), without a change of state."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedScene:
+    """A scene and its tracks, one table for each of its timestamps.
+
+    frames   frames taken in
+    seconds  time spent in the tracker
+    """
+
+    scene: Scene
+    tracks: tuple[Tracks, ...]
+    frames: int
+    seconds: float
+
+
+def track_scene(scene: Scene, tracker: OnlineTracker, progress: Progress | None = None) -> TrackedScene:
+    """Track one scene with a fresh tracker. Frames after the last timestamp of the scene are left out."""
+    wanted: list[Tracks] = []
+    done, latest, total = 0, None, len(scene.frames)
+    # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
+    with threadpool_limits(limits=1, user_api="blas"):
+        start = time.perf_counter()
+        for moment in scene.timestamps.tolist():
+            while done < total and scene.frames[done].timestamp <= moment:
+                latest = tracker.step(scene.frames[done])
+                done += 1
+                if progress is not None:
+                    progress(scene.name, done, total)
+            wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
+        seconds = time.perf_counter() - start
+    return TrackedScene(scene, tuple(wanted), done, seconds)
+
+
+def track_dataset(
+    dataset: Dataset,
+    new_tracker: Callable[[], OnlineTracker],
+    scenes: Iterable[str] | None = None,
+    progress: Progress | None = None,
+) -> Iterator[TrackedScene]:
+    """Track some scenes (default: all), each with a tracker of its own, one at a time as they are asked for."""
+    for name in dataset.scenes if scenes is None else scenes:
+        yield track_scene(dataset.scene(name), new_tracker(), progress)

@@ -1,0 +1,54 @@
+"""The shipped configuration: every kind of data has one, each is valid, and users' files lie over it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from data_tools.simulator import SimulatorSettings
+from pipelines.config import Family, TrackConfig, load_config
+from pipelines.configuration import read_settings, settings_reference, write_settings
+from pipelines.configuration.schema import settings_of
+from saga_fg import InputError
+
+
+@pytest.mark.parametrize("family", get_args(Family))
+def test_shipped_defaults_are_valid_and_survive_the_round_trip(family: Family) -> None:
+    config = load_config(family)
+    assert read_settings(TrackConfig, write_settings(config)) == config
+
+
+def test_a_users_file_lies_over_the_shipped_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("tracker: {max_delay: 0.25}\nsensors: {radar: {time_offset: -0.05}}\n")
+    config = load_config("kitti", path)
+    assert config.tracker.max_delay == 0.25
+    assert config.sensors["radar"].time_offset == -0.05
+    assert config.sensors["radar"].score == load_config("kitti").sensors["default"].score
+    assert config.greedy == load_config("kitti").greedy
+
+
+def test_a_mistake_in_a_users_file_names_file_and_key(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("tracker:\n  existence:\n    lifetme: 3\n")
+    with pytest.raises(InputError) as caught:
+        load_config("nuscenes", path)
+    assert str(caught.value) == f"{path}: tracker.existence.lifetme: unknown key, did you mean 'lifetime'?"
+
+
+@pytest.mark.parametrize("settings", [TrackConfig, SimulatorSettings])
+def test_every_setting_explains_itself(settings: type) -> None:
+    def unexplained(cls: type, where: str) -> list[str]:
+        found = [f"{where}.{item.name}" for item in settings_of(cls) if not item.comment]
+        for item in settings_of(cls):
+            schema = item.schema
+            while not hasattr(schema, "classes") and (hasattr(schema, "value") or hasattr(schema, "items")):
+                schema = schema.value if hasattr(schema, "value") else schema.items[0]
+            for below in getattr(schema, "classes", ()):
+                found += unexplained(below, f"{where}.{item.name}")
+        return found
+
+    assert unexplained(settings, settings.__name__) == []
+    assert settings_reference(settings).count("|  |") == 0

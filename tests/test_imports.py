@@ -1,0 +1,38 @@
+"""What importing costs, and which way imports run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+HEAVY = {"open3d", "matplotlib", "typer", "rich", "pandas", "dash", "torch"}
+
+
+def loaded_by(statement: str) -> set[str]:
+    """The top-level modules that a fresh interpreter holds after `statement`."""
+    code = f"{statement}\nimport json, sys\nprint(json.dumps(sorted({{name.split('.')[0] for name in sys.modules}})))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    return set(json.loads(run.stdout))
+
+
+@pytest.mark.parametrize("package", ["factors", "saga_fg", "data_tools", "pipelines"])
+def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
+    assert not loaded_by(f"import {package}") & HEAVY
+
+
+def test_importing_the_tracker_loads_nothing_heavy_either() -> None:
+    assert not loaded_by("from saga_fg import *\nfrom saga_fg.tracking import Tracker") & HEAVY
+
+
+def test_imports_run_one_way() -> None:
+    """pipelines -> data_tools -> saga_fg -> factors, as the contract in pyproject.toml says."""
+    pytest.importorskip("importlinter", reason="import-linter comes with the extra dev")
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()"]
+    run = subprocess.run([*command, "--no-cache"], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert "1 kept, 0 broken" in run.stdout
