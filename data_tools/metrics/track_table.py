@@ -43,7 +43,9 @@ class TrackTable:
         unique, first = np.unique(key, return_index=True)
         if len(unique) != n:
             row = int(np.setdiff1d(np.arange(n), first)[0])
-            raise InputError(f"id[{row}]: expected unique ids, {str(names[row])!r} occurs twice at moment {moment[row]}")
+            raise InputError(
+                f"id[{row}]: expected unique ids, {str(names[row])!r} occurs twice at moment {moment[row]}"
+            )
         for name, array in (("moment", moment), ("id", names), ("score", checked("score", self.score, (n,)))):
             object.__setattr__(self, name, array)
 
