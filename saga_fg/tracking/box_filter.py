@@ -65,7 +65,7 @@ class BoxFilter:
     ) -> None:
         """Take in one detection each for the tracks `rows` (k,)."""
         total = self.size_weight[rows] + weight
-        known: BoolArray = np.isfinite(size).all(axis=1)
+        known = np.asarray(np.isfinite(size).all(axis=1))
         old = np.where(np.isfinite(self.size[rows]), self.size[rows], size)
         mixed = old + (weight / total)[:, None] * (size - old)
         self.size[rows] = np.where(known[:, None], mixed, self.size[rows])

@@ -18,9 +18,8 @@ class ClassSettings:
     motion: ConstantVelocity | ConstantAcceleration = settings_group(
         lambda: ConstantVelocity(acceleration_noise=2.0), "own motion"
     )
-    birth_speed: float = setting(
-        5.0, "standard deviation of a velocity component at birth where it is not measured, m/s"
-    )
+    birth_speed: float = setting(5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s")
+    birth_drift: float = setting(1.0, "standard deviation of an unmeasured velocity at birth, across the heading, m/s")
     min_score: float = setting(0.0, "detections with a lower probability are not used at all")
     birth_score: float = setting(0.1, "detections with a lower probability start no track")
     duplicate_distance: float = setting(0.5, "of two detections of the class closer than this the weaker goes, m")

@@ -206,7 +206,7 @@ class Tracker:
     def _update(self, observed: _Observed, matching: Matching, delay: float) -> None:
         columns, boxes = self._columns, observed.boxes
         z = boxes.position[:, :2] - self._origin
-        fast: BoolArray = np.isfinite(boxes.velocity).all(axis=1) & np.isfinite(observed.R_velocity).all(axis=(1, 2))
+        fast = np.isfinite(np.concatenate([boxes.velocity, observed.R_velocity[:, 0]], axis=1)).all(axis=1)
         for node_type, rows in self._by_type(columns.label[matching.track]):
             for with_velocity in (True, False):
                 chosen = rows[fast[matching.detection[rows]] == with_velocity]
@@ -270,9 +270,10 @@ class Tracker:
         boxes, p = observed.boxes.select(born), observed.probability[born]
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
-        speed = self._of_class("birth_speed", boxes.label)
-        measured: BoolArray = np.isfinite(boxes.velocity).all(axis=1) & np.isfinite(observed.R_velocity[born]).all(axis=(1, 2))
-        P_velocity = np.where(measured[:, None, None], observed.R_velocity[born], (speed**2)[:, None, None] * np.eye(2))
+        measured = np.isfinite(np.concatenate([boxes.velocity, observed.R_velocity[born, 0]], axis=1)).all(axis=1)
+        P_velocity = np.where(
+            measured[:, None, None], observed.R_velocity[born], self._birth_velocity_covariance(boxes)
+        )
         velocity = np.where(measured[:, None], boxes.velocity, 0.0)
         for node_type, rows in self._by_type(boxes.label):
             mean = np.zeros((len(rows), node_type.dim))
@@ -290,6 +291,16 @@ class Tracker:
                 boxes.size, p, boxes.position[:, 2], observed.z_noise[born], boxes.yaw, observed.yaw_noise[born]
             )
         )
+
+    def _birth_velocity_covariance(self, boxes: Boxes) -> FloatArray:
+        """(n, 2, 2) of a velocity that nothing is known of but the class and the heading."""
+        speed, drift = (self._of_class(name, boxes.label) for name in ("birth_speed", "birth_drift"))
+        ahead = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1)
+        known = np.isfinite(boxes.yaw)
+        along = np.where(known, speed**2 - drift**2, 0.0)[:, None, None] * np.nan_to_num(
+            ahead[:, :, None] * ahead[:, None]
+        )
+        return np.asarray(along + (np.where(known, drift, speed) ** 2)[:, None, None] * np.eye(2))
 
     def _bury(self) -> None:
         """Tracks not seen for too long, or no longer believed, are marginalised."""
