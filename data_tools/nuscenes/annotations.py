@@ -1,9 +1,7 @@
 """Ground truth of nuScenes: annotated boxes of the seven tracking classes at every sample.
 
-Velocity is the central difference of the neighbouring annotations of the same instance (one-sided at the ends of its
-chain), and unknown where they lie more than 1.5 s per side apart, as in `NuScenes.box_velocity` of the development kit:
-
-    v_k = (p_{k+1} - p_{k-1}) / (t_{k+1} - t_{k-1})
+Velocity is the central difference of the neighbouring annotations of the same instance, and unknown where they lie
+more than 1.5 s per side apart, as in `NuScenes.box_velocity` of the development kit.
 
 An object counts as visible if some LiDAR or radar point lies in its box; the official evaluation leaves out the others.
 """
@@ -17,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.central_differences import central_differences
 from data_tools.located import located
 from data_tools.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS
 from data_tools.nuscenes.scenes import SceneRecord
 from data_tools.nuscenes.tables import read_table
-from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.dataset import Annotations
 from saga_fg.errors import InputError
@@ -100,7 +98,7 @@ class _Rows:
             position=numbers[:, :3],
             size=numbers[:, [4, 3, 5]],
             yaw=quaternion_yaw(checked_quaternions("rotation", numbers[:, 6:])),
-            velocity=central_differences(instance, scene.timestamps[sample], numbers[:, :2]),
+            velocity=central_differences(instance, scene.timestamps[sample], numbers[:, :2], MAX_GAP),
         )
         order = np.argsort(sample, kind="stable")
         bounds = np.searchsorted(sample[order], np.arange(len(scene.tokens) + 1))
@@ -110,22 +108,3 @@ class _Rows:
             with located(f"sample {token}"):
                 result.append(Annotations(instance[chosen], boxes.select(chosen), visible[chosen]))
         return result
-
-
-def central_differences(instance: StrArray, time: FloatArray, position: FloatArray) -> FloatArray:
-    """Velocities (N, 2) of annotations with instance names (N,), times (N,) in s and positions (N, 2), in any order."""
-    n = len(instance)
-    velocity = np.full((n, 2), np.nan)
-    if n < 2:
-        return velocity
-    order = np.lexsort((time, instance))
-    same = instance[order][1:] == instance[order][:-1]
-    rank = np.arange(n)
-    before: IntArray = rank - np.append(False, same)
-    after: IntArray = rank + np.append(same, False)
-    t, p = time[order], position[order]
-    elapsed = t[after] - t[before]
-    longest = MAX_GAP * (after - before)
-    known = (elapsed > 0) & (elapsed <= longest)
-    velocity[order[known]] = (p[after] - p[before])[known] / elapsed[known, None]
-    return velocity

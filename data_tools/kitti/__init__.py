@@ -1,0 +1,26 @@
+"""KITTI tracking: official poses, calibration and labels, and detections as text, in; official result text out."""
+
+from data_tools.kitti.calibration import Calibration, read_calibration
+from data_tools.kitti.camera_boxes import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
+from data_tools.kitti.dataset import KittiTracking
+from data_tools.kitti.image_boxes import image_boxes, observation_angles
+from data_tools.kitti.labels import KittiObjects, has_box, read_kitti_labels
+from data_tools.kitti.oxts import read_poses
+from data_tools.kitti.tracking_results import kitti_result_text, write_kitti_results
+
+__all__ = [
+    "Calibration",
+    "CameraBoxes",
+    "KittiObjects",
+    "KittiTracking",
+    "camera_boxes_to_world",
+    "has_box",
+    "image_boxes",
+    "kitti_result_text",
+    "observation_angles",
+    "read_calibration",
+    "read_kitti_labels",
+    "read_poses",
+    "world_boxes_to_camera",
+    "write_kitti_results",
+]

@@ -1,0 +1,89 @@
+"""Reading KITTI's text files: lines of values, separated by spaces or commas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class TextTable:
+    """Rows of equally many values as text (N, C), and the line number (N,) of each."""
+
+    path: Path
+    values: np.ndarray[tuple[int, int], np.dtype[np.str_]]
+    line: np.ndarray[tuple[int], np.dtype[np.int64]]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def numbers(self, columns: list[int] | slice, names: tuple[str, ...]) -> FloatArray:
+        """Some columns as finite floats (N, C). Raises `InputError` naming line and column."""
+        text = self.values[:, columns]
+        try:
+            numbers = text.astype(np.float64)
+        except ValueError:
+            numbers = np.array([[_number(x) for x in row] for row in text]).reshape(text.shape)
+        bad = ~np.isfinite(numbers)
+        if bad.any():
+            row, column = (int(i) for i in np.argwhere(bad)[0])
+            raise self.fault(row, f"{names[column]}: expected a finite number, got {str(text[row, column])[:40]!r}")
+        return np.asarray(numbers, dtype=np.float64)
+
+    def integers(
+        self, column: int, name: str, smallest: int, largest: int = 2**31
+    ) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """A column as whole numbers (N,). Raises `InputError` naming the line of one out of range."""
+        numbers = self.numbers([column], (name,))[:, 0]
+        bad = (numbers != np.round(numbers)) | (numbers < smallest) | (numbers > largest)
+        if bad.any():
+            row = int(np.argmax(bad))
+            got = str(self.values[row, column])[:40]
+            raise self.fault(row, f"{name}: expected a whole number from {smallest} to {largest}, got {got}")
+        return numbers.astype(np.int64)
+
+    def fault(self, row: int, what: str) -> InputError:
+        """An error about one row."""
+        return InputError(f"{self.path}: line {self.line[row]}: {what}")
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file. Raises `InputError` if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected text: {error}") from error
+
+
+def read_table(path: Path, columns: tuple[int, ...], what: str, separator: str | None = None) -> TextTable:
+    """Read lines of values; all must have the same number of values, one of `columns`. Empty lines are left out.
+
+    Raises `InputError` naming the first line that has another number.
+    """
+    rows: list[list[str]] = []
+    numbers: list[int] = []
+    for number, line in enumerate(read_lines(path), start=1):
+        row = line.split(separator)
+        if not row or row == [""]:
+            continue
+        if len(row) not in columns or (rows and len(row) != len(rows[0])):
+            expected = len(rows[0]) if rows else " or ".join(map(str, columns))
+            raise InputError(f"{path}: line {number}: expected {expected} columns ({what}), got {len(row)}")
+        rows.append(row)
+        numbers.append(number)
+    values = np.array(rows, dtype=np.str_) if rows else np.empty((0, columns[0]), dtype=np.str_)
+    return TextTable(path, values, np.array(numbers, dtype=np.int64))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
