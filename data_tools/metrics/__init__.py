@@ -10,6 +10,11 @@ from data_tools.metrics.bootstrap import (
 )
 from data_tools.metrics.consistency import coverage, coverages, nees, nees_band
 from data_tools.metrics.error_sample import ErrorSample
+from data_tools.metrics.kitti_tracking import (
+    KittiTrackingFigures,
+    KittiTrackingSequence,
+    kitti_tracking_figures,
+)
 from data_tools.metrics.matching import Matching, match_scene
 from data_tools.metrics.nuscenes_tracking import (
     NuScenesTrackingMetrics,
@@ -25,6 +30,8 @@ from data_tools.metrics.track_table import TrackTable
 __all__ = [
     "ErrorSample",
     "Interval",
+    "KittiTrackingFigures",
+    "KittiTrackingSequence",
     "Matching",
     "NuScenesTrackingMetrics",
     "NuScenesTrackingScene",
@@ -37,6 +44,7 @@ __all__ = [
     "coverage",
     "coverages",
     "difference",
+    "kitti_tracking_figures",
     "match_scene",
     "nees",
     "nees_band",

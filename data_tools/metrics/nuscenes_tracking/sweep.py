@@ -7,9 +7,7 @@ official evaluation uses)
 2. the rest is assigned by the Hungarian method, as many pairs as possible first, then the least sum of distances;
    a pair whose object was last matched to another track is an identity switch.
 
-Everything but time is vectorised: all scenes, classes and thresholds advance by one moment together. Most leftover
-pairs have no rival, so they match at once; only the rest goes through the Hungarian method, and what recurs at several
-thresholds is solved once.
+Everything but time is vectorised: all scenes, classes and thresholds advance by one moment together.
 """
 
 from __future__ import annotations
@@ -18,8 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from data_tools.metrics.assignment import Candidates, optimal_pairs
 from data_tools.metrics.nuscenes_tracking.sightings import Sightings
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 
@@ -112,9 +110,8 @@ def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Swee
         remembered = last[identity[here.true]]
         kept = _first_claims(present & (remembered == track[here.found][:, None]), here.found)
         free = present & ~_taken(kept, here.true) & ~_taken(kept, here.found)
-        pair, at = np.nonzero(free)
-        new = _assigned(here, pair, at, true, T)
-        pair, at = pair[new], at[new]
+        group = true.scene[here.true] * classes + label[here.true]
+        pair, at = np.nonzero(optimal_pairs(Candidates(here.true, here.found, here.distance, group), free))
         rows = here.true[pair]
         switched[rows, at] = remembered[pair, at] >= 0
         old_pair, old_at = np.nonzero(kept)
@@ -141,36 +138,3 @@ def _taken(kept: BoolArray, row: IntArray) -> BoolArray:
     pair, at = np.nonzero(kept)
     taken[row[pair] - first, at] = True
     return np.asarray(taken[row - first])
-
-
-def _assigned(here: Pairs, pair: IntArray, at: IntArray, true: Rows, T: int) -> BoolArray:
-    """Which of the free pairs `pair` (Q,), each at threshold `at` (Q,), the assignment chooses."""
-    a, b = here.true[pair], here.found[pair]
-    rivals_a = np.bincount((a - here.true.min()) * T + at)[(a - here.true.min()) * T + at]
-    rivals_b = np.bincount((b - here.found.min()) * T + at)[(b - here.found.min()) * T + at]
-    chosen = np.asarray((rivals_a == 1) & (rivals_b == 1))
-    contested = np.flatnonzero(~chosen)
-    if len(contested) == 0:
-        return chosen
-    group = (true.scene[a] * (true.sightings.label.max() + 1) + true.sightings.label[a]) * T + at
-    contested = contested[np.argsort(group[contested], kind="stable")]
-    solved: dict[bytes, BoolArray] = {}
-    for members in np.split(contested, np.flatnonzero(np.diff(group[contested])) + 1):
-        key = pair[members].tobytes()
-        if key not in solved:
-            rows = pair[members]
-            solved[key] = _hungarian(here.true[rows], here.found[rows], here.distance[rows])
-        chosen[members] = solved[key]
-    return chosen
-
-
-def _hungarian(row: IntArray, column: IntArray, distance: FloatArray) -> BoolArray:
-    """Which of the pairs (row, column) the assignment chooses: most pairs first, then the least sum of distances."""
-    rows, r = np.unique(row, return_inverse=True)
-    columns, c = np.unique(column, return_inverse=True)
-    outside = 2.0 * min(len(rows), len(columns)) * (distance.max() + 1.0) + 1.0  # dearer than all pairs together
-    cost = np.full((len(rows), len(columns)), outside)
-    cost[r, c] = distance
-    selected = np.zeros(cost.shape, dtype=np.bool_)
-    selected[linear_sum_assignment(cost)] = True
-    return np.asarray(selected[r, c])

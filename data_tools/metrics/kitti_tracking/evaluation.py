@@ -1,0 +1,200 @@
+"""KITTI 3D multi-object tracking metrics, averaged over recall: sAMOTA, AMOTA, AMOTP and the CLEAR figures.
+
+True and found boxes of a class are matched frame by frame: as many pairs of at least the wanted 3D IoU as possible, and
+among those the largest sum of IoU. Thresholds on the mean score of a track are set where the recall comes nearest to
+1/40, 2/40, ...; with the counts at each (objects gt that count, misses FN, false alarms FP, switches IDS)
+
+    MOTA   = 1 - (FN + FP + IDS) / gt
+    sMOTA  = min(1, max(0, 1 - (FN + FP + IDS - (1 - r) gt) / (r gt)))         r: the wanted recall
+    MOTP   = mean 3D IoU of the pairs
+    sAMOTA, AMOTA, AMOTP: sums of sMOTA, MOTA, MOTP over the thresholds that are reached, divided by 40
+
+and the CLEAR figures at the threshold with the highest MOTA. Written anew from the paper and made to agree with its
+authors' evaluation, whose peculiarity it keeps: thresholds are run from few tracks to many, after a run with all, and a
+found box that matched in any of these runs is never let pass (`class_rows`) in a later one.
+
+Source: Weng et al., 3D Multi-Object Tracking: A Baseline and New Evaluation Metrics, IROS 2020, section IV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.metrics.assignment import Candidates, optimal_pairs
+from data_tools.metrics.kitti_tracking.class_rows import (
+    ClassRows,
+    KittiTrackingSequence,
+    found_rows,
+    joined_ranges,
+    true_rows,
+)
+from data_tools.metrics.kitti_tracking.track_scores import track_scores
+from data_tools.metrics.kitti_tracking.trajectories import TrajectoryFigures, trajectory_figures
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.overlap import paired_iou_3d
+
+RECALLS = 40
+
+
+@dataclass(frozen=True)
+class KittiTrackingFigures:
+    """Figures of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
+
+    gt: true boxes that count; mt, ml: shares of trajectories mostly tracked, mostly lost; tp, recall and precision
+    include pairs with true boxes that don't count. All but samota, amota, amotp are at the threshold of best MOTA.
+    """
+
+    samota: float
+    amota: float
+    amotp: float
+    mota: float
+    motp: float
+    recall: float
+    precision: float
+    mt: float
+    ml: float
+    gt: int
+    tp: int
+    fp: int
+    fn: int
+    ids: int
+    frag: int
+
+
+def kitti_tracking_figures(
+    sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float
+) -> KittiTrackingFigures | None:
+    """Figures of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
+
+    Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. Raises `InputError` for objects
+    of the class without a 3D box.
+    """
+    true, found = true_rows(sequences, label.lower()), found_rows(sequences, label.lower())
+    gt = int((~true.exempt).sum())
+    if gt == 0:
+        return None
+    candidates = _candidates(true, found, min_iou)
+    everything = optimal_pairs(candidates, np.ones((len(candidates), 1), dtype=np.bool_))[:, 0]
+    mean = track_scores(found.score, found.identity, 1)[:, 0]
+    thresholds, recalls = _thresholds(true, candidates, everything, mean)
+
+    cuts = np.array([-np.inf, *thresholds])
+    scores = track_scores(found.score, found.identity, len(cuts) + 1)
+    runs = _runs(true, found, candidates, scores[:, :-1] >= cuts, np.zeros(len(found), dtype=np.bool_))
+    best = int(np.argmax([0.0, *runs.mota[1:]]))  # the run with all tracks, if no threshold makes MOTA positive
+    final = _runs(true, found, candidates, scores[:, -1:] >= cuts[best], runs.matched)
+
+    smota = 1.0 - (runs.errors[1:] - (1.0 - recalls) * gt) / (recalls * gt)
+    tp, fn, fp = int(final.tp[0]), int(final.fn[0]), int(final.fp[0])
+    return KittiTrackingFigures(
+        samota=float(np.clip(smota, 0.0, 1.0).sum() / RECALLS),
+        amota=float(runs.mota[1:].sum() / RECALLS),
+        amotp=float(runs.motp[1:].sum() / RECALLS),
+        mota=float(final.mota[0]),
+        motp=float(final.motp[0]),
+        recall=tp / (tp + fn) if tp else 0.0,
+        precision=tp / (tp + fp) if tp else 0.0,
+        mt=float(final.trajectories.mostly_tracked[0]),
+        ml=float(final.trajectories.mostly_lost[0]),
+        gt=gt,
+        tp=tp,
+        fp=fp,
+        fn=fn,
+        ids=int(final.trajectories.switches[0]),
+        frag=int(final.trajectories.fragments[0]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """Counts of R runs, each with other tracks left in.
+
+    tp, fn, fp, trajectories, overlap (sum of the pairs' IoU)  (R,)
+    matched  (M,) found boxes that matched in any run up to the last
+    """
+
+    gt: int
+    tp: IntArray
+    fn: IntArray
+    fp: IntArray
+    trajectories: TrajectoryFigures
+    overlap: FloatArray
+    matched: BoolArray
+
+    @property
+    def errors(self) -> IntArray:
+        return np.asarray(self.fn + self.fp + self.trajectories.switches)
+
+    @property
+    def mota(self) -> FloatArray:
+        return np.asarray(1.0 - self.errors / self.gt)
+
+    @property
+    def motp(self) -> FloatArray:
+        return np.asarray(self.overlap / np.maximum(self.tp, 1))
+
+
+def _candidates(true: ClassRows, found: ClassRows, min_iou: float) -> Candidates:
+    """All pairs in the same frame with enough 3D IoU; cost 1 - IoU."""
+    first = np.searchsorted(found.frame_key, true.frame_key)
+    last = np.searchsorted(found.frame_key, true.frame_key, side="right")
+    row, column = joined_ranges(first, last)
+    a, b = true.boxes, found.boxes
+    offset = a.position[row, :2] - b.position[column, :2]
+    reach = (np.hypot(a.size[row, 0], a.size[row, 1]) + np.hypot(b.size[column, 0], b.size[column, 1])) / 2
+    near = np.hypot(offset[:, 0], offset[:, 1]) < reach
+    row, column = row[near], column[near]
+    cost = 1.0 - paired_iou_3d(a.select(row), b.select(column))
+    enough = cost <= 1.0 - min_iou
+    row, column = row[enough], column[enough]
+    return Candidates(row, column, cost[enough], true.frame_key[row])
+
+
+def _thresholds(
+    true: ClassRows, candidates: Candidates, chosen: BoolArray, score: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Score thresholds and the recalls they are for, from the pairs of the run with all tracks.
+
+    Of the matched scores, in descending order, the n-th is the threshold that gives recall n / to_find; it is taken
+    when the next one would come no nearer to the recall that is wanted. The first one is dropped: it stands for 0.
+    """
+    found_at_all = np.zeros(len(true), dtype=np.bool_)
+    found_at_all[candidates.row[chosen]] = True
+    to_find = len(true) - int((true.exempt & ~found_at_all).sum())
+    matched = np.sort(score[candidates.column[chosen]])[::-1].tolist()
+    thresholds, recalls, wanted = [], [], 0.0
+    for n, value in enumerate(matched):
+        here, following = (n + 1) / to_find, (n + 2) / to_find
+        if n + 1 < len(matched) and following - wanted < wanted - here:
+            continue
+        thresholds.append(value)
+        recalls.append(wanted)
+        wanted += 1 / RECALLS
+    return np.array(thresholds[1:]), np.array(recalls[1:])
+
+
+def _runs(
+    true: ClassRows, found: ClassRows, candidates: Candidates, present: BoolArray, matched_before: BoolArray
+) -> _Runs:
+    """Match and count with the found boxes `present` (M, R) in each run; `matched_before` (M,) in earlier runs."""
+    pairs = optimal_pairs(candidates, present[candidates.column])
+    pair, run = np.nonzero(pairs)
+    track = np.full((len(true), pairs.shape[1]), -1, dtype=np.int64)
+    track[candidates.row[pair], run] = found.identity[candidates.column[pair]]
+    matched = np.zeros_like(present)
+    matched[candidates.column[pair], run] = True
+    matched = np.logical_or.accumulate(matched, axis=1) | matched_before[:, None]
+    tp = pairs.sum(axis=0)
+    order = np.lexsort((true.frame_key, true.identity))
+    return _Runs(
+        gt=int((~true.exempt).sum()),
+        tp=tp,
+        fn=len(true) - tp - (true.exempt[:, None] & (track < 0)).sum(axis=0),
+        fp=present.sum(axis=0) - tp - (present & found.exempt[:, None] & ~matched).sum(axis=0),
+        trajectories=trajectory_figures(track[order], true.identity[order], true.exempt[order]),
+        overlap=(1.0 - candidates.cost) @ pairs,
+        matched=matched[:, -1],
+    )
