@@ -118,7 +118,7 @@ def test_boxes_that_need_not_match():
 
 
 def test_a_box_that_matched_at_one_threshold_is_never_let_pass_later():
-    # Above a score of 0.5 track 1 alone is at object 0 and matches it, low in the image as it is. With all tracks there,
+    # Above a score of 0.5 track 1 alone is at object 0 and matches it, low in the image as it is. With all tracks,
     # track 0 fits better, and track 1, left over, would be let pass.
     truth = [(f, n, 50.0 * n) for f in range(40) for n in range(2)]
     found = [(f, 0, 0.0, {"score": 0.5}) for f in range(40)] + [(f, 2, 50.0, {"score": 0.75}) for f in range(40)]
