@@ -24,13 +24,16 @@ Values = Literal["finite", "finite-or-nan", "any"]
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: Values = "finite") -> FloatArray:
     """Return `value` as a read-only float64 array of `shape` (None: any length).
 
-    Raises `InputError` naming the array, the offending entry and what was expected.
+    An empty list stands for no rows. Raises `InputError` naming the array, the offending entry and what was expected.
     """
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        array = np.asarray(value)
+        if array.dtype.kind == "c":
+            raise TypeError("complex")
+        array = np.array(array, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name}: expected numbers, got {_short(value)}") from error
-    if array.ndim == len(shape) - 1 and array.size == 0 and shape[0] is None:
+    if array.shape == (0,) and not shape[0]:
         array = array.reshape((0, *(n or 0 for n in shape[1:])))
     if array.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
@@ -48,7 +51,7 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: 
 
 def checked_labels(name: str, value: Any, length: int | None = None) -> StrArray:
     """Return `value` as a read-only array of non-empty strings of shape (length,)."""
-    array = np.asarray(value)
+    array = _listed(value)
     if array.size == 0:
         array = np.empty(0, dtype="<U1")
     if array.dtype.kind != "U" or array.ndim != 1:
@@ -64,10 +67,10 @@ def checked_labels(name: str, value: Any, length: int | None = None) -> StrArray
 
 def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntArray:
     """Return `value` as a read-only int64 array of unique entries, of shape (length,)."""
-    array = np.asarray(value)
+    array = _listed(value)
     if array.size == 0:
         array = np.empty(0, dtype=np.int64)
-    if array.dtype.kind not in "iu" or array.ndim != 1:
+    if array.dtype.kind not in "iu" or array.ndim != 1 or (array > np.iinfo(np.int64).max).any():
         raise InputError(f"{name}: expected a list of integers, got {_short(value)}")
     if length is not None and len(array) != length:
         raise InputError(f"{name}: expected {length} entries, got {len(array)}")
@@ -77,6 +80,14 @@ def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntAr
     array = array.astype(np.int64)
     array.flags.writeable = False
     return array
+
+
+def _listed(value: Any) -> NDArray[Any]:
+    """`value` as an array of whatever kind; nested lists of different lengths as one of objects."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        return np.asarray(value, dtype=object)
 
 
 def _shape(shape: tuple[int | None, ...]) -> str:

@@ -16,7 +16,8 @@ from saga_fg.errors import InputError
 
 def wrap_angle(angle: ArrayLike) -> FloatArray:
     """Angles (any shape, rad) wrapped into [-pi, pi)."""
-    return np.asarray((np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi)
+    wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray(np.where(wrapped >= np.pi, -np.pi, wrapped))  # an angle just below -pi is rounded to pi
 
 
 def checked_transform(name: str, value: ArrayLike) -> FloatArray:
