@@ -57,7 +57,7 @@ class Detections:
             [d.yaw for d in detections],
             [d.velocity for d in detections],
         )
-        return cls(boxes, np.array([d.score for d in detections], dtype=np.float64))
+        return cls(boxes, checked("score", [d.score for d in detections], (len(detections),)))
 
     @classmethod
     def empty(cls) -> Self:
@@ -121,6 +121,8 @@ class Frame:
         object.__setattr__(self, "timestamp", timestamp)
         if not isinstance(self.sensor, str) or not self.sensor:
             raise InputError(f"sensor: expected a name, got {self.sensor!r}")
+        if not isinstance(self.detections, Detections):
+            raise InputError(f"detections: expected Detections, got {type(self.detections).__name__}")
         if self.coordinates not in get_args(Coordinates):
             raise InputError(
                 f"coordinates: expected one of {', '.join(get_args(Coordinates))}, got {self.coordinates!r}"
