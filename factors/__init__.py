@@ -1,25 +1,67 @@
 """GTSAM factors of saga-fg: plain arrays, keys and callables in; gtsam and numpy only.
 
-Linear families give native `gtsam.JacobianFactor`s.
+Linear families give native `gtsam.JacobianFactor`s, which no solver needs Python for. Nonlinear ones give a
+`ResidualFactor`: `solve` linearises it, `as_custom_factor` makes it one of GTSAM's. One family a file.
 """
 
+from factors.detection import detection_factor, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
-from factors.gaussian import gaussian_factor, gaussian_graph, nonlinear_graph, nonlinear_graph_at
+from factors.gaussian import (
+    check_dimensions,
+    gaussian_factor,
+    gaussian_factors,
+    gaussian_graph,
+    nonlinear_graph,
+    nonlinear_graph_at,
+)
 from factors.interaction import interaction_factor, interaction_factors
 from factors.marginal import marginal_factors, marginal_moments
-from factors.prior import joint_prior_factor, prior_factor
+from factors.measurement import Components, MeasurementModel, box, position, position_velocity
+from factors.nonlinear import Linearisable, ResidualFactor
+from factors.nonlinear_interaction import NonlinearInteraction
+from factors.polar import Radar, RangeBearing, RangeRate
+from factors.prior import joint_prior_factor, prior_factor, prior_factors
+from factors.robust import Robust
+from factors.solver import Solution, SolverSettings, linearised, solve
+from factors.variables import PlanarPose, SpatialPose, Variable, Vector
 
 __all__ = [
+    "Components",
     "FactorError",
+    "Linearisable",
+    "MeasurementModel",
+    "NonlinearInteraction",
+    "PlanarPose",
+    "Radar",
+    "RangeBearing",
+    "RangeRate",
+    "ResidualFactor",
+    "Robust",
     "SingularSystemError",
+    "Solution",
+    "SolverSettings",
+    "SpatialPose",
+    "Variable",
+    "Vector",
+    "box",
+    "check_dimensions",
+    "detection_factor",
     "gaussian_factor",
+    "gaussian_factors",
     "gaussian_graph",
     "interaction_factor",
     "interaction_factors",
     "joint_prior_factor",
+    "linear_detection_factor",
+    "linear_detection_factors",
+    "linearised",
     "marginal_factors",
     "marginal_moments",
     "nonlinear_graph",
     "nonlinear_graph_at",
+    "position",
+    "position_velocity",
     "prior_factor",
+    "prior_factors",
+    "solve",
 ]

@@ -16,7 +16,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.validation import FloatArray, checked, checked_keys, format_key, format_keys, whitener
+from factors.validation import (
+    FloatArray,
+    KeyArray,
+    checked,
+    checked_key_array,
+    checked_keys,
+    format_key,
+    format_keys,
+    whitener,
+    whiteners,
+)
 
 
 def gaussian_factor(
@@ -42,6 +52,57 @@ def gaussian_factor(
     if covariance is not None:
         augmented = whitener("covariance", covariance, len(b)) @ augmented
     return native_factor(distinct, dims, np.asfortranarray(augmented))
+
+
+def gaussian_factors(
+    keys: ArrayLike, blocks: Sequence[ArrayLike], rhs: ArrayLike, covariances: ArrayLike
+) -> list[gtsam.JacobianFactor]:
+    """Return n factors of the same shape, || sum_k blocks[k][i] x(keys[i, k]) - rhs[i] ||_covariances[i], i = 1..n.
+
+    keys: (n, k), distinct within a row; blocks[k]: (n, m, d_k); rhs: (n, m); covariances: (n, m, m) or one (m, m) for
+    all. Whitening and checks are done for all at once, which is what makes them cheap. Raises `FactorError`.
+    """
+    b = checked("rhs", rhs, (None, None))
+    n, m = b.shape
+    names = np.asarray(keys)
+    if names.shape != (n, len(blocks)) or not blocks:
+        raise FactorError(f"keys: expected shape ({n}, {len(blocks)}), one key per block, got {names.shape}")
+    names = checked_key_array("keys", names.reshape(-1)).reshape(names.shape)
+    matrices = [checked(f"blocks[{k}]", block, (n, m, None)) for k, block in enumerate(blocks)]
+    stack = np.asarray(covariances)
+    W = whitener("covariances", stack, m)[None] if stack.ndim == 2 else whiteners("covariances", stack, m)
+    if len(W) not in (1, n):
+        raise FactorError(f"covariances: expected {n} matrices, got {len(W)}")
+    if not n:
+        return []
+    return whitened_factors(names, W, matrices, b)
+
+
+def whitened_factors(
+    keys: KeyArray, W: FloatArray, blocks: Sequence[FloatArray], rhs: FloatArray
+) -> list[gtsam.JacobianFactor]:
+    """Return the factors || W[i] (sum_k blocks[k][i] x(keys[i, k]) - rhs[i]) ||^2 of `gaussian_factors`.
+
+    Of the caller's mistakes only repeated keys and empty blocks are caught here: shapes and numbers must be right.
+    """
+    ordered = np.sort(keys, axis=1)
+    twice = ordered[:, 1:] == ordered[:, :-1]
+    if twice.any():
+        row = int(np.argmax(twice.any(axis=1)))
+        key = int(ordered[row, 1:][twice[row]][0])
+        raise FactorError(f"keys: {format_key(key)} occurs twice in factor {row}, the one on {format_keys(keys[row])}")
+    dims = [block.shape[2] for block in blocks]
+    n, m = rhs.shape
+    if m == 0 or 0 in dims:
+        raise FactorError("blocks: expected at least one row, and one column per block")
+    # Stored transposed, so that each factor's matrix is column-major, as GTSAM wants it.
+    augmented = np.empty((n, sum(dims) + 1, m))
+    column = 0
+    for block, dim in zip(blocks, dims, strict=True):
+        np.matmul(block.swapaxes(1, 2), W.swapaxes(1, 2), out=augmented[:, column : column + dim])
+        column += dim
+    np.matmul(W, rhs[:, :, None], out=augmented[:, -1, :, None])
+    return [native_factor(row, dims, matrix.T) for row, matrix in zip(keys.tolist(), augmented, strict=True)]
 
 
 def native_factor(keys: Sequence[int], dims: Sequence[int], augmented: FloatArray) -> gtsam.JacobianFactor:
@@ -80,18 +141,21 @@ def nonlinear_graph_at(factors: Iterable[gtsam.GaussianFactor], point: gtsam.Val
 
     The variables may be of any type. Raises `FactorError` for a key that `point` lacks or holds in another dimension.
     """
-    dims = point.dims()
-    graph = gtsam.NonlinearFactorGraph()
+    linear = gaussian_graph(factors)
+    check_dimensions(map(linear.at, range(linear.size())), point.dims())
+    return gtsam.LinearContainerFactor.ConvertLinearGraph(linear, point)
+
+
+def check_dimensions(factors: Iterable[gtsam.GaussianFactor], dims: Mapping[int, int]) -> None:
+    """Raise `FactorError` for a factor whose columns are not as many as its variables' dimensions, or unknown."""
     for factor in factors:
         keys = factor.keys()
-        missing = [key for key in keys if key not in dims]
-        if missing:
-            raise FactorError(f"dimension of {format_keys(missing)} unknown")
+        try:
+            total = sum([dims[key] for key in keys])
+        except KeyError as error:
+            raise FactorError(f"{format_key(error.args[0])}: expected its dimension to be known") from error
         width = (factor.cols() if isinstance(factor, gtsam.JacobianFactor) else factor.information().shape[0] + 1) - 1
-        total = sum(dims[key] for key in keys)
         if total != width:
             raise FactorError(
                 f"the factor on {format_keys(keys)} has {width} columns, but these variables have {total} dimensions"
             )
-        graph.push_back(gtsam.LinearContainerFactor(factor, point))
-    return graph

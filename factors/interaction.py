@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors.errors import FactorError
-from factors.gaussian import gaussian_factor, native_factor
-from factors.validation import checked, checked_key_array, checked_keys, format_key, whiteners
+from factors.gaussian import gaussian_factor, whitened_factors
+from factors.validation import checked, checked_key_array, checked_keys, whiteners
 
 
 def interaction_factor(
@@ -57,25 +57,16 @@ def interaction_factors(
     if not len(nexts):
         return []
     W = whiteners("Q", checked("Q", Q, (len(nexts), d, d)))
-    e = blocks.shape[2]
-    if d == 0 or e == 0:
-        raise FactorError(f"F: expected blocks of at least one row and column, got ({d}, {e})")
 
     result: list[gtsam.JacobianFactor | None] = [None] * len(nexts)
-    for degree in np.unique(degrees).tolist():
+    for degree in np.unique(degrees).tolist():  # factors of one shape together
         rows = np.flatnonzero(degrees == degree)
         entries = starts[rows, None] + np.arange(degree)
         names = np.concatenate([nexts[rows, None], previous[entries]], axis=1)
-        _distinct(names)
-        # Stored transposed, so that each factor's matrix is column-major, as GTSAM wants it.
-        augmented = np.empty((len(rows), d + degree * e + 1, d))
-        augmented[:, :d] = W[rows].swapaxes(1, 2)
-        whitened = -W[rows, None] @ blocks[entries]
-        augmented[:, d:-1] = whitened.swapaxes(2, 3).reshape(len(rows), degree * e, d)
-        augmented[:, -1] = (W[rows] @ offsets[rows, :, None])[:, :, 0]
-        dims = [d] + [e] * degree
-        for row, name, matrix in zip(rows.tolist(), names.tolist(), augmented.swapaxes(1, 2), strict=True):
-            result[row] = native_factor(name, dims, matrix)
+        identity = np.broadcast_to(np.eye(d), (len(rows), d, d))
+        own = [identity, *(-blocks[column] for column in entries.T)]
+        for row, factor in zip(rows.tolist(), whitened_factors(names, W[rows], own, offsets[rows]), strict=True):
+            result[row] = factor
     return [factor for factor in result if factor is not None]
 
 
@@ -88,12 +79,3 @@ def _rows(indptr: ArrayLike, nodes: int, entries: int) -> tuple[NDArray[np.int64
     if pointers[0] != 0 or pointers[-1] != entries or (degrees < 0).any():
         raise FactorError(f"indptr: expected to rise from 0 to the number of entries, {entries}")
     return pointers[:-1], degrees
-
-
-def _distinct(names: NDArray[np.uint64]) -> None:
-    ordered = np.sort(names, axis=1)
-    twice = ordered[:, 1:] == ordered[:, :-1]
-    if twice.any():
-        row = int(np.argmax(twice.any(axis=1)))
-        key = int(ordered[row, 1:][twice[row]][0])
-        raise FactorError(f"keys: {format_key(key)} occurs twice in the factor of {format_key(int(names[row, 0]))}")

@@ -46,8 +46,10 @@ def marginal_moments(graph: gtsam.GaussianFactorGraph, keys: Iterable[int]) -> t
     wanted = checked_keys("keys", keys)
     _present(graph, wanted)
     others = set(graph.keyVector()) - set(wanted)
-    ordering = gtsam.Ordering(list(wanted))
-    information, vector = marginal_factors(graph, others).hessian(ordering)
+    remaining = marginal_factors(graph, others)
+    if set(wanted) - set(remaining.keyVector()):  # nothing is left that speaks of them
+        raise singular_system(graph)
+    information, vector = remaining.hessian(gtsam.Ordering(list(wanted)))
     try:
         root = np.linalg.inv(np.linalg.cholesky(information))
     except np.linalg.LinAlgError as error:

@@ -15,14 +15,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.gaussian import gaussian_factor, native_factor
-from factors.validation import checked, checked_keys, whitener
+from factors.gaussian import gaussian_factor, gaussian_factors, native_factor
+from factors.validation import checked, checked_key_array, checked_keys, whitener
 
 
 def prior_factor(key: int, mean: ArrayLike, covariance: ArrayLike) -> gtsam.JacobianFactor:
     """Return the factor || x(key) - mean ||_covariance; mean: (d,), covariance: (d, d), positive definite."""
     center = checked("mean", mean, (None,))
     return gaussian_factor([key], [np.eye(len(center))], center, covariance)
+
+
+def prior_factors(keys: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> list[gtsam.JacobianFactor]:
+    """Return one prior a key; keys: (n,); means: (n, d); covariances: (n, d, d), or one (d, d) for all."""
+    centers = checked("means", means, (None, None))
+    names = checked_key_array("keys", keys)
+    checked_keys("keys", names.tolist())
+    identity = np.broadcast_to(np.eye(centers.shape[1]), (*centers.shape, centers.shape[1]))
+    return gaussian_factors(names[:, None], [identity], centers, covariances)
 
 
 def joint_prior_factor(keys: Iterable[int], means: Sequence[ArrayLike], covariance: ArrayLike) -> gtsam.JacobianFactor:

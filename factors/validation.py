@@ -7,7 +7,7 @@ Noise enters a linear factor by whitening. With Q = L L^T (Cholesky) and W = L^-
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,10 +98,11 @@ def format_key(key: int) -> str:
     return f"{letter}{int(key) & (1 << 56) - 1}" if letter.isascii() and letter.isalpha() else str(int(key))
 
 
-def format_keys(keys: Sequence[int], limit: int = 8) -> str:
+def format_keys(keys: Iterable[int], limit: int = 8) -> str:
     """Return up to `limit` keys, separated by commas, and how many more there are."""
-    more = f" and {len(keys) - limit} more" if len(keys) > limit else ""
-    return ", ".join(format_key(key) for key in keys[:limit]) + more
+    names = [format_key(key) for key in keys]
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
 
 
 def _entry(name: str, stack: FloatArray, bad: NDArray[np.bool_]) -> str:

@@ -8,11 +8,13 @@ from factors import (
     FactorError,
     SingularSystemError,
     gaussian_factor,
+    gaussian_factors,
     gaussian_graph,
     joint_prior_factor,
     marginal_factors,
     marginal_moments,
     prior_factor,
+    prior_factors,
 )
 
 
@@ -50,8 +52,6 @@ def test_marginal_keeps_what_is_known_of_the_rest(seed, covariance):
     np.testing.assert_allclose(reduced_P, P[:size, :size], atol=1e-8)
 
     joint_mean, joint_P = marginal_moments(graph, kept[::-1][:3])
-    order = [keys.index(key) for key in kept[::-1][:3]]
-    assert len(order) == 3
     rows = np.concatenate([_rows(kept, dims, key) for key in kept[::-1][:3]])
     np.testing.assert_allclose(joint_mean, mean[rows], atol=1e-8)
     np.testing.assert_allclose(joint_P, P[np.ix_(rows, rows)], atol=1e-8)
@@ -71,6 +71,45 @@ def test_joint_prior_says_its_mean_and_covariance(seed, covariance):
     mean, recovered = marginal_moments(gaussian_graph([joint_prior_factor(keys, means, P)]), keys)
     np.testing.assert_allclose(mean, np.concatenate(means), atol=1e-9)
     np.testing.assert_allclose(recovered, P, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_many_priors_equal_one_by_one(shared, covariance):
+    rng = np.random.default_rng(0)
+    keys, means = rng.permutation(20)[:5], rng.normal(size=(5, 3))
+    P = covariance(rng, 3) if shared else np.stack([covariance(rng, 3) for _ in keys])
+    for i, factor in enumerate(prior_factors(keys, means, P)):
+        alone = prior_factor(int(keys[i]), means[i], P if shared else P[i])
+        assert factor.keys() == alone.keys()
+        np.testing.assert_allclose(factor.augmentedJacobian(), alone.augmentedJacobian(), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_many_factors_equal_one_by_one(seed, covariance):
+    rng = np.random.default_rng(seed)
+    n, m, dims = 6, 3, [2, 5, 1, 3]
+    keys = np.stack([rng.permutation(40)[: len(dims)] for _ in range(n)])
+    blocks, rhs = [rng.normal(size=(n, m, d)) for d in dims], rng.normal(size=(n, m))
+    R = np.stack([covariance(rng, m) for _ in range(n)])
+    for i, factor in enumerate(gaussian_factors(keys, blocks, rhs, R)):
+        alone = gaussian_factor(keys[i].tolist(), [block[i] for block in blocks], rhs[i], R[i])
+        assert factor.keys() == alone.keys()
+        np.testing.assert_allclose(factor.augmentedJacobian(), alone.augmentedJacobian(), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("keys", "means", "P", "message"),
+    [
+        ([1, 2], [[0.0], [0.0]], np.ones((3, 1, 1)), "expected 2 matrices, got 3"),
+        ([1, 1], [[0.0], [0.0]], np.eye(1), "more than once"),
+        ([1], [[0.0], [0.0]], np.eye(1), "keys: expected shape"),
+        ([1, 2], [[0.0], [np.nan]], np.eye(1), r"means\[1, 0\]"),
+        ([1, 2], [0.0, 0.0], np.eye(1), "means: expected shape"),
+    ],
+)
+def test_bad_lists_of_priors_are_refused(keys, means, P, message):
+    with pytest.raises(FactorError, match=message):
+        prior_factors(keys, means, P)
 
 
 def test_eliminating_nothing_or_everything(covariance):

@@ -1,0 +1,157 @@
+"""The general nonlinear factor of ours: a residual function with a full noise model, optionally robust.
+
+    phi(x) = exp( -rho( || r(x_1, ..., x_n) ||_R ) ),      rho(s) = s^2 / 2 unless robust
+
+Linearised at a point, with J_k = dr/dx_k, W R W^T = 1 and the weight w of the robust loss there,
+
+    || sqrt(w) ( sum_k W J_k delta_k + W r ) ||^2,
+
+a native Jacobian factor on the increments delta. `factors.solver.solve` uses that; `as_custom_factor` gives the same
+thing as a `gtsam.CustomFactor` for anybody's own graph, where GTSAM calls back into Python at each linearisation and
+copies all Values every time, which costs more than the factor itself beyond a hundred variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.custom import custom_factor, tolerant_custom_factor
+from factors.differences import central_differences, wrap_angles
+from factors.errors import FactorError
+from factors.gaussian import native_factor
+from factors.robust import Robust
+from factors.validation import FloatArray, checked, checked_keys, format_keys, whitener
+from factors.variables import Variable, read_states
+
+
+class Linearisable(Protocol):
+    """What `factors.solver.solve` asks of a factor that GTSAM does not evaluate itself."""
+
+    @property
+    def keys(self) -> tuple[int, ...]: ...
+
+    def error(self, values: gtsam.Values) -> float:
+        """Return the cost, -log phi, at `values`."""
+
+    def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactor:
+        """Return the factor on the increments from `values`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualFactor:
+    """A factor from a residual function.
+
+    keys: distinct; variables: one a key, saying its type; residual(*states) -> (m,), states in the order of the keys;
+    covariance: (m, m) of the residual; jacobians(*states) -> one (m, dim_k) a key, by central differences when absent;
+    angles: components of the residual that are angles in rad and are wrapped into [-pi, pi); name: for messages.
+
+    The functions may raise what they like: it comes out as a `FactorError` that names the factor, as does a result of
+    a wrong shape or with numbers that are not finite. Picklable if the functions are.
+    """
+
+    keys: tuple[int, ...]
+    variables: tuple[Variable, ...]
+    residual: Callable[..., ArrayLike]
+    covariance: FloatArray
+    jacobians: Callable[..., Sequence[ArrayLike]] | None = None
+    robust: Robust | None = None
+    angles: tuple[int, ...] = ()
+    name: str = "factor"
+    _whitener: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        keys = checked_keys("keys", self.keys)
+        if not keys or len(self.variables) != len(keys):
+            raise FactorError(f"variables: expected one per key, got {len(self.variables)} for {len(keys)} keys")
+        covariance = checked("covariance", self.covariance, (None, None))
+        if any(not 0 <= component < len(covariance) for component in self.angles):
+            raise FactorError(f"angles: expected components from 0 to {len(covariance) - 1}, got {self.angles}")
+        object.__setattr__(self, "keys", keys)
+        object.__setattr__(self, "variables", tuple(self.variables))
+        object.__setattr__(self, "covariance", covariance)
+        object.__setattr__(self, "_whitener", whitener("covariance", covariance, len(covariance)))
+
+    @property
+    def dim(self) -> int:
+        """Number of rows of the residual."""
+        return len(self.covariance)
+
+    def __str__(self) -> str:
+        return f"{self.name} on {format_keys(self.keys)}"
+
+    def states(self, values: gtsam.Values) -> list[Any]:
+        """Return the states of the factor's variables."""
+        try:
+            return read_states(values, self.keys, self.variables)
+        except FactorError as error:
+            raise FactorError(f"{self}: {error}") from error
+
+    def residual_at(self, states: Sequence[Any]) -> FloatArray:
+        """Return the residual (m,), angles wrapped, not whitened."""
+        residual = self._called(self.residual, states)
+        try:
+            return wrap_angles(checked("residual", residual, (self.dim,)), self.angles)
+        except FactorError as error:
+            raise FactorError(f"{self}: {error}") from error
+
+    def jacobians_at(self, states: Sequence[Any]) -> list[FloatArray]:
+        """Return the Jacobians of the residual, one (m, dim_k) a key."""
+        if self.jacobians is None:
+            center = self.residual_at(states)  # differences from it stay small, so that no angle wraps between two
+
+            def near(*moved: Any) -> FloatArray:
+                return wrap_angles(self.residual_at(moved) - center, self.angles)
+
+            return central_differences(near, states, self.variables)
+        given = self._called(self.jacobians, states)
+        try:
+            if len(given) != len(self.keys):
+                raise FactorError(f"expected {len(self.keys)} Jacobians, one per key, got {len(given)}")
+            return [
+                checked(f"Jacobian {k}", jacobian, (self.dim, variable.dim))
+                for k, (jacobian, variable) in enumerate(zip(given, self.variables, strict=True))
+            ]
+        except (FactorError, TypeError) as error:
+            raise FactorError(f"{self}: {error}") from error
+
+    def error(self, values: gtsam.Values) -> float:
+        """Return the cost rho(|| r ||) at `values`."""
+        whitened = self._whitener @ self.residual_at(self.states(values))
+        square = float(whitened @ whitened)
+        return 0.5 * square if self.robust is None else float(self.robust.cost(np.sqrt(square)))
+
+    def linearise(self, values: gtsam.Values) -> gtsam.JacobianFactor:
+        """Return the factor on the increments from `values`, weighted by the robust loss there."""
+        states = self.states(values)
+        augmented = np.column_stack([*self.jacobians_at(states), -self.residual_at(states)])
+        augmented = self._whitener @ augmented
+        if self.robust is not None:
+            augmented *= np.sqrt(self.robust.weight(np.linalg.norm(augmented[:, -1])))
+        return native_factor(self.keys, [variable.dim for variable in self.variables], np.asfortranarray(augmented))
+
+    def noise_model(self) -> gtsam.noiseModel.Base:
+        """Return GTSAM's model of the factor's noise, robust if the factor is."""
+        gaussian = gtsam.noiseModel.Gaussian.Covariance(self.covariance)
+        return gaussian if self.robust is None else self.robust.model(gaussian)
+
+    def as_custom_factor(self) -> gtsam.CustomFactor:
+        """Return the same factor for a GTSAM graph; see `factors.custom.custom_factor`."""
+        return custom_factor(self)
+
+    def as_tolerant_custom_factor(
+        self, start: gtsam.Values, on_failure: Callable[[FactorError], None]
+    ) -> gtsam.CustomFactor:
+        """Return the same factor for iSAM2, which an exception would ruin; see `tolerant_custom_factor`."""
+        return tolerant_custom_factor(self, start, on_failure)
+
+    def _called(self, function: Callable[..., Any], states: Sequence[Any]) -> Any:
+        try:
+            return function(*states)
+        except Exception as error:
+            raise FactorError(f"{self}: {error if isinstance(error, FactorError) else repr(error)}") from error

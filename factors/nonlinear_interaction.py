@@ -1,0 +1,139 @@
+"""Nonlinear interaction of any number of nodes over one time step, from a function.
+
+    x_i(t+dt) = f( x_i(t), [x_j(t)]_{j in N(i)}, dt ) + q_i,    q_i ~ N(0, Q_i)
+
+    phi  =  || x_i(t+dt) - f(x_i(t), [x_j(t)], dt) ||_{Q_i}^2
+
+Whoever has an f has a factor: social repulsion, a coordinated turn, a car-following law. See `NonlinearInteraction`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.differences import central_differences, wrap_angles
+from factors.errors import FactorError
+from factors.nonlinear import ResidualFactor
+from factors.robust import Robust
+from factors.validation import FloatArray, checked
+from factors.variables import Vector
+
+Prediction = Callable[[FloatArray, list[FloatArray], float], ArrayLike]
+Derivative = Callable[[FloatArray, list[FloatArray], float], tuple[ArrayLike, Sequence[ArrayLike]]]
+
+
+@dataclass(frozen=True)
+class NonlinearInteraction:
+    """An interaction from a function of NumPy arrays.
+
+    predict(x, others, dt) -> (d,): the node's state dt seconds later, from its state x (d,) and its neighbours' states
+    others, a list of (d_j,), which may be empty. jacobians(x, others, dt) -> (F, [F_j, ...]), of shapes (d, d) and
+    (d, d_j); central differences of `predict` when absent. angles: components of the state that are angles in rad, so
+    that turning past pi is no jump.
+
+        def repel(x, others, dt): ...
+
+        factor = NonlinearInteraction(repel).factor(next_key, key, neighbours, dims=4, dt=0.1, covariance=Q)
+        factor.linearise(values)  # for our solver, `factors.solver`
+        graph.add(factor.as_custom_factor())  # for GTSAM's
+    """
+
+    predict: Prediction
+    jacobians: Derivative | None = None
+    angles: tuple[int, ...] = ()
+
+    def factor(
+        self,
+        next_key: int,
+        key: int,
+        neighbours: Sequence[int],
+        dims: int | Sequence[int],
+        dt: float,
+        covariance: ArrayLike,
+        robust: Robust | None = None,
+    ) -> ResidualFactor:
+        """Return the factor of one node and step.
+
+        next_key, key: the node at t+dt and at t; neighbours: the others at t; dims: dimension of every state, or of
+        the node's followed by each neighbour's; dt: seconds, >= 0; covariance: Q (d, d). Raises `FactorError`.
+        """
+        own, *others = [dims] * (1 + len(neighbours)) if isinstance(dims, int) else list(dims)
+        if len(others) != len(neighbours):
+            raise FactorError(f"dims: expected {1 + len(neighbours)} dimensions, got {1 + len(others)}")
+        step = _checked_step(dt)
+
+        return ResidualFactor(
+            keys=(next_key, key, *neighbours),
+            variables=(Vector(own), Vector(own), *map(Vector, others)),
+            residual=partial(_residual, self, step),
+            covariance=checked("covariance", covariance, (own, own)),
+            jacobians=partial(_jacobians, self, step),
+            robust=robust,
+            angles=self.angles,
+            name=getattr(self.predict, "__name__", "interaction"),
+        )
+
+    def affine(
+        self, x: ArrayLike, others: Sequence[ArrayLike], dt: float
+    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+        """Return (F, [F_j, ...], b) with f(y, [y_j, ...], dt) = F y + sum_j F_j y_j + b around x, others.
+
+        First order; that is what linear estimators and `interaction_factor` take. Raises `FactorError`.
+        """
+        state = checked("x", x, (None,)).copy()
+        near = [checked("others", other, (None,)).copy() for other in others]
+        for array in (state, *near):
+            array.flags.writeable = False
+        step = _checked_step(dt)
+        F, F_others = self.differentiated(state, near, step)
+        b = self.predicted(state, near, step) - F @ state
+        for block, other in zip(F_others, near, strict=True):
+            b -= block @ other
+        return F, F_others, b
+
+    def predicted(self, x: FloatArray, others: list[FloatArray], dt: float) -> FloatArray:
+        """Return the checked prediction (d,)."""
+        return checked("prediction", self.predict(x, others, dt), (len(x),))
+
+    def differentiated(self, x: FloatArray, others: list[FloatArray], dt: float) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the checked Jacobians (d, d) and [(d, d_j), ...] of the prediction."""
+        if self.jacobians is None:
+            center = self.predicted(x, others, dt)
+
+            def near(x: FloatArray, *others: FloatArray) -> FloatArray:
+                return wrap_angles(self.predicted(x, list(others), dt) - center, self.angles)
+
+            variables = [Vector(len(state)) for state in (x, *others)]
+            F, *F_others = central_differences(near, [x, *others], variables)
+            return F, F_others
+        own, given = self.jacobians(x, others, dt)
+        if len(given) != len(others):
+            raise FactorError(f"jacobians: expected one per neighbour, {len(others)}, got {len(given)}")
+        return checked("jacobian of x", own, (len(x), len(x))), [
+            checked(f"jacobian of neighbour {j}", block, (len(x), len(other)))
+            for j, (block, other) in enumerate(zip(given, others, strict=True))
+        ]
+
+
+def _residual(interaction: NonlinearInteraction, dt: float, *states: FloatArray) -> FloatArray:
+    later, x, *others = states
+    return later - interaction.predicted(x, others, dt)
+
+
+def _jacobians(interaction: NonlinearInteraction, dt: float, *states: FloatArray) -> list[FloatArray]:
+    later, x, *others = states
+    F, F_others = interaction.differentiated(x, others, dt)
+    return [np.eye(len(later)), -F, *(-block for block in F_others)]
+
+
+def _checked_step(dt: Any) -> float:
+    step = float(checked("dt", dt, ()))
+    if step < 0:
+        raise FactorError(f"dt: expected a duration of at least 0 s, got {step}")
+    return step

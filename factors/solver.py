@@ -1,0 +1,235 @@
+"""Nonlinear least squares over GTSAM's factors and ours together: Gauss-Newton and Levenberg-Marquardt.
+
+    minimise  E(x) = sum_i rho_i( || r_i(x) ||_{R_i} )
+
+Each iteration linearises at x, GTSAM's own factors in C++ and ours by their `linearise`, solves for the step
+
+    (H + lambda I) delta = g,     H = A^T A,  g = A^T b     (GTSAM's multifrontal elimination)
+
+and moves to x + delta. Robust factors enter with the weights of the present x (iteratively reweighted least squares).
+Ours are called once an iteration and copy nothing; the same factors as `CustomFactor`s in GTSAM's optimisers take about
+ten times as long at a hundred variables.
+
+Levenberg-Marquardt starts at lambda = 0, that is as Gauss-Newton, and damps only steps that fail to lower E
+(Nocedal and Wright, Numerical Optimization, 2nd ed. 2006, section 10.3). Both stop when the next step is short: the
+length of a step in posterior standard deviations is sqrt(delta^T H delta), which knows no units.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from factors.errors import FactorError, SingularSystemError
+from factors.gaussian import check_dimensions, native_factor
+from factors.marginal import marginal_moments
+from factors.nonlinear import Linearisable
+from factors.singular import singular_system
+from factors.validation import FloatArray, format_keys
+
+_LOG = logging.getLogger(__name__)
+_EXACT = 1e-12  # relative agreement of the error with its prediction from which a problem counts as linear
+_MAX_DAMPING = 1e12
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """method: "levenberg-marquardt" or "gauss-newton"; max_iterations: linearisations; tolerance: length of the step,
+    in posterior standard deviations, below which the solution counts as reached; damping: first lambda tried when a
+    plain step fails.
+    """
+
+    method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
+    max_iterations: int = 100
+    tolerance: float = 1e-6
+    damping: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.method not in ("levenberg-marquardt", "gauss-newton"):
+            raise FactorError(f"method: expected levenberg-marquardt or gauss-newton, got {self.method!r}")
+        if self.max_iterations < 1 or not self.tolerance > 0 or not self.damping > 0:
+            raise FactorError("settings: expected max_iterations >= 1, tolerance > 0 and damping > 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """values: the minimum; error: E there; iterations: linearisations it took; converged: whether the last step was
+    short enough; graph, factors: what was minimised.
+    """
+
+    values: gtsam.Values
+    error: float
+    iterations: int
+    converged: bool
+    graph: gtsam.NonlinearFactorGraph
+    factors: Sequence[Linearisable]
+
+    @cached_property
+    def linear(self) -> gtsam.GaussianFactorGraph:
+        """The factors on increments from `values`, for covariances and for passing on."""
+        return linearised(self.graph, self.factors, self.values)
+
+    def covariance(self, keys: Iterable[int]) -> FloatArray:
+        """Return the joint covariance (D, D) of `keys`, in this order, in the limit of small errors."""
+        return marginal_moments(self.linear, keys)[1]
+
+
+def solve(
+    graph: gtsam.NonlinearFactorGraph,
+    factors: Sequence[Linearisable],
+    start: gtsam.Values,
+    settings: SolverSettings | None = None,
+) -> Solution:
+    """Return the minimum of GTSAM's factors in `graph` and ours in `factors` together, from `start`.
+
+    Linear factors go into the graph by `nonlinear_graph`. Not converging is no exception: look at `Solution.converged`.
+    Raises `FactorError` when variables and factors do not fit together or a factor fails at `start`, and
+    `SingularSystemError`, naming the variables, when the factors do not determine the solution.
+    """
+    settings = settings or SolverSettings()
+    check_variables(graph, factors, start)
+    values, error = start, _error(graph, factors, start)
+    if not np.isfinite(error):
+        raise FactorError(f"the error at the start is {error}: a factor holds a number that is not finite")
+    damping = 0.0
+    ordering = None
+    for iteration in range(1, settings.max_iterations + 1):
+        linear = linearised(graph, factors, values)
+        if ordering is None:
+            ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+        move = _move(graph, factors, linear, ordering, values, error, damping, settings)
+        if move is None:  # no damping helps: error and linearisation contradict each other
+            return Solution(values, error, iteration, False, graph, factors)
+        _LOG.debug("iteration %d: error %.9g, step %.3g sigma", iteration, move.error, move.length)
+        values, error, damping = move.values, move.error, move.damping
+        if damping == 0 and (move.length <= settings.tolerance or move.exact):
+            return Solution(values, _error(graph, factors, values), iteration, True, graph, factors)
+        damping = damping / 10 if damping > settings.damping else 0.0
+    return Solution(values, _error(graph, factors, values), settings.max_iterations, False, graph, factors)
+
+
+def linearised(
+    graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values
+) -> gtsam.GaussianFactorGraph:
+    """Return all factors linearised at `values`, on increments from there."""
+    linear = graph.linearize(values)
+    for factor in factors:
+        linear.push_back(factor.linearise(values))
+    return linear
+
+
+def check_variables(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values) -> None:
+    """Raise `FactorError` unless factors and values speak of the same variables, and wrapped linear ones fit them.
+
+    A variable without a single factor is a `SingularSystemError`.
+    """
+    dims = values.dims()
+    used = {*graph.keyVector(), *(key for factor in factors for key in factor.keys)}
+    missing = sorted(used - dims.keys())
+    if missing:
+        raise FactorError(f"values: expected {format_keys(missing)}, which factors speak of")
+    free = sorted(dims.keys() - used)
+    if free:
+        raise SingularSystemError(f"no factor speaks of {format_keys(free)}", tuple(free))
+    factors_of_graph = (graph.at(i) for i in range(graph.size()) if graph.exists(i))
+    check_dimensions(  # GTSAM's own factors check their variables themselves, wrapped linear ones do not
+        (factor.factor() for factor in factors_of_graph if isinstance(factor, gtsam.LinearContainerFactor)), dims
+    )
+
+
+@dataclass(frozen=True)
+class _Move:
+    """values, error: where the step led, length: of the step, in sigmas, damping: that it took, exact: whether the
+    error came out as the linearisation had said, which means that there is nothing nonlinear.
+    """
+
+    values: gtsam.Values
+    error: float
+    length: float
+    damping: float
+    exact: bool
+
+
+def _move(
+    graph: gtsam.NonlinearFactorGraph,
+    factors: Sequence[Linearisable],
+    linear: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    error: float,
+    damping: float,
+    settings: SolverSettings,
+) -> _Move | None:
+    """Return the first step, damped as much as it takes, that does not raise the error; None when none does."""
+    careful = settings.method == "levenberg-marquardt"
+    undetermined = False
+    while damping <= _MAX_DAMPING:
+        step = _step(linear, ordering, damping)
+        if step is None:
+            undetermined |= damping == 0
+            if not careful:
+                raise singular_system(linear)
+        else:
+            length = _length(linear, step, damping)
+            moved = values.retract(step)
+            if not careful:
+                return _Move(moved, error, length, 0.0, False)
+            if undetermined and length <= settings.tolerance and damping <= settings.damping:
+                raise singular_system(linear)  # standing still, but only the damping says where
+            moved_error = _error_or_infinity(graph, factors, moved)
+            if moved_error <= error * (1 + _EXACT) or (length <= settings.tolerance and damping == 0):
+                exact = abs(moved_error - linear.error(step)) <= _EXACT * error
+                return _Move(moved, moved_error, length, damping, exact)
+        damping = max(10 * damping, settings.damping)
+    if undetermined:
+        raise singular_system(linear)
+    return None
+
+
+def _error(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values) -> float:
+    try:
+        native = graph.error(values)
+    except FactorError:
+        raise
+    except (RuntimeError, ValueError) as error:
+        raise FactorError(f"GTSAM could not evaluate the graph: {error}") from error
+    return native + sum(factor.error(values) for factor in factors)
+
+
+def _error_or_infinity(
+    graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values
+) -> float:
+    try:
+        return _error(graph, factors, values)
+    except FactorError:  # a step too far, to where a factor is undefined
+        return float("inf")
+
+
+def _step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: float) -> gtsam.VectorValues | None:
+    """Return the damped step, or None when the system is singular."""
+    system = linear
+    if damping > 0:
+        system = gtsam.GaussianFactorGraph()
+        system.push_back(linear)
+        zero = linear.gradientAtZero()
+        for i in range(ordering.size()):
+            key = ordering.at(i)
+            dim = zero.dim(key)
+            system.push_back(native_factor([key], [dim], np.sqrt(damping) * np.eye(dim, dim + 1)))
+    try:
+        step = system.optimize(ordering)
+    except RuntimeError:
+        return None
+    return step if np.isfinite(step.norm()) else None
+
+
+def _length(linear: gtsam.GaussianFactorGraph, step: gtsam.VectorValues, damping: float) -> float:
+    """Return sqrt(delta^T H delta); (H + lambda I) delta = g makes that g^T delta - lambda delta^T delta."""
+    square = -linear.gradientAtZero().dot(step) - damping * step.dot(step)
+    return float(np.sqrt(max(square, 0.0)))

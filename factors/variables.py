@@ -1,0 +1,115 @@
+"""What a factor of ours must know of a variable: how to read it from `gtsam.Values`, its dimension, how to move it.
+
+A variable x lives on a manifold; x + delta means retract(x, delta), delta in R^dim. For vectors that is the sum, for
+poses GTSAM's own retraction, so that Jacobians are taken in the coordinates in which GTSAM's solvers step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+
+from factors.errors import FactorError
+from factors.validation import FloatArray, format_key
+
+
+class Variable(Protocol):
+    """A type of variable; states are whatever `read` returns."""
+
+    @property
+    def dim(self) -> int: ...
+
+    def read(self, values: gtsam.Values, key: int) -> Any:
+        """Return the state of `key`; GTSAM raises RuntimeError when there is none, or one of another type."""
+
+    def retract(self, state: Any, delta: FloatArray) -> Any:
+        """Return `state` moved by `delta` (dim,)."""
+
+    def local(self, state: Any, other: Any) -> FloatArray:
+        """Return the delta (dim,) from `state` to `other`."""
+
+    def size(self, state: Any) -> FloatArray:
+        """Return the magnitude (dim,) of each coordinate, which numerical differences choose their steps by."""
+
+
+@dataclass(frozen=True)
+class Vector:
+    """A vector of R^dim; its states are read-only arrays of shape (dim,)."""
+
+    dim: int
+
+    def __post_init__(self) -> None:
+        if isinstance(self.dim, bool) or not isinstance(self.dim, int | np.integer) or self.dim < 1:
+            raise FactorError(f"dim: expected a positive integer, got {self.dim!r}")
+
+    def read(self, values: gtsam.Values, key: int) -> FloatArray:
+        state = values.atVector(key)
+        if len(state) != self.dim:
+            raise FactorError(f"{format_key(key)}: expected a vector of {self.dim} entries, got {len(state)}")
+        state.flags.writeable = False  # a function that writes into its arguments would spoil the next one's
+        return state
+
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        return state + delta
+
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        return other - state
+
+    def size(self, state: FloatArray) -> FloatArray:
+        return np.abs(state)
+
+
+@dataclass(frozen=True)
+class PlanarPose:
+    """A `gtsam.Pose2`; delta = (x, y, heading) in the pose's own frame."""
+
+    @property
+    def dim(self) -> int:
+        return 3
+
+    def read(self, values: gtsam.Values, key: int) -> gtsam.Pose2:
+        return values.atPose2(key)
+
+    def retract(self, state: gtsam.Pose2, delta: FloatArray) -> gtsam.Pose2:
+        return state.retract(delta)
+
+    def local(self, state: gtsam.Pose2, other: gtsam.Pose2) -> FloatArray:
+        return state.localCoordinates(other)
+
+    def size(self, state: gtsam.Pose2) -> FloatArray:
+        return np.ones(3)
+
+
+@dataclass(frozen=True)
+class SpatialPose:
+    """A `gtsam.Pose3`; delta = (rotation vector, translation) in the pose's own frame."""
+
+    @property
+    def dim(self) -> int:
+        return 6
+
+    def read(self, values: gtsam.Values, key: int) -> gtsam.Pose3:
+        return values.atPose3(key)
+
+    def retract(self, state: gtsam.Pose3, delta: FloatArray) -> gtsam.Pose3:
+        return state.retract(delta)
+
+    def local(self, state: gtsam.Pose3, other: gtsam.Pose3) -> FloatArray:
+        return state.localCoordinates(other)
+
+    def size(self, state: gtsam.Pose3) -> FloatArray:
+        return np.ones(6)
+
+
+def read_states(values: gtsam.Values, keys: Sequence[int], variables: Sequence[Variable]) -> list[Any]:
+    """Return the states of `keys`; raise `FactorError` for a missing one or one of another type or dimension."""
+    try:
+        return [variable.read(values, key) for key, variable in zip(keys, variables, strict=True)]
+    except RuntimeError as error:
+        missing = [key for key in keys if not values.exists(key)]
+        reason = f"has no {format_key(missing[0])}" if missing else f"holds another type of variable: {error}"
+        raise FactorError(f"values {reason}") from error

@@ -1,0 +1,227 @@
+"""The solver: convergence, damping, robust weights, variables on manifolds, and what it says when it cannot."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import (
+    FactorError,
+    PlanarPose,
+    RangeBearing,
+    ResidualFactor,
+    Robust,
+    SingularSystemError,
+    SolverSettings,
+    SpatialPose,
+    Vector,
+    detection_factor,
+    gaussian_factor,
+    gaussian_graph,
+    interaction_factor,
+    linearised,
+    nonlinear_graph,
+    position,
+    prior_factor,
+    solve,
+)
+
+X = [gtsam.symbol("x", i) for i in range(10)]
+EMPTY = gtsam.NonlinearFactorGraph()
+
+
+def values_of(states):
+    values = gtsam.Values()
+    for key, state in states.items():
+        values.insert(key, state)
+    return values
+
+
+def rosenbrock(x):
+    return np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
+
+
+def on_vector(residual, key=0, dim=2, m=2, **given):
+    return ResidualFactor((key,), (Vector(dim),), residual, np.eye(m), **given)
+
+
+@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt"])
+def test_linear_problem_takes_one_step(method, covariance):
+    rng = np.random.default_rng(0)
+    factors = [prior_factor(X[0], rng.normal(size=3), covariance(rng, 3))]
+    for i in range(6):
+        factors.append(
+            interaction_factor(X[i + 1], [X[i]], [rng.normal(size=(3, 3))], rng.normal(size=3), covariance(rng, 3))
+        )
+    start = values_of({X[i]: 10 * rng.normal(size=3) for i in range(7)})
+    solution = solve(nonlinear_graph(factors, dict.fromkeys(X, 3)), [], start, SolverSettings(method=method))
+    expected = gaussian_graph(factors).optimize()
+    assert solution.converged
+    assert solution.iterations <= 2
+    for i in range(7):
+        np.testing.assert_allclose(solution.values.atVector(X[i]), expected.at(X[i]), atol=1e-7)
+    information, _ = gaussian_graph(factors).hessian(gtsam.Ordering(X[:7]))
+    np.testing.assert_allclose(solution.covariance(X[2:4]), np.linalg.inv(information)[6:12, 6:12], rtol=1e-6)
+
+
+def test_levenberg_marquardt_comes_down_a_curved_valley():
+    solution = solve(EMPTY, [on_vector(rosenbrock)], values_of({0: np.array([-1.2, 1.0])}))
+    assert solution.converged
+    np.testing.assert_allclose(solution.values.atVector(0), [1.0, 1.0], atol=1e-8)
+    assert solution.error == pytest.approx(0.0, abs=1e-15)
+
+
+def test_damping_saves_a_step_that_gauss_newton_loses():
+    factor = on_vector(lambda x: np.arctan(x), dim=1, m=1)
+    start = values_of({0: np.array([3.0])})
+    assert not solve(EMPTY, [factor], start, SolverSettings("gauss-newton", max_iterations=3)).converged
+    solution = solve(EMPTY, [factor], start)
+    assert solution.converged
+    assert solution.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-8)
+
+
+def test_running_out_of_iterations_is_reported():
+    solution = solve(
+        EMPTY, [on_vector(rosenbrock)], values_of({0: np.array([-1.2, 1.0])}), SolverSettings(max_iterations=2)
+    )
+    assert not solution.converged
+    assert solution.iterations == 2
+    assert solution.error < 0.5 * np.sum(rosenbrock(np.array([-1.2, 1.0])) ** 2)
+
+
+def test_step_to_where_a_factor_is_undefined_is_shortened():
+    def logarithm(x):
+        return np.log(x - 1.0) if x[0] > 1 else np.array([np.nan])
+
+    solution = solve(EMPTY, [on_vector(logarithm, dim=1, m=1)], values_of({0: np.array([10.0])}))
+    assert solution.converged
+    assert solution.values.atVector(0)[0] == pytest.approx(2.0, abs=1e-8)
+
+
+def test_robust_mean_is_the_weighted_one():
+    rng = np.random.default_rng(2)
+    z = np.concatenate([rng.normal(size=(40, 2)), 30 + rng.normal(size=(8, 2))])
+    robust = Robust("cauchy", 1.0)
+    factors = [detection_factor(0, position(2), measured, np.eye(2), robust) for measured in z]
+    mean = solve(EMPTY, factors, values_of({0: np.median(z, axis=0)})).values.atVector(0)
+    weight = robust.weight(np.linalg.norm(z - mean, axis=1))
+    np.testing.assert_allclose(mean, (weight[:, None] * z).sum(axis=0) / weight.sum(), atol=1e-5)
+    assert np.linalg.norm(mean) < 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("spatial", [False, True])
+def test_factors_between_poses_and_vectors(spatial, seed):
+    """A point seen from two poses: numerical Jacobians on manifolds, agreement with GTSAM's solver."""
+    rng = np.random.default_rng(seed)
+    d = 3 if spatial else 2
+    pose_type = gtsam.Pose3 if spatial else gtsam.Pose2
+    variable = SpatialPose() if spatial else PlanarPose()
+
+    def seen(pose, point):
+        return pose.transformTo(point)
+
+    poses = [pose_type.Expmap(0.3 * rng.normal(size=variable.dim)) for _ in range(3)]
+    points = 5 * rng.normal(size=(4, d))
+    graph, ours, start = gtsam.NonlinearFactorGraph(), [], gtsam.Values()
+    noise = gtsam.noiseModel.Isotropic.Sigma(variable.dim, 0.1)
+    prior = gtsam.PriorFactorPose3 if spatial else gtsam.PriorFactorPose2
+    for i, pose in enumerate(poses):
+        graph.add(prior(100 - i, pose, noise))
+        start.insert(100 - i, pose.retract(0.1 * rng.normal(size=variable.dim)))
+        for j, point in enumerate(points):
+            z = seen(pose, point) + 0.01 * rng.normal(size=d)
+            ours.append(
+                ResidualFactor(
+                    (100 - i, j),
+                    (variable, Vector(d)),
+                    lambda pose, point, z=z: seen(pose, point) - z,
+                    1e-4 * np.eye(d),
+                    name="point",
+                )
+            )
+    for j, point in enumerate(points):
+        start.insert(j, point + 0.1 * rng.normal(size=d))
+    solution = solve(graph, ours, start)
+    assert solution.converged
+
+    H_pose, H_point = (np.zeros((d, n), order="F") for n in (variable.dim, d))
+    state = ours[0].states(solution.values)
+    state[0].transformTo(state[1], H_pose, H_point)
+    for numerical, exact in zip(ours[0].jacobians_at(state), (H_pose, H_point), strict=True):
+        np.testing.assert_allclose(numerical, exact, atol=1e-8)
+
+    for factor in ours:
+        graph.add(factor.as_custom_factor())
+    theirs = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    assert solution.error <= graph.error(theirs) * (1 + 1e-9)
+    for i in range(3):
+        pose = PlanarPose() if not spatial else SpatialPose()
+        difference = pose.local(pose.read(solution.values, 100 - i), pose.read(theirs, 100 - i))
+        np.testing.assert_allclose(difference, 0, atol=1e-3)
+
+
+def test_free_variables_are_named():
+    between = gaussian_factor(X[1:3], [np.eye(2), -np.eye(2)], [0.0, 0.0])
+    graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2)), between], dict.fromkeys(X, 2))
+    start = values_of({key: np.ones(2) for key in X[:3]})
+    for method in ("gauss-newton", "levenberg-marquardt"):
+        with pytest.raises(SingularSystemError, match="does not determine x1, x2") as caught:
+            solve(graph, [], start, SolverSettings(method=method))
+        assert caught.value.keys == (X[1], X[2])
+
+
+def test_only_the_free_direction_of_a_nonlinear_problem_is_named():
+    ranges = ResidualFactor((X[3],), (Vector(2),), lambda x: [np.hypot(*x) - 5.0], np.eye(1))
+    known = detection_factor(X[1], position(2), [1.0, 2.0], np.eye(2))
+    with pytest.raises(SingularSystemError, match="does not determine x3;"):
+        solve(EMPTY, [ranges, known], values_of({X[1]: np.ones(2), X[3]: np.array([3.0, 3.0])}))
+
+
+def test_variable_without_any_factor_is_named():
+    graph = nonlinear_graph([prior_factor(X[0], [0.0], [[1.0]])], {X[0]: 1})
+    with pytest.raises(SingularSystemError, match="no factor speaks of x4"):
+        solve(graph, [], values_of({X[0]: np.zeros(1), X[4]: np.zeros(1)}))
+
+
+def test_factor_on_unknown_variable_is_named():
+    graph = nonlinear_graph([prior_factor(X[0], [0.0], [[1.0]])], {X[0]: 1})
+    with pytest.raises(FactorError, match="expected x5, which factors speak of"):
+        solve(graph, [detection_factor(X[5], position(2), [0.0, 0.0], np.eye(2))], values_of({X[0]: np.zeros(1)}))
+
+
+@pytest.mark.parametrize("state", [np.zeros(3), gtsam.Pose2()])
+def test_linear_factor_on_another_dimension_is_refused(state):
+    graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2))], {X[0]: 2})
+    with pytest.raises(FactorError, match="2 columns, but these variables have 3 dimensions"):
+        solve(graph, [], values_of({X[0]: state}))
+
+
+def test_gtsams_own_complaints_come_as_factor_errors():
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose2(X[0], gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)))
+    with pytest.raises(FactorError, match="GTSAM could not evaluate"):
+        solve(graph, [], values_of({X[0]: np.zeros(3)}))
+
+
+def test_number_that_is_not_finite_is_found_at_the_start():
+    factor = prior_factor(X[0], [0.0], [[1.0]])
+    factor.getb()[0] = np.nan
+    with pytest.raises(FactorError, match="not finite"):
+        solve(nonlinear_graph([factor], {X[0]: 1}), [], values_of({X[0]: np.zeros(1)}))
+
+
+def test_solution_passes_on_its_linear_factors():
+    model, z = RangeBearing(2), np.array([5.0, 0.5])
+    factors = [detection_factor(0, model, z, np.diag([0.01, 0.001])) for _ in range(2)]
+    solution = solve(EMPTY, factors, values_of({0: np.array([4.0, 1.0])}))
+    again = linearised(EMPTY, factors, solution.values)
+    np.testing.assert_allclose(solution.linear.hessian()[0], again.hessian()[0])
+    np.testing.assert_allclose(solution.covariance([0]), np.linalg.inv(again.hessian()[0]), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "given", [{"method": "newton"}, {"max_iterations": 0}, {"tolerance": 0.0}, {"damping": -1.0}, {"tolerance": np.nan}]
+)
+def test_bad_settings_are_refused(given):
+    with pytest.raises(FactorError):
+        SolverSettings(**given)
