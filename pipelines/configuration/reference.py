@@ -93,14 +93,21 @@ def _type_text(schema: Schema) -> str:
             return " or ".join(f"`{scalar_text(option)}`" for option in options)
         case Listing(items, any_length):
             if any_length:
-                return f"list of {_type_text(items[0])}"
+                return f"list of {_plural(_type_text(items[0]))}"
             return f"list of {len(items)}: " + ", ".join(_type_text(item) for item in items)
         case Table(inner):
-            return f"table of {_type_text(inner)}"
+            return f"table of {_plural(_type_text(inner))}"
         case Section(classes):
             return "section" if len(classes) == 1 else "section of a `kind`"
         case Nullable(inner):
             return f"{_type_text(inner)}, or `null`"
+
+
+def _plural(text: str) -> str:
+    for noun in ("section", "number", "list"):
+        if text.startswith((noun, f"whole {noun}")):
+            return text.replace(noun, f"{noun}s", 1)
+    return text
 
 
 def _first_paragraph(cls: type) -> str:

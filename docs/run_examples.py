@@ -1,0 +1,104 @@
+"""Runs the examples of the documentation: `python docs/run_examples.py README.md docs/*.md`.
+
+Every fenced block of bash or Python is preceded by a comment that says what becomes of it:
+
+    <!-- run -->                    it is run
+    <!-- run with recordings -->    it is run where SAGA_FG_DATA names a folder with recordings, else skipped
+    <!-- ci -->                     .ci/run runs it, with `--mark ci`, in the root of the repository
+    <!-- not run: REASON -->        it is not run
+
+The blocks of a page run in order in one temporary folder, bash with `set -euo pipefail`, Python in a fresh interpreter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FENCE = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>bash|python)\n(?P<code>.*?)^```$", re.M | re.S)
+MARKS = ("run", "run with recordings", "ci")
+
+
+@dataclass(frozen=True)
+class Example:
+    """A fenced block: where it is, how it is marked, what is in it."""
+
+    page: Path
+    line: int
+    mark: str
+    language: str
+    code: str
+
+
+class UnmarkedExampleError(Exception):
+    """A block says neither that it is run nor why it is not."""
+
+
+def examples(page: Path) -> list[Example]:
+    """The blocks of a page. Raises `UnmarkedExampleError` for one without a mark."""
+    text = page.read_text(encoding="utf-8")
+    found = []
+    for match in FENCE.finditer(text):
+        line = text.count("\n", 0, match.start("code"))
+        mark = match["mark"] or ""
+        if mark not in MARKS and not mark.startswith("not run: "):
+            raise UnmarkedExampleError(f"{page}:{line}: expected a mark such as <!-- run --> before the block")
+        found.append(Example(page, line, mark, match["language"], match["code"]))
+    return found
+
+
+def run(example: Example, folder: Path, environment: dict[str, str]) -> int:
+    """Run one block in a folder; its exit code."""
+    if example.language == "bash":
+        command = ["bash", "-euo", "pipefail", "-c", example.code]
+    else:
+        command = [sys.executable, "-W", "error", "-c", example.code]
+    return subprocess.run(command, cwd=folder, env=environment, check=False).returncode
+
+
+def run_page(page: Path, wanted: Iterable[str], environment: dict[str, str]) -> list[str]:
+    """Run the wanted blocks of a page in one folder; one line for each that failed."""
+    failed = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for example in examples(page):
+            where = f"{page}:{example.line}"
+            if example.mark not in wanted:
+                continue
+            if example.mark == "run with recordings" and "SAGA_FG_DATA" not in environment:
+                print(f"--- {where}: skipped, SAGA_FG_DATA is not set to a folder with recordings", flush=True)
+                continue
+            print(f"--- {where}", flush=True)
+            folder = ROOT if example.mark == "ci" else Path(temporary)
+            code = run(example, folder, environment)
+            if code:
+                failed.append(f"{where}: exit code {code}")
+    return failed
+
+
+def main() -> int:
+    """Run the pages named on the command line; 1 if a block failed."""
+    parser = argparse.ArgumentParser(description="Run the examples of the documentation.")
+    parser.add_argument("pages", nargs="+", type=Path)
+    parser.add_argument("--mark", choices=MARKS, help="only blocks marked so (default: all but ci)")
+    arguments = parser.parse_args()
+    environment = dict(os.environ)
+    beside = ROOT.parent / "shared" / "data"
+    if "SAGA_FG_DATA" in environment or beside.is_dir():  # as an absolute path: examples run in other folders
+        environment["SAGA_FG_DATA"] = str(Path(environment.get("SAGA_FG_DATA", beside)).resolve())
+    wanted = (arguments.mark,) if arguments.mark else MARKS[:2]
+    failed = [line for page in arguments.pages for line in run_page(page, wanted, environment)]
+    for line in failed:
+        print(f"FAILED {line}", flush=True)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

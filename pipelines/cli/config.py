@@ -1,0 +1,45 @@
+"""`saga-fg config`: every setting with its default and its meaning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from pipelines.cli.options import Verbose
+
+
+def config(
+    kind: Annotated[
+        Literal["file", "nuscenes", "kitti", "simulated"],
+        typer.Option("--for", help="The kind of data whose shipped defaults to print."),
+    ] = "file",
+    simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,
+    file: Annotated[
+        Path | None, typer.Option("--config", help="Print the settings this YAML file leads to.", metavar="FILE")
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="The reference in Markdown instead of YAML.")] = False,
+    verbose: Verbose = False,
+) -> None:
+    """Print every setting, its default and what it means, as YAML to edit and pass to `--config`.
+
+    A file needs to hold only what it changes.
+
+    \b
+    Examples:
+      saga-fg config > mine.yaml                      # everything, to edit
+      saga-fg config --for kitti --config mine.yaml   # what mine.yaml makes of the defaults for KITTI
+      saga-fg config --simulator                      # settings of `saga-fg simulate`
+    """
+    from data_tools.simulator import SimulatorSettings
+    from pipelines.config import TrackConfig, load_config
+    from pipelines.configuration import load_settings, settings_reference, write_settings
+
+    if markdown:
+        text = settings_reference(SimulatorSettings if simulator else TrackConfig)
+    elif simulator:
+        text = write_settings(load_settings(SimulatorSettings, file) if file else SimulatorSettings())
+    else:
+        text = write_settings(load_config(kind, file))
+    typer.echo(text, nl=False)

@@ -1,0 +1,46 @@
+"""`saga-fg demo`: simulated traffic, three trackers, a table, a picture and a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import progress_bar
+
+
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the page.")] = Path(
+        "saga-fg-demo"
+    ),
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of simulated scenes.")] = 3,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate traffic, track it with three methods, and compare them.
+
+    Prints a table, and writes a bird's-eye picture and an HTML page with a player. Takes less than a minute.
+
+    \b
+    Examples:
+      saga-fg demo
+      saga-fg demo --output out --scenes 1 --seed 3
+    """
+    from pipelines.comparison import COLUMNS, table_rows
+    from pipelines.config import load_config
+    from pipelines.demo import run_demo
+
+    with progress_bar() as progress:
+        result = run_demo(output, load_config("simulated", config), scenes=scenes, seed=seed, progress=progress)
+    table = Table(title=f"{scenes} simulated scenes, seed {seed}", title_justify="left")
+    for k, column in enumerate(COLUMNS):
+        table.add_column(column, justify="right" if k else "left", no_wrap=k == 0)
+    for row in table_rows(result.comparison):
+        table.add_row(*row)
+    Console().print(table)
+    typer.echo(f"picture: {result.picture}\npage:    {result.page}")

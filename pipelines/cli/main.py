@@ -1,0 +1,48 @@
+"""The command `saga-fg` and its sub-commands."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from pipelines.cli.config import config
+from pipelines.cli.demo import demo
+from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.track import track_app
+
+app = typer.Typer(
+    cls=ReportingGroup,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(track_app, name="track")
+app.command()(demo)
+app.command()(config)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"saga-fg {version('saga-fg')}")
+        raise typer.Exit
+
+
+@app.callback()
+def saga_fg(
+    show_version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
+    ] = False,
+) -> None:
+    """Track many interacting objects with a graph-aware Kalman filter.
+
+    Start with `saga-fg demo`; then `saga-fg track --help` for recordings.
+    """
+
+
+def main() -> None:
+    """Entry point of the installed command."""
+    app(prog_name="saga-fg")

@@ -1,0 +1,42 @@
+"""Options that several commands share, and the parsing of their values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.cli.reporting import set_up_logging
+from saga_fg.errors import InputError
+
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Say more on stderr.", callback=set_up_logging, show_default=False)
+]
+Config = Annotated[
+    Path | None, typer.Option("--config", help="YAML file over the defaults; see `saga-fg config`.", metavar="FILE")
+]
+
+
+def sensor_files(values: Sequence[str]) -> dict[str, Path]:
+    """`["lidar=a.json", "camera=b.json"]` as a mapping; a lone file without a name is the sensor "lidar"."""
+    files: dict[str, Path] = {}
+    for value in values:
+        sensor, equals, path = value.partition("=")
+        if not equals and len(values) == 1:
+            sensor, path = "lidar", value
+        if not sensor or not path:
+            raise InputError(f"--detections {value}: expected NAME=FILE, e.g. lidar={value or 'detections.json'}")
+        if sensor in files:
+            raise InputError(f"--detections {value}: the sensor {sensor} is given twice")
+        files[sensor] = Path(path)
+    return files
+
+
+def names(option: str, value: str) -> tuple[str, ...]:
+    """The entries of a comma-separated option, each once."""
+    entries = tuple(dict.fromkeys(entry.strip() for entry in value.split(",") if entry.strip()))
+    if not entries:
+        raise InputError(f"{option}: expected names with commas between them, got {value!r}")
+    return entries

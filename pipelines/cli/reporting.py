@@ -1,0 +1,85 @@
+"""How the command talks: results on stdout; progress, warnings and one-line errors on stderr.
+
+Exit codes: 0 done, 2 wrong arguments or input (`SagaError`), 130 interrupted; anything else is a bug and a traceback.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from typer.core import TyperGroup
+
+from pipelines.tracking import Progress as ProgressCallback
+from saga_fg.errors import SagaError
+
+log = logging.getLogger(__name__)
+
+INPUT_ERROR, INTERRUPTED = 2, 130
+
+
+@functools.cache
+def error_console() -> Console:
+    """The one console on stderr, shared by log lines and progress bar so that they do not run into each other."""
+    return Console(stderr=True)
+
+
+class ReportingGroup(TyperGroup):
+    """Turns what a command raises into a line on stderr and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except SagaError as error:
+            log.debug("where the error was found", exc_info=error)
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(INPUT_ERROR) from error
+        except KeyboardInterrupt as error:
+            typer.echo("interrupted: nothing was written", err=True)
+            raise typer.Exit(INTERRUPTED) from error
+
+
+class _ConsoleHandler(logging.Handler):
+    """Log lines above the progress bar, as they are: neither wrapped nor coloured."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error_console().print(self.format(record), markup=False, highlight=False, soft_wrap=True)
+
+
+def set_up_logging(verbose: bool) -> None:
+    """Warnings to stderr; with `verbose` everything that is logged, and tracebacks with errors."""
+    level = logging.DEBUG if verbose else logging.WARNING
+    for name in ("factors", "saga_fg", "data_tools", "pipelines"):  # other libraries' debug lines are not ours to show
+        logging.getLogger(name).setLevel(level)
+    root = logging.getLogger()
+    if not any(isinstance(handler, _ConsoleHandler) for handler in root.handlers):
+        handler = _ConsoleHandler()
+        handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+        root.addHandler(handler)
+
+
+@contextmanager
+def progress_bar(scenes: int | None = None) -> Iterator[ProgressCallback]:
+    """A progress callback that draws a bar on stderr, and draws nothing where stderr is not a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+    console = error_console()
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task("reading")
+        seen: list[str] = []
+
+        def advance(scene: str, done: int, total: int) -> None:
+            if not seen or seen[-1] != scene:
+                seen.append(scene)
+            of = f"/{scenes}" if scenes else ""
+            bar.update(task, description=f"{scene} ({len(seen)}{of})", completed=done, total=total)
+
+        yield advance

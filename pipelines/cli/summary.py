@@ -1,0 +1,44 @@
+"""The line that says what a run of the tracker did."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import typer
+
+from pipelines.tracking import TrackedScene
+
+
+@dataclass
+class Summary:
+    """Counts the scenes that pass through it."""
+
+    output: Path
+    scenes: int = 0
+    frames: int = 0
+    boxes: int = 0
+    seconds: float = 0.0
+    tracks: set[tuple[str, int]] = field(default_factory=set)
+
+    def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
+        """The same runs, counted."""
+        for run in runs:
+            self.scenes += 1
+            self.frames += run.frames
+            self.seconds += run.seconds
+            self.boxes += sum(len(tracks) for tracks in run.tracks)
+            self.tracks.update((run.scene.name, id_) for tracks in run.tracks for id_ in tracks.id.tolist())
+            yield run
+
+    def show(self) -> None:
+        """Print the line on stdout."""
+        rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
+        counts = ((self.scenes, "scene"), (self.frames, "frame"), (len(self.tracks), "track"), (self.boxes, "box"))
+        typer.echo(f"{self.output}: {', '.join(_counted(*count) for count in counts)}{rate}")
+
+
+def _counted(number: int, noun: str) -> str:
+    plural = "" if number == 1 else "es" if noun.endswith("x") else "s"
+    return f"{number} {noun}{plural}"

@@ -1,0 +1,156 @@
+"""The command as users meet it: help with examples, one-line errors, exit codes, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from pipelines.cli import app
+from pipelines.cli.options import names, sensor_files
+from saga_fg import InputError
+
+SAGA_FG = [sys.executable, "-c", "from pipelines.cli import main; main()"]
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_it_was() -> Iterator[None]:
+    root = logging.getLogger()
+    handlers = list(root.handlers)
+    yield
+    root.handlers = handlers
+    for name in ("factors", "saga_fg", "data_tools", "pipelines"):
+        logging.getLogger(name).setLevel(logging.NOTSET)
+
+
+def saga_fg(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize("command", ["track nuscenes", "track kitti", "track file", "demo", "config"], ids=lambda c: c)
+def test_help_shows_a_worked_example(command: str) -> None:
+    result = saga_fg(*command.split(), "--help")
+    assert result.exit_code == 0
+    assert f"    saga-fg {command}" in result.stdout
+    assert "Example" in result.stdout
+
+
+def test_version_is_that_of_the_distribution() -> None:
+    result = saga_fg("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("saga-fg 0.")
+
+
+def test_config_prints_yaml_that_leads_to_itself(tmp_path: Path) -> None:
+    printed = saga_fg("config", "--for", "kitti").stdout
+    path = tmp_path / "all.yaml"
+    path.write_text(printed)
+    assert saga_fg("config", "--for", "file", "--config", path).stdout == printed
+    assert set(yaml.safe_load(printed)) == {"tracker", "greedy", "sensors"}
+
+
+def test_config_prints_the_simulators_settings_and_markdown() -> None:
+    assert "keyframe_rate" in yaml.safe_load(saga_fg("config", "--simulator").stdout)
+    assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout
+    assert "## `road`" in saga_fg("config", "--markdown", "--simulator").stdout
+
+
+def test_an_input_error_is_one_line_on_stderr_and_exit_code_2(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("tracker: {max_dely: 3}\n")
+    result = saga_fg("config", "--config", path)
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {path}: tracker.max_dely: unknown key, did you mean 'max_delay'?\n"
+    assert result.stdout == ""
+
+
+def test_verbose_adds_the_traceback(tmp_path: Path) -> None:
+    result = saga_fg("config", "--config", tmp_path / "none.yaml", "-v")
+    assert result.exit_code == 2
+    assert "Traceback (most recent call last)" in result.stderr
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+
+
+def test_a_missing_option_is_explained() -> None:
+    result = saga_fg("track", "nuscenes", "--dataroot", "x")
+    assert result.exit_code == 2
+    assert "--detections" in result.stderr
+
+
+def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("pipelines.config.load_config", broken)
+    assert isinstance(saga_fg("config").exception, ZeroDivisionError)
+
+
+def test_sensor_files_are_named() -> None:
+    assert sensor_files(["a.json"]) == {"lidar": Path("a.json")}
+    assert sensor_files(["lidar=a=b.json", "camera=c"]) == {"lidar": Path("a=b.json"), "camera": Path("c")}
+    with pytest.raises(InputError, match=r"--detections b\.json: expected NAME=FILE, e\.g\. lidar=b\.json"):
+        sensor_files(["a=x", "b.json"])
+    with pytest.raises(InputError, match="the sensor a is given twice"):
+        sensor_files(["a=x", "a=y"])
+
+
+def test_names_are_split_at_commas() -> None:
+    assert names("--scenes", "a, b,a,") == ("a", "b")
+    with pytest.raises(InputError, match="--scenes: expected names"):
+        names("--scenes", " , ")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
+    """Interrupted while it works: exit code 130, one line, no file and no temporary."""
+    command = [*SAGA_FG, "demo", "--output", str(tmp_path / "out"), "--scenes", "50"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    while not list(tmp_path.iterdir()) and process.poll() is None:  # the temporary folder: the work has begun
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate()
+    assert process.returncode == 130, stderr
+    assert stderr.strip().splitlines()[-1] == "interrupted: nothing was written"
+    assert stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_leaves_an_earlier_result_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    output = tmp_path / "out"
+    output.mkdir()
+    (output / "index.html").write_text("earlier")
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipelines.demo.run.compare", interrupted)
+    result = saga_fg("demo", "--output", output)
+    assert result.exit_code == 130
+    assert [(path.name, path.read_text()) for path in output.iterdir()] == [("index.html", "earlier")]
+    assert list(tmp_path.iterdir()) == [output]
+
+
+def test_an_output_that_cannot_be_written_is_noticed_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.demo.run.compare", lambda *_, **__: pytest.fail("work was done"))
+    result = saga_fg("demo", "--output", tmp_path / "none" / "out")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {tmp_path / 'none' / 'out'}: not writable")
+
+
+def test_the_installed_command_runs_on_its_own(tmp_path: Path) -> None:
+    """As a process of its own: a clean stdout, no progress bar where stderr is no terminal."""
+    run = subprocess.run([*SAGA_FG, "config"], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert run.stderr == ""
+    assert json.dumps(yaml.safe_load(run.stdout)["tracker"]["max_delay"]) == "0.5"

@@ -1,0 +1,116 @@
+"""The demonstration: methods on the same scenes, a picture and a page that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from pipelines.cli import app
+from pipelines.comparison import COLUMNS, Comparison, compare, table_rows
+from pipelines.config import load_config
+from pipelines.demo.page import demo_page
+from pipelines.demo.run import METHODS, hardest_moment, latest_detections, run_demo
+from saga_fg import InputError, Scene
+
+SHORT = SimulatorSettings(duration=3.0, warm_up=5.0)
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    return compare(SimulatedTraffic(SHORT, scenes=2, seed=1), load_config("simulated"), METHODS)
+
+
+def test_all_methods_see_the_same_scenes(comparison: Comparison) -> None:
+    assert tuple(comparison.runs) == METHODS
+    assert len({tuple(run.scene.name for run in runs) for runs in comparison.runs.values()}) == 1
+    objects = {m.objects for m in comparison.metrics.values()}
+    assert len(objects) == 1
+    assert objects.pop() > 100
+    for runs in comparison.runs.values():
+        for run in runs:
+            assert len(run.tracks) == len(run.scene)
+            assert run.frames == sum(frame.timestamp <= run.scene.timestamps[-1] for frame in run.scene.frames)
+
+
+def test_the_table_has_a_row_for_each_method(comparison: Comparison) -> None:
+    rows = table_rows(comparison)
+    assert [row[0] for row in rows] == list(METHODS)
+    assert all(len(row) == len(COLUMNS) for row in rows)
+    assert float(rows[2][1]) == pytest.approx(comparison.metrics["saga"].position.rmse, abs=5e-4)
+
+
+def test_a_scene_without_ground_truth_cannot_be_compared() -> None:
+    class Blind:
+        scenes = ("a",)
+
+        def scene(self, name: str) -> Scene:
+            return Scene(name, np.zeros(1), np.eye(4)[None], ("",), [])
+
+    with pytest.raises(InputError, match="scene a: expected ground truth"):
+        compare(Blind(), load_config("file"), METHODS)
+
+
+def test_the_moment_shown_has_the_most_moving_hidden_objects(comparison: Comparison) -> None:
+    scene_row, moment = hardest_moment(comparison)
+    run = comparison.runs["saga"][scene_row]
+    assert run.scene.ground_truth is not None
+
+    def hidden(scene: Scene, k: int) -> int:
+        assert scene.ground_truth is not None
+        truth = scene.ground_truth[k]
+        near = np.hypot(*(truth.boxes.position[:, :2] - scene.world_T_ego[k, :2, 3]).T) < 40
+        return int((~truth.visible & near & (np.hypot(*truth.boxes.velocity.T) > 0.5)).sum())
+
+    scenes = [run.scene for run in comparison.runs["saga"]]
+    assert hidden(run.scene, moment) == max(hidden(scene, k) for scene in scenes for k in range(len(scene)))
+
+
+def test_latest_detections_are_those_of_every_sensors_last_frame(comparison: Comparison) -> None:
+    scene = comparison.runs["kf"][0].scene
+    k = 10
+    expected = 0
+    for sensor in scene.sensors:
+        frames = [f for f in scene.frames if f.sensor == sensor and f.timestamp <= scene.timestamps[k]]
+        expected += len(frames[-1])
+    assert len(latest_detections(scene, k)) == expected
+
+
+def test_the_page_holds_all_it_needs(comparison: Comparison) -> None:
+    picture = b"\x89PNG not really"
+    runs = {method: comparison.runs[method][0] for method in METHODS}
+    page = demo_page(COLUMNS, [("<b>&", *COLUMNS[1:])], picture, runs)
+    assert "<td>&lt;b&gt;&amp;</td>" in page
+    assert base64.b64encode(picture).decode() in page
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", page)
+    data = json.loads(re.search(r"^const data = (.*);$", page, flags=re.M)[1])  # type: ignore[index]
+    assert data["methods"] == list(METHODS)
+    assert len(data["moments"]) == len(data["times"]) == len(runs["saga"].scene)
+    last = data["moments"][-1]
+    tracks = runs["saga"].tracks[-1]
+    assert [row[5] for row in last["t"]["saga"]] == tracks.id.tolist()
+    origin = runs["saga"].scene.world_T_ego[0, :2, 3]
+    np.testing.assert_allclose(
+        [row[:2] for row in last["t"]["saga"]], tracks.boxes.position[:, :2] - origin, atol=0.006
+    )
+
+
+def test_the_demo_writes_a_picture_and_a_page(tmp_path: Path) -> None:
+    result = run_demo(tmp_path / "out", load_config("simulated"), SHORT, scenes=1)
+    assert result.picture.read_bytes().startswith(b"\x89PNG\r\n")
+    assert result.page.read_text(encoding="utf-8").startswith("<!doctype html>")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["birds_eye.png", "index.html"]
+
+
+def test_the_command_prints_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("data_tools.simulator.scene.SimulatorSettings", lambda: SHORT)
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["demo", "--output", str(tmp_path / "out"), "--scenes", "1"])
+    assert result.exit_code == 0, result.output
+    for text in (*COLUMNS, *METHODS, "picture: ", "page: "):
+        assert text in result.stdout

@@ -1,0 +1,89 @@
+"""The documentation keeps up: generated pages are fresh, examples are marked, links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+
+
+def page_name(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def run_examples(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, ROOT / "docs" / "run_examples.py", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def test_the_configuration_page_is_what_the_code_says() -> None:
+    code = "from make_configuration import configuration_page; print(configuration_page(), end='')"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "docs")
+    written = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert run.stdout == written, "run `python docs/make_configuration.py`"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_within_the_documentation_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        if target.startswith(("http://", "https://")):
+            continue
+        name, _, anchor = target.partition("#")
+        linked = (page.parent / name).resolve() if name else page
+        assert linked.exists(), f"{page_name(page)} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", linked.read_text(encoding="utf-8"), flags=re.M)
+            anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+            assert anchor in anchors, f"{page_name(page)} links to {target}"
+
+
+def test_the_contents_name_every_page() -> None:
+    contents = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").rglob("*.md"):
+        name = page.relative_to(ROOT / "docs").as_posix()
+        assert name == "README.md" or f"]({name})" in contents, f"docs/README.md does not name {name}"
+
+
+def test_every_example_says_whether_it_is_run() -> None:
+    run = run_examples("--mark", "ci", *(page for page in PAGES if page.name != "README.md"))
+    assert run.returncode == 0, run.stderr
+
+
+def test_the_readmes_examples_of_the_library_work() -> None:
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.M | re.S)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 15
+    run = subprocess.run([sys.executable, "-W", "error", "-c", example], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert "2 car at" in run.stdout  # the hidden car is still there
+
+
+def test_examples_that_fail_or_are_not_marked_are_reported(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- run -->\n```bash\necho first > a\n```\n\n<!-- run -->\n```python\nopen('a').read(); 1 / 0\n```\n"
+    )
+    run = run_examples(page)
+    assert run.returncode == 1
+    assert f"FAILED {page}:7: exit code 1" in run.stdout
+    assert "ZeroDivisionError" in run.stderr
+    page.write_text("```bash\ntrue\n```\n")
+    run = run_examples(page)
+    assert run.returncode != 0
+    assert f"{page}:1: expected a mark such as <!-- run --> before the block" in run.stderr
+
+
+def test_ci_runs_the_commands_of_the_readme() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"<!-- ci -->\n```bash\n(.*?)\n```", text) == [
+        "pip install -e . && saga-fg demo",
+        'pip install -e ".[dev]" && pytest -n 2',
+    ]
+    assert "run_examples.py --mark ci README.md" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
