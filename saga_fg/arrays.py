@@ -67,6 +67,15 @@ def checked_labels(name: str, value: Any, length: int | None = None) -> StrArray
 
 def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntArray:
     """Return `value` as a read-only int64 array of unique entries, of shape (length,)."""
+    array = checked_rows(name, value, length)
+    unique, counts = np.unique(array, return_counts=True)
+    if len(unique) != len(array):
+        raise InputError(f"{name}: expected unique ids, {int(unique[counts > 1][0])} occurs more than once")
+    return array
+
+
+def checked_rows(name: str, value: ArrayLike, length: int | None = None) -> IntArray:
+    """Return `value` as a read-only int64 array of shape (length,); entries may repeat."""
     array = _listed(value)
     if array.size == 0:
         array = np.empty(0, dtype=np.int64)
@@ -74,9 +83,6 @@ def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntAr
         raise InputError(f"{name}: expected a list of integers, got {_short(value)}")
     if length is not None and len(array) != length:
         raise InputError(f"{name}: expected {length} entries, got {len(array)}")
-    unique, counts = np.unique(array, return_counts=True)
-    if len(unique) != len(array):
-        raise InputError(f"{name}: expected unique ids, {int(unique[counts > 1][0])} occurs more than once")
     array = array.astype(np.int64)
     array.flags.writeable = False
     return array

@@ -7,6 +7,7 @@ A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -18,7 +19,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
 from saga_fg.scene_graph import Edges, SceneGraph
-from saga_fg.settings import setting, settings_group
+from saga_fg.settings import require_between, require_positive, setting, settings_group
 
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
@@ -54,6 +55,10 @@ class Neighbours:
     max_degree: int = setting(4, "edges kept per influenced node, strongest first")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_distance", "min_speed", "max_degree")
+        require_positive(self, "distance_scale", "heading_scale", "speed_scale", infinite=True)
+
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = np.isin(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
         target, source, distance = _close_pairs(nodes.position, able, self.max_distance)
@@ -75,6 +80,10 @@ class Following:
     lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_gap")
+        require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = np.isin(nodes.label, self.classes)

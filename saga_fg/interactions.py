@@ -13,6 +13,7 @@ Car-following is Helly's linear law (Helly 1959); with the gap taken from the pr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.node import NodeType
-from saga_fg.settings import setting
+from saga_fg.settings import require_between, require_one_of, require_positive, setting
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
@@ -100,6 +101,11 @@ class CarFollowing:
         "present", "desired gap: the one of the present estimate (formation), or standstill_gap + headway * speed"
     )
     standstill_gap: float = setting(2.0, "bumper to bumper, m; used with gap: standstill")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "time_constant")
+        require_between(self, 0, math.inf, "headway", "standstill_gap")
+        require_one_of(self, "gap", ("present", "standstill"))
 
     def applies(self, target: NodeType, source: NodeType) -> bool:
         return all(t.has(POSITION + VELOCITY) for t in (target, source))

@@ -8,6 +8,7 @@ nodes of different types, with states of different size, live in one graph.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray, checked
 from saga_fg.errors import InputError
-from saga_fg.settings import setting
+from saga_fg.settings import require_between, require_positive, setting
 
 
 class Motion(Protocol):
@@ -45,6 +46,9 @@ class ConstantVelocity:
 
     acceleration_noise: float = setting(1.0, "spectral density of the acceleration, m^2/s^3")
 
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "acceleration_noise")
+
     @property
     def components(self) -> tuple[str, ...]:
         return ("x", "y", "vx", "vy")
@@ -69,6 +73,10 @@ class ConstantAcceleration:
     jerk_noise: float = setting(1.0, "spectral density of the jerk, m^2/s^5")
     fading_time: float = setting(float("inf"), "time constant with which the acceleration fades, s; .inf for never")
 
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "jerk_noise")
+        require_positive(self, "fading_time", infinite=True)
+
     @property
     def components(self) -> tuple[str, ...]:
         return ("x", "y", "vx", "vy", "ax", "ay")
@@ -88,6 +96,9 @@ class RandomWalk:
 
     names: tuple[str, ...] = setting(("x", "y"), "state components")
     drift: float = setting(0.0, "spectral density of the drift, unit^2/s")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "drift")
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, checked, checked_ids
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_ids, checked_rows
 from saga_fg.errors import InputError
 from saga_fg.node import NodeType
 
@@ -41,13 +41,10 @@ class Edges:
     b: FloatArray
 
     def __post_init__(self) -> None:
-        count = len(np.asarray(self.target))
         what = f"edges of {self.interaction}"
+        count = len(checked_rows(f"{what}: target", self.target))
         for name in ("target", "source"):
-            array = np.array(getattr(self, name), dtype=np.int64)
-            if array.shape != (count,):
-                raise InputError(f"{what}: {name}: expected {count} rows, got shape {array.shape}")
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, checked_rows(f"{what}: {name}", getattr(self, name), count))
         rate = checked(f"{what}: rate", self.rate, (count,))
         if (rate < 0).any():
             raise InputError(
@@ -95,9 +92,8 @@ class SceneGraph:
                 if len(rows) == 0:
                     continue
                 if rows.min() < 0 or rows.max() >= len(nodes):
-                    raise InputError(
-                        f"edges of {group.interaction}: {name}: row {int(rows.max())} is outside {len(nodes)} nodes"
-                    )
+                    bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
+                    raise InputError(f"edges of {group.interaction}: {name}: row {bad} is outside {len(nodes)} nodes")
                 if (self.dims[rows] != dim).any():
                     bad = int(rows[np.argmax(self.dims[rows] != dim)])
                     raise InputError(

@@ -9,6 +9,7 @@ world never depends on which sensor speaks, so a new sensor is a few lines of co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -16,8 +17,9 @@ from typing import Literal
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.errors import InputError
 from saga_fg.geometry import inverse_transform, wrap_angle, yaw_transform
-from saga_fg.settings import setting, settings_group
+from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 DEFAULT = "default"  # key of the settings for every class that has none of its own
 
@@ -34,6 +36,10 @@ class NoiseModel:
     yaw: float = setting(0.2, "standard deviation of the heading, rad")
     height: float = setting(0.2, "standard deviation of the centre's height, m")
 
+    def __post_init__(self) -> None:
+        require_positive(self, "position", "velocity", "yaw", "height")
+        require_between(self, 0, math.inf, "range_noise", "bearing_noise", "low_score")
+
 
 @dataclass(frozen=True)
 class FieldOfView:
@@ -42,6 +48,14 @@ class FieldOfView:
     min_azimuth: float = setting(-np.pi, "rad, from straight ahead, left positive")
     max_azimuth: float = setting(np.pi, "rad")
     max_range: float = setting(80.0, "m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "max_range", infinite=True)
+        require_between(self, -math.inf, math.inf, "min_azimuth", "max_azimuth")
+        if self.max_azimuth < self.min_azimuth:
+            raise InputError(
+                f"max_azimuth: expected at least min_azimuth {self.min_azimuth:g}, got {self.max_azimuth:g}"
+            )
 
 
 @dataclass(frozen=True)
@@ -73,6 +87,11 @@ class Sensor:
     field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
     extrinsics: Extrinsics = settings_group(Extrinsics, "where it sits, for detections in sensor coordinates")
     time_offset: float = setting(0.0, "added to the sensor's timestamps to get the time of measurement, s")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, 1, "detection_probability")
+        require_between(self, -math.inf, math.inf, "time_offset")
+        require_one_of(self, "score", ("probability", "logit"))
 
     def probability(self, score: FloatArray) -> FloatArray:
         """The detector's scores (N,) as probabilities in [0.001, 0.999]."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.errors import InputError
 from saga_fg.node import ConstantAcceleration, ConstantVelocity
 from saga_fg.sensor import DEFAULT
-from saga_fg.settings import setting, settings_group
+from saga_fg.settings import require_between, require_positive, setting, settings_group
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,14 @@ class ClassSettings:
     max_distance: float = setting(4.0, "no match beyond this distance between prediction and detection, m")
     max_coasting: float = setting(1.2, "a track without detection is given up after this time, s")
     yaw_drift: float = setting(0.3, "how fast the heading changes, standard deviation after one second, rad")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "birth_speed", "birth_drift")
+        require_between(self, 0, 1, "min_score", "birth_score", "gate")
+        require_between(self, 0, math.inf, "duplicate_distance", "yaw_drift")
+        require_positive(self, "max_distance", "max_coasting", infinite=True)
+        if self.gate == 1:
+            raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
 
 
 @dataclass(frozen=True)
@@ -54,6 +64,9 @@ class TrackerSettings:
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
 
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "max_delay", "report_coasting")
+
 
 @dataclass(frozen=True)
 class GreedySettings:
@@ -65,3 +78,7 @@ class GreedySettings:
     )
     max_coasting: float = setting(1.2, "a track without detection is kept this long, s")
     min_score: float = setting(0.0, "detections with a lower probability are not used")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, 1, "min_score")
+        require_positive(self, "max_coasting", infinite=True)

@@ -80,7 +80,10 @@ def test_columns_are_read_only_and_yaw_is_wrapped(boxes):
         ({"position": [(0, 0), (0, 0)]}, r"position: expected shape \(2, 3\), got \(2, 2\)"),
         ({"position": [(0, 0, 0), (0, NAN, 0)]}, r"position\[1, 1\]: expected a finite number, got nan"),
         ({"position": [(0, 0, 0), (0, 0, np.inf)]}, r"position\[1, 2\]: expected a finite number, got inf"),
-        ({"size": [(1, 1, 1), (4, -2, 1)]}, r"size\[1\]: expected positive length, width, height in m, got \[4.0, -2.0"),
+        (
+            {"size": [(1, 1, 1), (4, -2, 1)]},
+            r"size\[1\]: expected positive length, width, height in m, got \[4.0, -2.0",
+        ),
         ({"size": [(1, 1, 1), (4, 0, 1)]}, r"size\[1\]: expected positive"),
         ({"size": [(1, 1, 1), (np.inf, 1, 1)]}, r"size\[1, 0\]: expected a finite number, or NaN"),
         ({"yaw": [0.0]}, r"yaw: expected shape \(2,\), got \(1,\)"),

@@ -1,0 +1,99 @@
+"""Settings carry a comment for people, and refuse numbers outside their range."""
+
+import dataclasses
+import inspect
+import math
+
+import pytest
+
+from saga_fg import ConstantAcceleration, ConstantVelocity, GreedyTracker, InputError, RandomWalk, Sensor
+from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.interactions import CarFollowing, SharedVelocity
+from saga_fg.sensor import Extrinsics, FieldOfView, NoiseModel
+from saga_fg.settings import setting, settings_group
+from saga_fg.tracking import ClassSettings, ExistenceSettings, GreedySettings, TrackerSettings
+
+SETTINGS = [
+    CarFollowing,
+    ClassSettings,
+    ConstantAcceleration,
+    ConstantVelocity,
+    ExistenceSettings,
+    Extrinsics,
+    FieldOfView,
+    Following,
+    GreedySettings,
+    Neighbours,
+    NoiseModel,
+    RandomWalk,
+    Sensor,
+    SharedVelocity,
+    TrackerSettings,
+]
+
+
+@pytest.mark.parametrize("kind", SETTINGS)
+def test_every_setting_has_a_default_and_a_comment_and_cannot_be_changed(kind):
+    defaults = kind()
+    assert defaults == kind()
+    for field in dataclasses.fields(kind):
+        assert field.metadata["comment"], f"{kind.__name__}.{field.name}"
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(defaults, dataclasses.fields(kind)[0].name, None)
+
+
+def test_groups_are_made_anew():
+    @dataclasses.dataclass(frozen=True)
+    class Outer:
+        number: int = setting(3, "a number")
+        names: dict[str, int] = settings_group(dict, "names")
+
+    assert Outer().number == 3
+    assert Outer().names == {}
+    assert Outer().names is not Outer().names
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (ConstantVelocity, {"acceleration_noise": -1.0}, "acceleration_noise: expected a finite number >= 0, got -1.0"),
+        (ConstantVelocity, {"acceleration_noise": math.nan}, "acceleration_noise: expected a finite number >= 0"),
+        (ConstantAcceleration, {"jerk_noise": math.inf}, "jerk_noise: expected a finite number >= 0, got inf"),
+        (ConstantAcceleration, {"fading_time": 0.0}, "fading_time: expected a number > 0, got 0.0"),
+        (RandomWalk, {"drift": -0.1}, "drift: expected a finite number >= 0"),
+        (CarFollowing, {"time_constant": 0.0}, "time_constant: expected a finite number > 0"),
+        (CarFollowing, {"headway": -1.0}, "headway: expected a finite number >= 0"),
+        (CarFollowing, {"gap": "desired"}, "gap: expected one of present, standstill, got 'desired'"),
+        (Neighbours, {"rate": -0.1}, "rate: expected a finite number >= 0"),
+        (Neighbours, {"distance_scale": 0.0}, "distance_scale: expected a number > 0"),
+        (Neighbours, {"max_degree": -1}, "max_degree: expected a finite number >= 0"),
+        (Following, {"rate": math.nan}, "rate: expected a finite number >= 0"),
+        (Following, {"lateral_scale": 0.0}, "lateral_scale: expected a number > 0"),
+        (NoiseModel, {"position": 0.0}, "position: expected a finite number > 0, got 0.0"),
+        (NoiseModel, {"velocity": math.inf}, "velocity: expected a finite number > 0, got inf"),
+        (NoiseModel, {"range_noise": -0.1}, "range_noise: expected a finite number >= 0"),
+        (FieldOfView, {"max_range": -1.0}, "max_range: expected a number > 0"),
+        (FieldOfView, {"min_azimuth": 2.0, "max_azimuth": 1.0}, "max_azimuth: expected at least min_azimuth 2, got 1"),
+        (Sensor, {"detection_probability": 1.5}, "detection_probability: expected a number from 0 to 1, got 1.5"),
+        (Sensor, {"time_offset": math.nan}, "time_offset: expected a finite number"),
+        (Sensor, {"score": "logits"}, "score: expected one of probability, logit, got 'logits'"),
+        (ClassSettings, {"gate": 1.0}, "gate: expected a share below 1"),
+        (ClassSettings, {"birth_score": 2.0}, "birth_score: expected a number from 0 to 1"),
+        (ClassSettings, {"max_distance": 0.0}, "max_distance: expected a number > 0"),
+        (TrackerSettings, {"max_delay": -0.1}, "max_delay: expected a finite number >= 0"),
+        (GreedySettings, {"max_coasting": math.nan}, "max_coasting: expected a number > 0"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(kind, values, message):
+    with pytest.raises(InputError, match=message):
+        kind(**values)
+
+
+def test_scales_may_be_infinite_to_switch_a_kernel_off():
+    assert Neighbours(speed_scale=math.inf).speed_scale == math.inf
+    assert Following(gap_scale=math.inf).gap_scale == math.inf
+
+
+def test_trackers_work_on_defaults_alone():
+    assert inspect.signature(GreedyTracker).parameters["settings"].default is None
+    assert GreedyTracker().settings == GreedySettings()
