@@ -47,7 +47,11 @@ def read_scenes(folder: Path, names: Collection[str] | None) -> SceneTables:
     for name in chosen:
         if name not in scenes:
             raise InputError(f"{folder / 'scene.json'}: {unknown('scene', name, tuple(scenes))}")
-    samples = {token: (time, after) for token, time, after in read_table(folder, "sample", _SAMPLE)}
+    samples: dict[str, tuple[Any, str]] = {}
+    for token, time, after in read_table(folder, "sample", ("token", "timestamp", "next")):
+        if token in samples:
+            raise InputError(f"{folder / 'sample.json'}: record {token}: expected every token once, it occurs again")
+        samples[token] = (time, after)
     chains = {name: _chain(folder, name, *scenes[name], samples) for name in chosen}
     times = {name: _times(folder, chain, samples) for name, chain in chains.items()}
     poses = _poses(folder, {token for chain in chains.values() for token in chain})
@@ -56,9 +60,6 @@ def read_scenes(folder: Path, names: Collection[str] | None) -> SceneTables:
         for name, chain in chains.items()
     }
     return SceneTables(records, frozenset(samples))
-
-
-_SAMPLE = ("token", "timestamp", "next")
 
 
 def _scene_rows(folder: Path) -> list[tuple[Any, ...]]:
@@ -73,7 +74,7 @@ def _scene_rows(folder: Path) -> list[tuple[Any, ...]]:
     return rows
 
 
-def _chain(folder: Path, scene: str, first: str, count: int, samples: dict[str, tuple[Any, Any]]) -> tuple[str, ...]:
+def _chain(folder: Path, scene: str, first: str, count: int, samples: dict[str, tuple[Any, str]]) -> tuple[str, ...]:
     """The samples of a scene in the order of the tables' links."""
     chain: list[str] = []
     token = first
@@ -89,7 +90,7 @@ def _chain(folder: Path, scene: str, first: str, count: int, samples: dict[str, 
     return tuple(chain)
 
 
-def _times(folder: Path, chain: tuple[str, ...], samples: dict[str, tuple[Any, Any]]) -> FloatArray:
+def _times(folder: Path, chain: tuple[str, ...], samples: dict[str, tuple[Any, str]]) -> FloatArray:
     times = [samples[token][0] for token in chain]
     for k, (token, time) in enumerate(zip(chain, times, strict=True)):
         where = f"{folder / 'sample.json'}: record {token}: timestamp"

@@ -148,6 +148,7 @@ BROKEN_TABLES = [
     (change("sample", 2, timestamp=START - 1), r"sample\.json: record a2: timestamp: .* time runs backwards at"),
     (change("sample", 1, timestamp="x"), r"record a1: timestamp: expected a whole number of microseconds, got 'x'"),
     (change("sample", 1, timestamp=10**400), r"record a1: timestamp: expected a whole number"),
+    (change("sample", 1, token="a0"), r"sample\.json: record a0: expected every token once, it occurs again"),
     (change("sample", 1, next="zz"), r"sample\.json: scene scene-0103: expected a sample 'zz', there is none"),
     (change("sample", 1, next="a0"), r"sample\.json: scene scene-0103: expected 3 samples, the chain goes on"),
     (change("sample", 1, next=""), r"sample\.json: scene scene-0103: expected 3 samples, got 2"),
