@@ -10,6 +10,7 @@ from data_tools.metrics.bootstrap import (
 )
 from data_tools.metrics.consistency import coverage, coverages, nees, nees_band
 from data_tools.metrics.error_sample import ErrorSample
+from data_tools.metrics.hota import HotaFigures, hota_figures
 from data_tools.metrics.kitti_tracking import (
     KittiTrackingFigures,
     KittiTrackingSequence,
@@ -29,6 +30,7 @@ from data_tools.metrics.track_table import TrackTable
 
 __all__ = [
     "ErrorSample",
+    "HotaFigures",
     "Interval",
     "KittiTrackingFigures",
     "KittiTrackingSequence",
@@ -44,6 +46,7 @@ __all__ = [
     "coverage",
     "coverages",
     "difference",
+    "hota_figures",
     "kitti_tracking_figures",
     "match_scene",
     "nees",

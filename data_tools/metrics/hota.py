@@ -1,0 +1,145 @@
+"""HOTA, CLEAR and Identity metrics of box tracks, computed by `trackeval` (extra `[eval]`) over our own similarities.
+
+    HOTA(a) = sqrt(DetA(a) AssA(a))   a: similarity from which a pair counts; HOTA: mean over a = 0.05, 0.10, ..., 0.95
+    DetA    = TP / (TP + FN + FP)
+    AssA    = mean over the pairs of TPA / (TPA + FNA + FPA), how well the two tracks of a pair agree over time
+    LocA    = mean similarity of the pairs
+    IDF1    = 2 IDTP / (2 IDTP + IDFN + IDFP), pairs under the best one-to-one mapping of whole tracks
+
+Similarities, all in [0, 1]: "centre", max(0, 1 - d / reach) of the horizontal distance d of the centres; "bev_iou" and
+"iou_3d", the overlap of footprints and of volumes.
+
+Sources: Luiten et al., HOTA: A Higher Order Metric for Evaluating Multi-object Tracking, IJCV 2021; Ristani et al.,
+Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking, ECCV Workshops 2016 (Identity).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from data_tools.metrics.track_table import TrackTable
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.boxes import Boxes
+from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.overlap import bev_iou, iou_3d
+
+Similarity = Literal["centre", "bev_iou", "iou_3d"]
+
+
+@dataclass(frozen=True, eq=False)
+class HotaFigures:
+    """Figures of one class over all scenes, shares in [0, 1] (MOTA may be negative), and counts.
+
+    hota, deta, assa, loca are means over `alpha` (19,), the values at each of which are in `hota_at`. CLEAR (mota,
+    motp: mean similarity, fp, fn, ids, frag) and Identity (idf1, idp, idr) count pairs from the threshold on.
+    """
+
+    hota: float
+    deta: float
+    assa: float
+    loca: float
+    mota: float
+    motp: float
+    fp: int
+    fn: int
+    ids: int
+    frag: int
+    idf1: float
+    idp: float
+    idr: float
+    alpha: FloatArray
+    hota_at: FloatArray
+
+
+def hota_figures(
+    scenes: Sequence[tuple[TrackTable, TrackTable]],
+    label: str,
+    similarity: Similarity = "centre",
+    reach: float = 4.0,
+    threshold: float = 0.5,
+) -> HotaFigures:
+    """Compare the tracks of class `label` with the truth: (truth, found) of each scene.
+
+    reach      distance of centres at which their similarity is 0, m
+    threshold  similarity from which CLEAR and Identity count a pair; with a reach of 4 m, 0.5 stands for 2 m
+
+    Raises `MissingExtraError` without trackeval, `InputError` for an unknown similarity or no scene.
+    """
+    if similarity not in get_args(Similarity):
+        raise InputError(f"similarity: expected one of {', '.join(get_args(Similarity))}, got {similarity!r}")
+    if not scenes:
+        raise InputError("scenes: expected at least one scene")
+    metrics = _trackeval_metrics()
+    options = {"THRESHOLD": threshold, "PRINT_CONFIG": False}
+    hota, clear, identity = metrics.HOTA(), metrics.CLEAR(options), metrics.Identity(options)
+    sequences = [_sequence(*scene, label, similarity, reach) for scene in scenes]
+    h, c, i = (
+        metric.combine_sequences({str(n): metric.eval_sequence(data) for n, data in enumerate(sequences)})
+        for metric in (hota, clear, identity)
+    )
+    return HotaFigures(
+        hota=float(np.mean(h["HOTA"])),
+        deta=float(np.mean(h["DetA"])),
+        assa=float(np.mean(h["AssA"])),
+        loca=float(np.mean(h["LocA"])),
+        mota=float(c["MOTA"]),
+        motp=float(c["MOTP"]),
+        fp=int(c["CLR_FP"]),
+        fn=int(c["CLR_FN"]),
+        ids=int(c["IDSW"]),
+        frag=int(c["Frag"]),
+        idf1=float(i["IDF1"]),
+        idp=float(i["IDP"]),
+        idr=float(i["IDR"]),
+        alpha=hota.array_labels,
+        hota_at=h["HOTA"],
+    )
+
+
+def _trackeval_metrics() -> Any:
+    try:
+        from trackeval import metrics
+    except ImportError as error:
+        raise MissingExtraError("HOTA needs trackeval: pip install 'saga-fg[eval]'") from error
+    return metrics
+
+
+def _sequence(truth: TrackTable, found: TrackTable, label: str, similarity: Similarity, reach: float) -> dict[str, Any]:
+    """One scene as `trackeval` wants it: per moment the numbers of true and found tracks, and their similarities."""
+    moments = 1 + int(max(truth.moment.max(initial=-1), found.moment.max(initial=-1)))
+    true_rows, true_ids, true_count = _of_class(truth, label, moments)
+    found_rows, found_ids, found_count = _of_class(found, label, moments)
+    return {
+        "num_timesteps": moments,
+        "num_gt_ids": true_count,
+        "num_tracker_ids": found_count,
+        "num_gt_dets": sum(map(len, true_ids)),
+        "num_tracker_dets": sum(map(len, found_ids)),
+        "gt_ids": true_ids,
+        "tracker_ids": found_ids,
+        "similarity_scores": [
+            _similarities(truth.boxes.select(a), found.boxes.select(b), similarity, reach)
+            for a, b in zip(true_rows, found_rows, strict=True)
+        ],
+    }
+
+
+def _of_class(table: TrackTable, label: str, moments: int) -> tuple[list[IntArray], list[IntArray], int]:
+    """Rows and track numbers of a class at each moment, and how many tracks there are."""
+    rows = np.flatnonzero(table.boxes.label == label)
+    names, numbers = np.unique(table.id[rows], return_inverse=True)
+    cuts = np.searchsorted(table.moment[rows], np.arange(1, moments))
+    return np.split(rows, cuts)[:moments], np.split(numbers, cuts)[:moments], len(names)
+
+
+def _similarities(truth: Boxes, found: Boxes, similarity: Similarity, reach: float) -> FloatArray:
+    if similarity == "bev_iou":
+        return bev_iou(truth, found)
+    if similarity == "iou_3d":
+        return iou_3d(truth, found)
+    offset = truth.position[:, None, :2] - found.position[None, :, :2]
+    return np.asarray(np.maximum(0.0, 1.0 - np.hypot(offset[..., 0], offset[..., 1]) / reach))
