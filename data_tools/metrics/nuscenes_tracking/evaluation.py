@@ -76,9 +76,8 @@ def nuscenes_tracking_metrics(
     true, found = (
         Rows.of(
             [
-                sightings(table, scene.ego_position, scene.racks, scene.timestamps, class_range)
+                sightings(getattr(scene, name), scene.ego_position, scene.racks, scene.timestamps, class_range)
                 for scene in scenes
-                for table in [getattr(scene, name)]
             ]
         )
         for name in ("truth", "found")
