@@ -45,8 +45,9 @@ class ExistenceSettings:
 
     lifetime: float = setting(30.0, "mean time after which an object leaves unseen, s")
     clutter_score: float = setting(0.2, "probability score at which a matched detection neither helps nor hurts")
-    confirm: float = setting(0.0, "tracks are reported from this existence probability on")
-    give_up: float = setting(0.02, "tracks below this existence probability are removed")
+    report: float = setting(0.0, "tracks are reported from this existence probability on")
+    confirm: float = setting(0.9, "from here on a track is confirmed: misses no longer end it, only time does")
+    give_up: float = setting(0.02, "unconfirmed tracks below this existence probability are removed")
 
 
 @dataclass(frozen=True)

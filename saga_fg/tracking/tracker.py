@@ -44,6 +44,7 @@ class _Columns:
     existence: FloatArray
     score: FloatArray
     last_seen: FloatArray
+    confirmed: BoolArray
 
     def select(self, rows: IntArray | BoolArray) -> _Columns:
         return _Columns(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -95,7 +96,9 @@ class Tracker:
         self._types: dict[str, NodeType] = {}
         self._next_id = 1
         none = np.empty(0)
-        self._columns = _Columns(np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none)
+        self._columns = _Columns(
+            np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none, none.astype(bool)
+        )
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
 
     def step(self, frame: Frame) -> Tracks:
@@ -259,6 +262,7 @@ class Tracker:
         columns.existence[matching.track] = np.clip(after / (1 + after), 0.0, 0.999)
         columns.score[matching.track] = p
         columns.last_seen[matching.track] = self._time
+        columns.confirmed |= columns.existence >= settings.confirm
 
     def _bear(self, observed: _Observed, matching: Matching) -> None:
         """New tracks from detections that no track explains."""
@@ -285,7 +289,9 @@ class Tracker:
             P[:, at_v[:, None], at_v] = P_velocity[rows]
             self._estimator.add(ids[rows], mean, P)
         now = np.full(len(born), self._time)
-        self._columns = self._columns.extended(_Columns(ids, boxes.label, p.copy(), p.copy(), now))
+        self._columns = self._columns.extended(
+            _Columns(ids, boxes.label, p.copy(), p.copy(), now, p >= self.settings.existence.confirm)
+        )
         self._box = self._box.extended(
             BoxFilter.born(
                 boxes.size, p, boxes.position[:, 2], observed.z_noise[born], boxes.yaw, observed.yaw_noise[born]
@@ -307,7 +313,7 @@ class Tracker:
         columns = self._columns
         coasting = self._time - columns.last_seen
         dead = coasting > self._of_class("max_coasting", columns.label)
-        dead |= columns.existence < self.settings.existence.give_up
+        dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
         if dead.any():
             self._estimator.marginalise(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
@@ -315,7 +321,9 @@ class Tracker:
     def _report(self, timestamp: float) -> Tracks:
         columns, settings = self._columns, self.settings
         coasting = np.maximum(self._time - columns.last_seen, 0.0)
-        shown = (columns.existence >= settings.existence.confirm) & (coasting <= settings.report_coasting)
+        shown = (columns.confirmed | (columns.existence >= settings.existence.report)) & (
+            coasting <= settings.report_coasting
+        )
         rows = np.flatnonzero(shown)
         position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())
         box = self._box
