@@ -1,10 +1,11 @@
 """GTSAM factors of saga-fg: plain arrays, keys and callables in; gtsam and numpy only.
 
 Linear families give native `gtsam.JacobianFactor`s, which no solver needs Python for. Nonlinear ones give a
-`ResidualFactor`: `solve` linearises it, `as_custom_factor` makes it one of GTSAM's. One family a file.
+`ResidualFactor`, which `solve` linearises and `as_custom_factor` makes one of GTSAM's, or many at once, for speed, as
+`ResidualFactors`. One family a file.
 """
 
-from factors.detection import detection_factor, linear_detection_factor, linear_detection_factors
+from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
     check_dimensions,
@@ -23,6 +24,7 @@ from factors.polar import Radar, RangeBearing, RangeRate
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
 from factors.robust import Robust
 from factors.solver import Solution, SolverSettings, linearised, solve
+from factors.stacked import ResidualFactors
 from factors.variables import PlanarPose, SpatialPose, Variable, Vector
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "RangeBearing",
     "RangeRate",
     "ResidualFactor",
+    "ResidualFactors",
     "Robust",
     "SingularSystemError",
     "Solution",
@@ -46,6 +49,7 @@ __all__ = [
     "box",
     "check_dimensions",
     "detection_factor",
+    "detection_factors",
     "gaussian_factor",
     "gaussian_factors",
     "gaussian_graph",

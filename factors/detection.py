@@ -24,7 +24,8 @@ from factors.gaussian import gaussian_factor, gaussian_factors
 from factors.measurement import MeasurementModel
 from factors.nonlinear import ResidualFactor
 from factors.robust import Robust
-from factors.validation import FloatArray, checked
+from factors.stacked import ResidualFactors
+from factors.validation import FloatArray, KeyArray, checked, checked_covariances, checked_key_array
 from factors.variables import Vector
 
 
@@ -49,6 +50,24 @@ def detection_factor(
     )
 
 
+def detection_factors(
+    keys: ArrayLike, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: Robust | None = None
+) -> ResidualFactors:
+    """Return n factors of one model, linearised together; keys: (n,), z: (n, m), R: (n, m, m), or (m, m) for all."""
+    measured = checked("z", z, (None, model.dim))
+    function = _Detection(model, measured)
+    return ResidualFactors(
+        rows=_column(keys, len(measured)),
+        dims=(model.state_dim,),
+        residual=function.residual,
+        covariances=checked_covariances("R", R, len(measured), model.dim),
+        jacobians=function.jacobians,
+        robust=robust,
+        angles=tuple(model.angles),
+        name=f"{model.name} detections",
+    )
+
+
 def linear_detection_factor(
     key: int, model: MeasurementModel, z: ArrayLike, R: ArrayLike, near: ArrayLike | None = None
 ) -> gtsam.JacobianFactor:
@@ -70,10 +89,12 @@ def linear_detection_factors(
     H = linear_matrix(model)
     reference = None if near is None else checked("near", near, (len(measured), model.state_dim))
     blocks = np.broadcast_to(H, (len(measured), *H.shape))
-    names = np.asarray(keys)
-    if names.shape != (len(measured),):
-        raise FactorError(f"keys: expected shape ({len(measured)},), got {names.shape}")
-    return gaussian_factors(names[:, None], [blocks], _unwrapped(model, H, measured, reference), R)
+    return gaussian_factors(
+        _column(keys, len(measured)),
+        [blocks],
+        _unwrapped(model, H, measured, reference),
+        checked_covariances("R", R, len(measured), model.dim),
+    )
 
 
 def linear_matrix(model: MeasurementModel) -> FloatArray:
@@ -81,6 +102,13 @@ def linear_matrix(model: MeasurementModel) -> FloatArray:
     if not model.linear:
         raise FactorError(f"model: expected a linear one, {model.name} is not")
     return model.jacobian(np.zeros(model.state_dim))
+
+
+def _column(keys: ArrayLike, n: int) -> KeyArray:
+    names = checked_key_array("keys", keys)
+    if len(names) != n:
+        raise FactorError(f"keys: expected {n}, one per measurement, got {len(names)}")
+    return names[:, None]
 
 
 def _unwrapped(model: MeasurementModel, H: FloatArray, z: FloatArray, near: FloatArray | None) -> FloatArray:

@@ -34,11 +34,30 @@ def central_differences(
     return jacobians
 
 
+def stacked_differences(function: Callable[..., FloatArray], states: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return the Jacobians (..., m, d_k) of `function(*states)`, (..., m), on vectors, for any number of them at once.
+
+    states[k]: (..., d_k); entry i of the function's value must depend on entry i of its arguments alone.
+    """
+    jacobians = []
+    for k, state in enumerate(states):
+        steps = np.cbrt(np.finfo(float).eps * np.maximum(1.0, np.abs(state)))
+        columns = []
+        for i in range(state.shape[-1]):
+            ahead, behind = list(states), list(states)
+            ahead[k], behind[k] = state.copy(), state.copy()
+            ahead[k][..., i] += steps[..., i]
+            behind[k][..., i] -= steps[..., i]
+            columns.append((function(*ahead) - function(*behind)) / (2 * steps[..., i, None]))
+        jacobians.append(np.stack(columns, axis=-1))
+    return jacobians
+
+
 def wrap_angles(residual: FloatArray, components: Sequence[int]) -> FloatArray:
     """Return `residual` (..., m) with these components, angles in rad, brought into [-pi, pi)."""
-    if not len(components):
+    if not components:
         return residual
     wrapped = residual.copy()
-    index = list(components)
-    wrapped[..., index] = (residual[..., index] + np.pi) % (2 * np.pi) - np.pi
+    for i in components:
+        wrapped[..., i] = (residual[..., i] + np.pi) % (2 * np.pi) - np.pi
     return wrapped

@@ -19,8 +19,10 @@ from factors.errors import FactorError
 from factors.validation import (
     FloatArray,
     KeyArray,
+    check_distinct,
     checked,
-    checked_key_array,
+    checked_covariances,
+    checked_key_rows,
     checked_keys,
     format_key,
     format_keys,
@@ -64,15 +66,12 @@ def gaussian_factors(
     """
     b = checked("rhs", rhs, (None, None))
     n, m = b.shape
-    names = np.asarray(keys)
-    if names.shape != (n, len(blocks)) or not blocks:
-        raise FactorError(f"keys: expected shape ({n}, {len(blocks)}), one key per block, got {names.shape}")
-    names = checked_key_array("keys", names.reshape(-1)).reshape(names.shape)
+    names = checked_key_rows("keys", keys, len(blocks))
+    check_distinct("keys", names)
+    if len(names) != n:
+        raise FactorError(f"keys: expected {n} rows, one per factor, got {len(names)}")
     matrices = [checked(f"blocks[{k}]", block, (n, m, None)) for k, block in enumerate(blocks)]
-    stack = np.asarray(covariances)
-    W = whitener("covariances", stack, m)[None] if stack.ndim == 2 else whiteners("covariances", stack, m)
-    if len(W) not in (1, n):
-        raise FactorError(f"covariances: expected {n} matrices, got {len(W)}")
+    W = whiteners("covariances", checked_covariances("covariances", covariances, n, m))
     if not n:
         return []
     return whitened_factors(names, W, matrices, b)
@@ -83,14 +82,8 @@ def whitened_factors(
 ) -> list[gtsam.JacobianFactor]:
     """Return the factors || W[i] (sum_k blocks[k][i] x(keys[i, k]) - rhs[i]) ||^2 of `gaussian_factors`.
 
-    Of the caller's mistakes only repeated keys and empty blocks are caught here: shapes and numbers must be right.
+    Unchecked, except for empty blocks: keys distinct within a row, shapes and numbers right.
     """
-    ordered = np.sort(keys, axis=1)
-    twice = ordered[:, 1:] == ordered[:, :-1]
-    if twice.any():
-        row = int(np.argmax(twice.any(axis=1)))
-        key = int(ordered[row, 1:][twice[row]][0])
-        raise FactorError(f"keys: {format_key(key)} occurs twice in factor {row}, the one on {format_keys(keys[row])}")
     dims = [block.shape[2] for block in blocks]
     n, m = rhs.shape
     if m == 0 or 0 in dims:

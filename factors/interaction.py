@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors.errors import FactorError
 from factors.gaussian import gaussian_factor, whitened_factors
-from factors.validation import checked, checked_key_array, checked_keys, whiteners
+from factors.validation import check_distinct, checked, checked_key_array, checked_keys, whiteners
 
 
 def interaction_factor(
@@ -63,6 +63,7 @@ def interaction_factors(
         rows = np.flatnonzero(degrees == degree)
         entries = starts[rows, None] + np.arange(degree)
         names = np.concatenate([nexts[rows, None], previous[entries]], axis=1)
+        check_distinct("keys", names)
         identity = np.broadcast_to(np.eye(d), (len(rows), d, d))
         own = [identity, *(-blocks[column] for column in entries.T)]
         for row, factor in zip(rows.tolist(), whitened_factors(names, W[rows], own, offsets[rows]), strict=True):

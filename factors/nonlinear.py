@@ -31,7 +31,7 @@ from factors.variables import Variable, read_states
 
 
 class Linearisable(Protocol):
-    """What `factors.solver.solve` asks of a factor that GTSAM does not evaluate itself."""
+    """What `factors.solver.solve` asks of a factor, or of many in one, that GTSAM does not evaluate itself."""
 
     @property
     def keys(self) -> tuple[int, ...]: ...
@@ -39,8 +39,8 @@ class Linearisable(Protocol):
     def error(self, values: gtsam.Values) -> float:
         """Return the cost, -log phi, at `values`."""
 
-    def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactor:
-        """Return the factor on the increments from `values`."""
+    def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactor | gtsam.GaussianFactorGraph:
+        """Return the factor, or several, on the increments from `values`."""
 
 
 @dataclass(frozen=True, eq=False)

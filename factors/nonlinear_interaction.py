@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.differences import central_differences, wrap_angles
+from factors.differences import stacked_differences, wrap_angles
 from factors.errors import FactorError
 from factors.nonlinear import ResidualFactor
 from factors.robust import Robust
-from factors.validation import FloatArray, checked
+from factors.stacked import ResidualFactors
+from factors.validation import FloatArray, checked, checked_covariances, checked_key_array
 from factors.variables import Vector
 
 Prediction = Callable[[FloatArray, list[FloatArray], float], ArrayLike]
@@ -63,9 +64,7 @@ class NonlinearInteraction:
         next_key, key: the node at t+dt and at t; neighbours: the others at t; dims: dimension of every state, or of
         the node's followed by each neighbour's; dt: seconds, >= 0; covariance: Q (d, d). Raises `FactorError`.
         """
-        own, *others = [dims] * (1 + len(neighbours)) if isinstance(dims, int) else list(dims)
-        if len(others) != len(neighbours):
-            raise FactorError(f"dims: expected {1 + len(neighbours)} dimensions, got {1 + len(others)}")
+        own, others = _dimensions(dims, len(neighbours))
         step = _checked_step(dt)
 
         return ResidualFactor(
@@ -77,6 +76,44 @@ class NonlinearInteraction:
             robust=robust,
             angles=self.angles,
             name=getattr(self.predict, "__name__", "interaction"),
+        )
+
+    def factors(
+        self,
+        next_keys: ArrayLike,
+        keys: ArrayLike,
+        neighbours: ArrayLike,
+        dims: int | Sequence[int],
+        dt: float,
+        covariances: ArrayLike,
+        robust: Robust | None = None,
+    ) -> ResidualFactors:
+        """Return the factors of n nodes with k neighbours each, evaluated together.
+
+        For that `predict`, and `jacobians` if given, must take stacks as well: x (n, d) and others, k arrays (n, d_j),
+        giving (n, d), and Jacobians (n, d, d) and (n, d, d_j). A function that indexes from the end, x[..., 2], does.
+        next_keys, keys: (n,); neighbours: (n, k), one column a neighbour; dims: as in `factor`; covariances: (n, d, d),
+        or (d, d) for all. Raises `FactorError`.
+        """
+        later, now = checked_key_array("next_keys", next_keys), checked_key_array("keys", keys)
+        near = np.asarray(neighbours)
+        if near.ndim != 2 or not len(later) == len(now) == len(near):
+            raise FactorError(
+                f"neighbours: expected shape (n, k), with n keys and n next_keys, got {near.shape}, "
+                f"with {len(now)} and {len(later)}"
+            )
+        others_keys = [checked_key_array("neighbours", column) for column in near.T]
+        own, others = _dimensions(dims, near.shape[1])
+        step = _checked_step(dt)
+        return ResidualFactors(
+            rows=np.stack([later, now, *others_keys], axis=1),
+            dims=(own, own, *others),
+            residual=partial(_residual, self, step),
+            covariances=checked_covariances("covariances", covariances, len(later), own),
+            jacobians=partial(_jacobians, self, step),
+            robust=robust,
+            angles=self.angles,
+            name=f"{getattr(self.predict, '__name__', 'interaction')} interactions",
         )
 
     def affine(
@@ -98,25 +135,24 @@ class NonlinearInteraction:
         return F, F_others, b
 
     def predicted(self, x: FloatArray, others: list[FloatArray], dt: float) -> FloatArray:
-        """Return the checked prediction (d,)."""
-        return checked("prediction", self.predict(x, others, dt), (len(x),))
+        """Return the checked prediction, of the shape of x."""
+        return checked("prediction", self.predict(x, others, dt), x.shape)
 
     def differentiated(self, x: FloatArray, others: list[FloatArray], dt: float) -> tuple[FloatArray, list[FloatArray]]:
-        """Return the checked Jacobians (d, d) and [(d, d_j), ...] of the prediction."""
+        """Return the checked Jacobians, (..., d, d) and [(..., d, d_j), ...], of the prediction."""
         if self.jacobians is None:
             center = self.predicted(x, others, dt)
 
             def near(x: FloatArray, *others: FloatArray) -> FloatArray:
                 return wrap_angles(self.predicted(x, list(others), dt) - center, self.angles)
 
-            variables = [Vector(len(state)) for state in (x, *others)]
-            F, *F_others = central_differences(near, [x, *others], variables)
+            F, *F_others = stacked_differences(near, [x, *others])
             return F, F_others
         own, given = self.jacobians(x, others, dt)
         if len(given) != len(others):
             raise FactorError(f"jacobians: expected one per neighbour, {len(others)}, got {len(given)}")
-        return checked("jacobian of x", own, (len(x), len(x))), [
-            checked(f"jacobian of neighbour {j}", block, (len(x), len(other)))
+        return checked("jacobian of x", own, (*x.shape, x.shape[-1])), [
+            checked(f"jacobian of neighbour {j}", block, (*x.shape, other.shape[-1]))
             for j, (block, other) in enumerate(zip(given, others, strict=True))
         ]
 
@@ -129,7 +165,15 @@ def _residual(interaction: NonlinearInteraction, dt: float, *states: FloatArray)
 def _jacobians(interaction: NonlinearInteraction, dt: float, *states: FloatArray) -> list[FloatArray]:
     later, x, *others = states
     F, F_others = interaction.differentiated(x, others, dt)
-    return [np.eye(len(later)), -F, *(-block for block in F_others)]
+    identity = np.broadcast_to(np.eye(later.shape[-1]), F.shape)
+    return [identity, -F, *(-block for block in F_others)]
+
+
+def _dimensions(dims: int | Sequence[int], neighbours: int) -> tuple[int, list[int]]:
+    own, *others = [dims] * (1 + neighbours) if isinstance(dims, int) else list(dims)
+    if len(others) != neighbours:
+        raise FactorError(f"dims: expected {1 + neighbours} dimensions, got {1 + len(others)}")
+    return own, others
 
 
 def _checked_step(dt: Any) -> float:

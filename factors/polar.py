@@ -56,14 +56,13 @@ class RangeBearing:
         return False
 
     def predict(self, x: FloatArray) -> FloatArray:
-        d, rho = _offset(x, self.position, self.sensor_pose)
-        return np.stack([rho, np.arctan2(d[..., 1], d[..., 0]) - self.sensor_pose[2]], axis=-1)
+        z = np.empty((*x.shape[:-1], 2))
+        z[..., 0], z[..., 1] = _range_bearing(_sight(x, self.position, self.sensor_pose), self.sensor_pose)
+        return z
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        d, rho = _offset(x, self.position, self.sensor_pose)
         J = np.zeros((*x.shape[:-1], 2, self.state_dim))
-        J[..., 0, list(self.position)] = d / rho[..., None]
-        J[..., 1, list(self.position)] = np.stack([-d[..., 1], d[..., 0]], axis=-1) / rho[..., None] ** 2
+        _range_bearing_jacobian(J, _sight(x, self.position, self.sensor_pose), self.position)
         return J
 
 
@@ -101,21 +100,15 @@ class RangeRate:
         return False
 
     def predict(self, x: FloatArray) -> FloatArray:
-        _, _, rate, _ = self._parts(x)
-        return rate[..., None]
+        sight = _sight(x, self.position, self.sensor_pose)
+        return _rate(sight, _relative(x, self.velocity, self.sensor_velocity))[..., None]
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        towards, rho, rate, relative = self._parts(x)
         J = np.zeros((*x.shape[:-1], 1, self.state_dim))
-        J[..., 0, list(self.position)] = (relative - rate[..., None] * towards) / rho[..., None]
-        J[..., 0, list(self.velocity)] = towards
+        sight = _sight(x, self.position, self.sensor_pose)
+        relative = _relative(x, self.velocity, self.sensor_velocity)
+        _rate_jacobian(J[..., 0, :], sight, relative, self.position, self.velocity)
         return J
-
-    def _parts(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        d, rho = _offset(x, self.position, self.sensor_pose)
-        towards = d / rho[..., None]
-        relative = x[..., list(self.velocity)] - np.asarray(self.sensor_velocity)
-        return towards, rho, (towards * relative).sum(axis=-1), relative
 
 
 @dataclass(frozen=True)
@@ -129,7 +122,8 @@ class Radar:
     sensor_velocity: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        self._rate()  # checks the fields
+        _check(self.state_dim, self.position, self.velocity, self.sensor_pose)
+        checked("sensor_velocity", self.sensor_velocity, (2,))
 
     @property
     def name(self) -> str:
@@ -148,26 +142,70 @@ class Radar:
         return False
 
     def predict(self, x: FloatArray) -> FloatArray:
-        return np.concatenate([self._bearing().predict(x), self._rate().predict(x)], axis=-1)
+        sight = _sight(x, self.position, self.sensor_pose)
+        z = np.empty((*x.shape[:-1], 3))
+        z[..., 0], z[..., 1] = _range_bearing(sight, self.sensor_pose)
+        z[..., 2] = _rate(sight, _relative(x, self.velocity, self.sensor_velocity))
+        return z
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        return np.concatenate([self._bearing().jacobian(x), self._rate().jacobian(x)], axis=-2)
+        sight = _sight(x, self.position, self.sensor_pose)
+        J = np.zeros((*x.shape[:-1], 3, self.state_dim))
+        _range_bearing_jacobian(J, sight, self.position)
+        relative = _relative(x, self.velocity, self.sensor_velocity)
+        _rate_jacobian(J[..., 2, :], sight, relative, self.position, self.velocity)
+        return J
 
-    def _bearing(self) -> RangeBearing:
-        return RangeBearing(self.state_dim, self.position, self.sensor_pose)
 
-    def _rate(self) -> RangeRate:
-        return RangeRate(self.state_dim, self.position, self.velocity, self.sensor_pose, self.sensor_velocity)
+@dataclass(frozen=True)
+class _Sight:
+    """Line of sight: unit vector (c, s) from sensor to object and the range; each (...,)."""
+
+    c: FloatArray
+    s: FloatArray
+    range: FloatArray
 
 
-def _offset(
-    x: FloatArray, position: tuple[int, int], sensor_pose: tuple[float, float, float]
-) -> tuple[FloatArray, FloatArray]:
-    d = x[..., list(position)] - np.asarray(sensor_pose[:2])
-    rho = np.hypot(d[..., 0], d[..., 1])
-    if not (rho > 0).all():
+def _sight(x: FloatArray, position: tuple[int, int], sensor_pose: tuple[float, float, float]) -> _Sight:
+    dx, dy = x[..., position[0]] - sensor_pose[0], x[..., position[1]] - sensor_pose[1]
+    rho = np.hypot(dx, dy)
+    if not np.all(rho > 0):
         raise FactorError("the object is at the sensor itself, where range and bearing have no derivative")
-    return d, rho
+    return _Sight(dx / rho, dy / rho, rho)
+
+
+def _relative(
+    x: FloatArray, velocity: tuple[int, int], sensor_velocity: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    return x[..., velocity[0]] - sensor_velocity[0], x[..., velocity[1]] - sensor_velocity[1]
+
+
+def _range_bearing(sight: _Sight, sensor_pose: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
+    return sight.range, np.arctan2(sight.s, sight.c) - sensor_pose[2]
+
+
+def _range_bearing_jacobian(J: FloatArray, sight: _Sight, position: tuple[int, int]) -> None:
+    """Fill the first two rows of J (..., m, d)."""
+    J[..., 0, position[0]], J[..., 0, position[1]] = sight.c, sight.s
+    J[..., 1, position[0]], J[..., 1, position[1]] = -sight.s / sight.range, sight.c / sight.range
+
+
+def _rate(sight: _Sight, relative: tuple[FloatArray, FloatArray]) -> FloatArray:
+    return sight.c * relative[0] + sight.s * relative[1]
+
+
+def _rate_jacobian(
+    row: FloatArray,
+    sight: _Sight,
+    relative: tuple[FloatArray, FloatArray],
+    position: tuple[int, int],
+    velocity: tuple[int, int],
+) -> None:
+    """Fill a row (..., d) of the Jacobian."""
+    rate = _rate(sight, relative)
+    row[..., position[0]] = (relative[0] - rate * sight.c) / sight.range
+    row[..., position[1]] = (relative[1] - rate * sight.s) / sight.range
+    row[..., velocity[0]], row[..., velocity[1]] = sight.c, sight.s
 
 
 def _check(

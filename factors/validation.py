@@ -26,9 +26,7 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise FactorError(f"{name}: expected numbers in a regular array") from error
-    if array.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
-    ):
+    if array.shape != shape and not _fits(array.shape, shape):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise FactorError(f"{name}: expected shape ({wanted}), got {array.shape}")
     if not np.isfinite(array).all():
@@ -52,12 +50,36 @@ def checked_keys(name: str, keys: Iterable[int]) -> tuple[int, ...]:
 
 def checked_key_array(name: str, keys: ArrayLike) -> KeyArray:
     """Return `keys` as a flat array of GTSAM keys, not necessarily distinct, or raise `FactorError`."""
-    array = np.asarray(keys)
+    try:
+        array = np.asarray(keys)
+    except ValueError as error:
+        raise FactorError(f"{name}: expected a flat array of integers from 0 to 2^64 - 1") from error
     if array.size == 0:
         array = np.empty(0, dtype=np.uint64)
     if array.ndim != 1 or array.dtype.kind not in "iu" or (array.dtype.kind == "i" and int(array.min()) < 0):
         raise FactorError(f"{name}: expected a flat array of integers from 0 to 2^64 - 1")
     return array.astype(np.uint64)
+
+
+def checked_key_rows(name: str, rows: ArrayLike, columns: int) -> KeyArray:
+    """Return `rows` as an array of GTSAM keys (n, columns), columns > 0, or raise `FactorError`."""
+    try:
+        array = np.asarray(rows)
+    except ValueError as error:
+        raise FactorError(f"{name}: expected rows of the same length") from error
+    if array.ndim != 2 or array.shape[1] != columns or not columns:
+        raise FactorError(f"{name}: expected shape (any, {columns}), got {array.shape}")
+    return checked_key_array(name, array.reshape(-1)).reshape(array.shape)
+
+
+def check_distinct(name: str, rows: KeyArray) -> None:
+    """Raise `FactorError` when a key occurs twice within one of the rows (n, k)."""
+    ordered = np.sort(rows, axis=1)
+    twice = ordered[:, 1:] == ordered[:, :-1]
+    if twice.any():
+        row = int(np.argmax(twice.any(axis=1)))
+        key = int(ordered[row, 1:][twice[row]][0])
+        raise FactorError(f"{name}: {format_key(key)} occurs twice in one factor, the one on {format_keys(rows[row])}")
 
 
 def whitener(name: str, covariance: ArrayLike, dim: int) -> FloatArray:
@@ -92,6 +114,18 @@ def whiteners(name: str, covariances: ArrayLike, dim: int | None = None) -> Floa
     return np.tril(np.linalg.inv(factor))
 
 
+def checked_covariances(name: str, value: ArrayLike, n: int, dim: int | None) -> FloatArray:
+    """Return `value`, n covariances (n, dim, dim) or one for all (dim, dim), as a stack of n or of one."""
+    try:
+        stack = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FactorError(f"{name}: expected numbers in a regular array") from error
+    stack = checked(name, stack[None] if stack.ndim == 2 else stack, (None, dim, dim))
+    if len(stack) not in (1, n):
+        raise FactorError(f"{name}: expected {n} covariances, got {len(stack)}")
+    return stack
+
+
 def format_key(key: int) -> str:
     """Return the key as people write it: x12 for a GTSAM symbol, the number itself otherwise."""
     letter = chr(int(key) >> 56)  # GTSAM's own formatter fails on what is not a letter
@@ -103,6 +137,10 @@ def format_keys(keys: Iterable[int], limit: int = 8) -> str:
     names = [format_key(key) for key in keys]
     more = f" and {len(names) - limit} more" if len(names) > limit else ""
     return ", ".join(names[:limit]) + more
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(n in (None, m) for n, m in zip(wanted, shape, strict=True))
 
 
 def _entry(name: str, stack: FloatArray, bad: NDArray[np.bool_]) -> str:

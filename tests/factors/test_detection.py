@@ -184,7 +184,7 @@ def test_detections_update_like_a_kalman_filter(covariance):
         (lambda: linear_detection_factor(0, RangeBearing(4), [1.0, 2.0], np.eye(2)), "expected a linear one"),
         (lambda: linear_detection_factor(0, LINEAR[3], np.ones(7), np.eye(7)), "near"),
         (lambda: linear_detection_factors([0], position(4), np.ones((2, 2)), np.eye(2)), "keys"),
-        (lambda: linear_detection_factors([0, 1], position(4), np.ones((2, 2)), np.ones((3, 2, 2))), "covariances"),
+        (lambda: linear_detection_factors([0, 1], position(4), np.ones((2, 2)), np.ones((3, 2, 2))), "R: expected 2"),
     ],
 )
 def test_bad_detections_are_refused(make, message):

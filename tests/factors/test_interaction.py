@@ -107,7 +107,7 @@ def test_bad_steps_are_refused_by_name(covariance):
         ({"indptr": [0, 2, 3, 4]}, "indptr"),
         ({"indptr": [0, 3, 2, 5]}, "indptr"),
         ({"indptr": [0.0, 2.0, 3.0, 5.0]}, "indptr"),
-        ({"keys": [0, 0, 1, 0, 1]}, "0 occurs twice in factor 0, the one on 1000, 0, 0"),
+        ({"keys": [0, 0, 1, 0, 1]}, "0 occurs twice in one factor, the one on 1000, 0, 0"),
         ({"keys": [0, 1000, 1, 0, 1]}, "1000 occurs twice"),
         ({"next_keys": [1000, 1001, 1000]}, "1000 occurs more than once"),
         ({"next_keys": [1000, 1001, -2]}, "integers"),

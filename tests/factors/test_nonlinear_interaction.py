@@ -12,48 +12,48 @@ from factors.gaussian import nonlinear_graph
 
 def social_repulsion(x, others, dt):
     """Social force (Helbing and Molnar, Phys. Rev. E 51, 1995): exponential repulsion; state (px, py, vx, vy)."""
-    force = np.zeros(2)
+    force = np.zeros_like(x[..., :2])
     for other in others:
-        away = x[:2] - other[:2]
-        distance = np.sqrt(away @ away + 0.01)
+        away = x[..., :2] - other[..., :2]
+        distance = np.sqrt((away**2).sum(axis=-1, keepdims=True) + 0.01)
         force = force + 2.0 * np.exp(-distance / 1.5) * away / distance
-    v = x[2:] + force * dt
-    return np.concatenate([x[:2] + v * dt, v])
+    v = x[..., 2:] + force * dt
+    return np.concatenate([x[..., :2] + v * dt, v], axis=-1)
 
 
 def social_repulsion_jacobians(x, others, dt):
-    gain, blocks = np.zeros((2, 2)), []
+    F, blocks, eye = np.zeros((*x.shape, 4)), [], np.eye(2)
+    F[..., :2, :2], F[..., :2, 2:], F[..., 2:, 2:] = eye, dt * eye, eye
     for other in others:
-        away = x[:2] - other[:2]
-        distance = np.sqrt(away @ away + 0.01)
-        scale = 2.0 * np.exp(-distance / 1.5) / distance
-        own = scale * (np.eye(2) - np.outer(away, away) / distance * (1 / 1.5 + 1 / distance))
-        gain += own
-        block = np.zeros((4, len(other)))
-        block[:, :2] = np.vstack([-own * dt * dt, -own * dt])
+        away = (x[..., :2] - other[..., :2])[..., None]
+        outer = away * away.swapaxes(-1, -2)
+        distance = np.sqrt((away**2).sum(axis=-2, keepdims=True) + 0.01)
+        own = 2.0 * np.exp(-distance / 1.5) / distance * (eye - outer / distance * (1 / 1.5 + 1 / distance))
+        block = np.zeros((*x.shape, other.shape[-1]))
+        block[..., :2, :2], block[..., 2:, :2] = -own * dt * dt, -own * dt
+        F[..., :2] -= block[..., :2]
         blocks.append(block)
-    F = np.block([[np.eye(2) + gain * dt * dt, dt * np.eye(2)], [gain * dt, np.eye(2)]])
     return F, blocks
 
 
 def coordinated_turn(x, others, dt):
     """Coordinated turn with state (px, py, speed, heading, turn rate); nobody else matters."""
-    px, py, speed, heading, rate = x
-    later = heading + rate * dt
+    px, py, speed, heading, rate = np.moveaxis(x, -1, 0)
     chord = speed * dt * np.sinc(rate * dt / (2 * np.pi))
     middle = heading + rate * dt / 2
-    return np.array([px + chord * np.cos(middle), py + chord * np.sin(middle), speed, later, rate])
+    ahead = [px + chord * np.cos(middle), py + chord * np.sin(middle), speed, heading + rate * dt, rate]
+    return np.stack(ahead, axis=-1)
 
 
 def intelligent_driver(x, others, dt):
     """Intelligent Driver Model (Treiber et al., Phys. Rev. E 62, 2000); state (position, speed) along the lane."""
-    s, v = x
+    s, v = x[..., 0], x[..., 1]
     interaction = 0.0
     for leader in others:
-        wanted = 2.0 + 1.5 * v + v * (v - leader[1]) / (2 * np.sqrt(1.5 * 2.0))
-        interaction = interaction + (wanted / (leader[0] - s - 5.0)) ** 2
+        wanted = 2.0 + 1.5 * v + v * (v - leader[..., 1]) / (2 * np.sqrt(1.5 * 2.0))
+        interaction = interaction + (wanted / (leader[..., 0] - s - 5.0)) ** 2
     a = 1.5 * (1 - (v / 30.0) ** 4 - interaction)
-    return np.array([s + v * dt + 0.5 * a * dt * dt, v + a * dt])
+    return np.stack([s + v * dt + 0.5 * a * dt * dt, v + a * dt], axis=-1)
 
 
 def raises(x, others, dt):
@@ -142,6 +142,49 @@ def test_affine_form_is_the_linear_interaction(name, covariance):
     np.testing.assert_allclose(ours, blocks, atol=1e-7)
 
 
+@pytest.mark.parametrize("robust", [None, Robust("huber", 0.5)])
+@pytest.mark.parametrize("name", CASES)
+def test_many_at_once_equal_one_by_one(name, robust, covariance):
+    cases = [random_case(name, seed, covariance, robust) for seed in range(4)]
+    _, d, others = CASES[name]
+    values, alone = gtsam.Values(), []
+    for i, (_, interaction, states, _, factor, Q) in enumerate(cases):
+        keys = [1000 * i + key for key in factor.keys]
+        for key, state in zip(keys, states, strict=True):
+            values.insert(key, state)
+        alone.append(interaction.factor(keys[0], keys[1], keys[2:], [d, *others], 0.3, Q, robust))
+    rows = np.array([factor.keys for factor in alone])
+    Q = np.stack([case[-1] for case in cases])
+    together = CASES[name][0].factors(rows[:, 0], rows[:, 1], rows[:, 2:], [d, *others], 0.3, Q, robust)
+    assert together.keys == tuple(sorted(rows.ravel().tolist()))
+    np.testing.assert_allclose(together.errors(values), [factor.error(values) for factor in alone], rtol=1e-12)
+    linear = together.linearise(values)
+    for i, factor in enumerate(alone):
+        expected = factor.linearise(values)
+        assert linear.at(i).keys() == expected.keys()
+        np.testing.assert_allclose(linear.at(i).augmentedJacobian(), expected.augmentedJacobian(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"neighbours": [1, 2]}, r"neighbours: expected shape \(n, k\)"),
+        ({"keys": [1, 2, 3]}, "with 3 and 2"),
+        ({"dims": [2, 2, 2]}, "expected 2 dimensions"),
+        ({"covariances": np.ones((2, 2))}, "singular"),
+        ({"covariances": np.ones((3, 2, 2))}, "expected 2 covariances"),
+        ({"dt": -1.0}, "dt"),
+        ({"next_keys": [5, -6]}, "integers"),
+    ],
+)
+def test_bad_lists_of_interactions_are_refused(change, message):
+    given = {
+        "next_keys": [11, 12], "keys": [1, 2], "neighbours": [[2], [1]], "dims": 2, "dt": 0.1, "covariances": np.eye(2)
+    } | change  # fmt: skip
+    with pytest.raises(FactorError, match=message):
+        CASES["following"][0].factors(**given)
+
+
 def followers(n, steps, seed):
     """A queue of drivers: graph of priors and interactions, and a start away from the solution."""
     rng = np.random.default_rng(seed)
@@ -164,6 +207,7 @@ def followers(n, steps, seed):
 @pytest.mark.parametrize("seed", range(2))
 def test_gtsams_solvers_reach_the_same_minimum(seed, method):
     graph, ours, start = followers(5, 4, seed)
+    assert len(ours) == 20
     solution = solve(graph, ours, start, SolverSettings(method=method))
     assert solution.converged
 

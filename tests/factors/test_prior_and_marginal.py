@@ -100,9 +100,9 @@ def test_many_factors_equal_one_by_one(seed, covariance):
 @pytest.mark.parametrize(
     ("keys", "means", "P", "message"),
     [
-        ([1, 2], [[0.0], [0.0]], np.ones((3, 1, 1)), "expected 2 matrices, got 3"),
+        ([1, 2], [[0.0], [0.0]], np.ones((3, 1, 1)), "expected 2 covariances, got 3"),
         ([1, 1], [[0.0], [0.0]], np.eye(1), "more than once"),
-        ([1], [[0.0], [0.0]], np.eye(1), "keys: expected shape"),
+        ([1], [[0.0], [0.0]], np.eye(1), "keys: expected 2 rows"),
         ([1, 2], [[0.0], [np.nan]], np.eye(1), r"means\[1, 0\]"),
         ([1, 2], [0.0, 0.0], np.eye(1), "means: expected shape"),
     ],
