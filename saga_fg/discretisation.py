@@ -111,7 +111,7 @@ def _coupled_groups(graph: SceneGraph) -> list[_Group]:
     """Nodes grouped by type, those that no edge acts on apart."""
     coupled = np.zeros(len(graph), dtype=bool)
     for edges in graph.edges:
-        coupled[edges.target] = True
+        coupled[edges.target[edges.rate > 0]] = True
     kinds: dict[int, int] = {}
     type_number = np.array([kinds.setdefault(id(t), len(kinds)) for t in graph.types])
     highest = max((_nilpotency(t.generator) or 0 for t in graph.types), default=1)
@@ -131,7 +131,9 @@ def _coupled_groups(graph: SceneGraph) -> list[_Group]:
         M = np.repeat(A, len(bound), axis=0)
         c = np.zeros((len(bound), node_type.dim))
         for edges in graph.edges:
-            mine = of_type[edges.target]
+            mine = of_type[edges.target] & coupled[edges.target]
+            if not mine.any():  # edges between states of another size, perhaps
+                continue
             at = position[edges.target[mine]]
             np.add.at(M, at, edges.rate[mine, None, None] * edges.A_self[mine])
             np.add.at(c, at, edges.rate[mine, None] * edges.b[mine])
@@ -193,6 +195,8 @@ def _coupling_blocks(
     blocks = []
     source_kind = np.array([id(graph.types[j]) for j in edges.source], dtype=np.int64)
     for number, kind in sorted({(int(o), int(k)) for o, k in zip(owner[edges.target], source_kind, strict=True)}):
+        if number < 0:  # no edge of a rate above zero acts on these
+            continue
         mine = np.flatnonzero((owner[edges.target] == number) & (source_kind == kind))
         target, source = edges.target[mine], edges.source[mine]
         A_j = graph.types[source[0]].generator
