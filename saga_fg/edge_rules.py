@@ -15,7 +15,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows
+from saga_fg.errors import InputError
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
 from saga_fg.scene_graph import Edges, SceneGraph
@@ -105,13 +106,16 @@ class Following:
 
 
 def build_graph(nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1e-3) -> SceneGraph:
-    """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out."""
+    """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out.
+
+    Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
+    """
     groups: list[Edges] = []
     if len(nodes) > 1:
         kinds: dict[int, int] = {}
         kind = np.array([kinds.setdefault(id(t), len(kinds)) for t in nodes.types])
         for rule in rules:
-            target, source, rate = rule.pairs(nodes)
+            target, source, rate = _checked_pairs(rule, nodes)
             keep = rate >= min_rate
             target, source, rate = target[keep], source[keep], rate[keep]
             pair_kind = kind[target] * len(kinds) + kind[source]
@@ -122,6 +126,19 @@ def build_graph(nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1
                     name = type(rule.interaction).__name__
                     groups.append(Edges(name, t, s, rate[mine], *rule.interaction.triples(nodes, t, s)))
     return SceneGraph(nodes.id, nodes.types, tuple(groups))
+
+
+def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """What the rule, perhaps a user's own, chooses; `InputError` if it makes no sense."""
+    what = f"edge rule {type(rule).__name__}"
+    pairs = rule.pairs(nodes)
+    target = checked_rows(f"{what}: target", pairs[0])
+    source = checked_rows(f"{what}: source", pairs[1], len(target))
+    for name, rows in (("target", target), ("source", source)):
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(nodes)):
+            bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
+            raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
+    return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))
 
 
 def _close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray, FloatArray]:
