@@ -26,7 +26,7 @@ class Kind:
 
 KINDS = (
     Kind("car", "car", (4.6, 1.85, 1.58), (0.3, 0.07, 0.1)),
-    Kind("van", "car", (5.4, 2.0, 2.35), (0.4, 0.06, 0.2)),
+    Kind("van", "car", (5.3, 2.0, 2.15), (0.4, 0.06, 0.2)),
     Kind("truck", "truck", (8.5, 2.45, 3.3), (1.4, 0.1, 0.3), speed=0.9, headway=1.2, acceleration=0.65),
     Kind("bus", "bus", (11.8, 2.5, 3.1), (0.7, 0.05, 0.15), speed=0.9, headway=1.15, acceleration=0.7),
 )

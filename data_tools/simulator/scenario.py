@@ -14,7 +14,7 @@ from data_tools.simulator.road import curved_road
 from data_tools.simulator.settings import RoadSettings, SimulatorSettings, TrafficSettings
 from saga_fg.arrays import FloatArray, IntArray
 
-JUNCTION = 30.0  # m between the stop lines of the two directions
+JUNCTION = 10.0  # m between the stop lines of the two directions
 FOCUS = 0.55  # share of the road's length at which things happen
 
 
@@ -88,18 +88,21 @@ def _draw_disturbances(
     lanes: Lanes, focus: float, until: float, settings: TrafficSettings, rng: np.random.Generator
 ) -> tuple[tuple[StopLine, ...], tuple[SlowZone, ...]]:
     opposite = lanes.road.length - (focus + JUNCTION)
-    if lanes.ending < 0 and rng.random() < settings.signal_probability:
-        red = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
-        return (StopLine(lanes.forward, focus, red), StopLine(lanes.oncoming, opposite, red)), ()
-    zones = []
+    light = lanes.ending < 0 and rng.random() < settings.signal_probability
     lane_wise = rng.random() < settings.lane_wise_probability
-    for lanes_of_direction, start in ((lanes.forward, focus + 20.0), (lanes.oncoming, opposite - 40.0)):
-        groups = lanes_of_direction[:, None] if lane_wise else [lanes_of_direction]
-        for group in groups:
-            speed = float(rng.uniform(*settings.slow_speed))
-            active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)
-            zones.append(SlowZone(group, start, start + 60.0, speed, active))
-    return (), tuple(zones)
+    stop_lines, zones = [], []
+    shared = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
+    for mine, place in ((lanes.forward, focus), (lanes.oncoming, opposite)):
+        if light:
+            turning = mine[:1] if lane_wise and len(mine) > 1 else mine[:0]  # the innermost lane turns off
+            own = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
+            stop_lines += [StopLine(np.setdiff1d(mine, turning), place, shared), StopLine(turning, place, own)]
+        else:
+            for group in mine[:, None] if lane_wise else [mine]:
+                speed = float(rng.uniform(*settings.slow_speed))
+                active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)
+                zones.append(SlowZone(group, place + 20.0, place + 80.0, speed, active))
+    return tuple(stop_lines), tuple(zones)
 
 
 def _fill(

@@ -30,7 +30,7 @@ class RoadSettings:
 class DriverSettings:
     """Means of the Intelligent Driver Model's parameters over the drivers of cars, and how much drivers differ."""
 
-    desired_speed: Range = setting((9.0, 15.0), "mean desired speed of a scene's drivers, m/s")
+    desired_speed: Range = setting((10.0, 16.0), "mean desired speed of a scene's drivers, m/s")
     time_headway: float = setting(1.2, "desired time headway T, s")
     minimum_gap: float = setting(2.0, "gap s0 kept at standstill, m")
     max_acceleration: float = setting(1.5, "maximum acceleration a, m/s^2")
@@ -48,16 +48,16 @@ class DriverSettings:
 class TrafficSettings:
     """How many vehicles there are, of which kinds, and what disturbs their flow."""
 
-    van_share: float = setting(0.15, "share of vans (labelled car) among moving vehicles")
+    van_share: float = setting(0.25, "share of vans and the like, labelled car, that one cannot look over")
     truck_share: float = setting(0.18, "share of trucks")
     bus_share: float = setting(0.08, "share of buses")
     platoon_size: tuple[int, int] = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: Range = setting((10.0, 60.0), "extra distance between platoons, m")
-    signal_probability: float = setting(0.6, "share of scenes with a traffic light ahead; the rest have a slow zone")
+    signal_probability: float = setting(0.7, "share of scenes with a traffic light ahead; the rest have a slow zone")
     red_duration: Range = setting((8.0, 18.0), "duration of a red phase, s")
     green_duration: Range = setting((8.0, 16.0), "duration of a green phase, s")
-    lane_wise_probability: float = setting(0.5, "share of the scenes with slow zones where each lane has its own")
-    slow_speed: Range = setting((2.0, 5.0), "speed in a slow zone while it is active, m/s")
+    lane_wise_probability: float = setting(0.5, "share of scenes where lanes have lights or slow zones of their own")
+    slow_speed: Range = setting((1.0, 4.0), "speed in a slow zone while it is active, m/s")
     slow_duration: Range = setting((5.0, 12.0), "how long a slow zone is active, and inactive, s")
 
 
