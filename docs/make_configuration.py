@@ -21,7 +21,7 @@ tracker:
   classes:
     pedestrian: {max_distance: 2.0}   # the rest as in `default`
   existence:
-    confirm: 0.3
+    report: 0.3
 sensors:
   camera:
     time_offset: -0.04
