@@ -41,7 +41,8 @@ class BoxFilter:
         yaw_noise: FloatArray,
     ) -> BoxFilter:
         """Filters of new tracks from their first detections; noises are standard deviations."""
-        return cls(size.copy(), weight.copy(), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2)
+        known = np.isfinite(size).all(axis=1)
+        return cls(size.copy(), np.where(known, weight, 0.0), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2)
 
     def select(self, rows: IntArray | BoolArray) -> BoxFilter:
         return BoxFilter(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -81,7 +82,7 @@ class BoxFilter:
         self.yaw[rows[first]], self.yaw_variance[rows[first]] = yaw[first], variance[first]
         difference = wrap_angle(yaw - self.yaw[rows])
         difference = np.where(np.abs(difference) > np.pi / 2, wrap_angle(difference + np.pi), difference)
-        gain = self.yaw_variance[rows] / (self.yaw_variance[rows] + variance)
+        gain = np.where(first, 0.0, self.yaw_variance[rows] / (self.yaw_variance[rows] + variance))
         self.yaw[rows] = wrap_angle(self.yaw[rows] + gain * difference)
         self.yaw_variance[rows] *= 1 - gain
 

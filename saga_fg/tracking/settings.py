@@ -49,6 +49,12 @@ class ExistenceSettings:
     confirm: float = setting(0.9, "from here on a track is confirmed: misses no longer end it, only time does")
     give_up: float = setting(0.02, "unconfirmed tracks below this existence probability are removed")
 
+    def __post_init__(self) -> None:
+        require_positive(self, "lifetime", infinite=True)
+        require_between(self, 0, 1, "clutter_score", "report", "confirm", "give_up")
+        if self.clutter_score in (0, 1):
+            raise InputError(f"clutter_score: expected a probability inside 0 to 1, got {self.clutter_score!r}")
+
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -63,6 +69,7 @@ class TrackerSettings:
     )
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
+    max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
 
     def __post_init__(self) -> None:

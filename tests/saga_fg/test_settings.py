@@ -80,6 +80,8 @@ def test_groups_are_made_anew():
         (ClassSettings, {"gate": 1.0}, "gate: expected a share below 1"),
         (ClassSettings, {"birth_score": 2.0}, "birth_score: expected a number from 0 to 1"),
         (ClassSettings, {"max_distance": 0.0}, "max_distance: expected a number > 0"),
+        (ExistenceSettings, {"clutter_score": 1.0}, "clutter_score: expected a probability inside 0 to 1, got 1.0"),
+        (ExistenceSettings, {"report": 1.1}, "report: expected a number from 0 to 1, got 1.1"),
         (TrackerSettings, {"max_delay": -0.1}, "max_delay: expected a finite number >= 0"),
         (GreedySettings, {"max_coasting": math.nan}, "max_coasting: expected a number > 0"),
     ],

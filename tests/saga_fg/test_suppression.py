@@ -1,0 +1,55 @@
+"""Duplicates: of two detections too close to be two objects the weaker goes."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from saga_fg import Boxes
+from saga_fg.tracking.suppression import strongest
+
+
+def kept(x, probability, distance=1.0, label="car"):
+    n = len(x)
+    boxes = Boxes.of(np.broadcast_to(label, n), np.stack([x, np.zeros(n), np.zeros(n)], axis=-1))
+    return strongest(boxes, np.asarray(probability), np.broadcast_to(distance, n).astype(float)).tolist()
+
+
+def test_the_weaker_of_two_goes():
+    assert kept([0.0, 0.5, 5.0], [0.4, 0.9, 0.1]) == [1, 2]
+    assert kept([0.0, 0.5], [0.9, 0.9]) == [0]
+
+
+def test_what_is_suppressed_suppresses_nothing():
+    assert kept([0.0, 0.8, 1.6], [0.9, 0.8, 0.7]) == [0, 2]
+    assert kept([0.0, 0.8, 1.6], [0.7, 0.9, 0.8]) == [1]
+
+
+def test_classes_do_not_suppress_each_other():
+    assert kept([0.0, 0.1], [0.9, 0.8], label=["car", "pedestrian"]) == [0, 1]
+
+
+def test_distance_zero_suppresses_nothing():
+    assert kept([0.0, 0.0], [0.9, 0.8], distance=0.0) == [0, 1]
+    assert kept([0.0, 0.5], [0.9, 0.8], distance=0.5) == [0, 1]
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_few_boxes(n):
+    assert kept(np.zeros(n), np.ones(n)) == list(range(n))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12))
+def test_what_stays_is_apart_and_what_goes_was_beaten(seed, n):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(0, 4, (n, 3))
+    probability = rng.permutation(n) / n
+    label = rng.choice(["car", "bus"], n)
+    distance = np.where(label == "car", 1.0, 1.5)
+    stays = strongest(Boxes.of(label, position), probability, distance)
+    apart = np.hypot(*np.moveaxis(position[:, None, :2] - position[None, :, :2], -1, 0))
+    rival = (label[:, None] == label) & (apart < distance[:, None]) & ~np.eye(n, dtype=bool)
+    assert (np.diff(stays) > 0).all()
+    assert not rival[np.ix_(stays, stays)].any()
+    for k in np.setdiff1d(np.arange(n), stays):
+        assert (rival[k, stays] & (probability[stays] > probability[k])).any()
