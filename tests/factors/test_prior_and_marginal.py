@@ -35,8 +35,9 @@ def moments(graph, keys):
     return covariance @ vector, covariance
 
 
+@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
 @pytest.mark.parametrize("seed", range(5))
-def test_marginal_keeps_what_is_known_of_the_rest(seed, covariance):
+def test_marginal_keeps_what_is_known_of_the_rest(seed, elimination, covariance):
     rng = np.random.default_rng(seed)
     keys = rng.permutation(500)[:9].tolist()
     dims = {key: int(rng.integers(1, 5)) for key in keys}
@@ -45,13 +46,13 @@ def test_marginal_keeps_what_is_known_of_the_rest(seed, covariance):
     mean, P = moments(graph, [*kept, *gone])
     size = sum(dims[key] for key in kept)
 
-    remaining = marginal_factors(graph, gone)
+    remaining = marginal_factors(graph, gone, elimination)
     assert sorted(remaining.keyVector()) == sorted(kept)
     reduced_mean, reduced_P = moments(remaining, kept)
     np.testing.assert_allclose(reduced_mean, mean[:size], atol=1e-8)
     np.testing.assert_allclose(reduced_P, P[:size, :size], atol=1e-8)
 
-    joint_mean, joint_P = marginal_moments(graph, kept[::-1][:3])
+    joint_mean, joint_P = marginal_moments(graph, kept[::-1][:3], elimination)
     rows = np.concatenate([_rows(kept, dims, key) for key in kept[::-1][:3]])
     np.testing.assert_allclose(joint_mean, mean[rows], atol=1e-8)
     np.testing.assert_allclose(joint_P, P[np.ix_(rows, rows)], atol=1e-8)
@@ -138,7 +139,8 @@ def test_unknown_key_is_refused(covariance):
         marginal_moments(graph, [1, 2])
 
 
-def test_singular_system_names_the_free_variables_only():
+@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
+def test_singular_system_names_the_free_variables_only(elimination):
     x = [gtsam.symbol("x", i) for i in range(4)]
     between = [np.eye(2), -np.eye(2)]
     graph = gaussian_graph(
@@ -149,24 +151,47 @@ def test_singular_system_names_the_free_variables_only():
         ]
     )
     with pytest.raises(SingularSystemError, match="does not determine x2, x3") as caught:
-        marginal_factors(graph, x)
+        marginal_factors(graph, x, elimination)
     assert caught.value.keys == (x[2], x[3])
     with pytest.raises(SingularSystemError):
-        marginal_moments(graph, x)
+        marginal_moments(graph, x, elimination)
 
 
-def test_variable_whose_factors_vanish_is_named():
+@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
+def test_variable_whose_factors_vanish_is_named(elimination):
     graph = gaussian_graph([gaussian_factor([1, 2], [np.eye(2), np.eye(2)], [0.0, 0.0])])
     with pytest.raises(SingularSystemError, match="does not determine"):
-        marginal_moments(graph, [1])
+        marginal_moments(graph, [1], elimination)
 
 
-def test_nan_is_found_when_marginalising():
+@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
+@pytest.mark.parametrize("others", [[], [6]])
+@pytest.mark.parametrize("broken", ["getA", "getb"])
+def test_nan_is_found_when_marginalising(broken, others, elimination):
     factor = prior_factor(5, [1.0], [[1.0]])
-    factor.getb()[:] = np.nan  # as an in-place update might
-    graph = gaussian_graph([factor, gaussian_factor([5, 6], [[[1.0]], [[1.0]]], [0.0])])
+    getattr(factor, broken)()[:] = np.nan  # as an in-place update might
+    graph = gaussian_graph([factor, *(gaussian_factor([5, key], [[[1.0]], [[1.0]]], [0.0]) for key in others)])
     with pytest.raises(FactorError, match="factors on 5 hold numbers that are not finite"):
-        marginal_factors(graph, [5])
+        marginal_factors(graph, [5], elimination)
+
+
+def test_unknown_elimination_is_refused():
+    with pytest.raises(FactorError, match="elimination: expected one of cholesky, qr"):
+        marginal_factors(gaussian_graph([prior_factor(1, [0.0], [[1.0]])]), [1], "lu")
+
+
+def test_qr_keeps_the_digits_that_cholesky_loses():
+    """A chain of nearly rigid links: prior of variance 1, links of variance 1e-12."""
+    rng = np.random.default_rng(0)
+    offsets = rng.normal(size=20)
+    factors = [prior_factor(0, [1.0], [[1.0]])]
+    factors += [gaussian_factor([t, t + 1], [[[-1.0]], [[1.0]]], [offsets[t]], [[1e-12]]) for t in range(20)]
+    graph = gaussian_graph(factors)
+    mean, variance = marginal_moments(graph, [20], "qr")
+    assert mean[0] == pytest.approx(1.0 + offsets.sum(), abs=1e-9)
+    assert variance[0, 0] == pytest.approx(1.0 + 20e-12, rel=1e-11)
+    rough, _ = marginal_moments(graph, [20])
+    assert abs(rough[0] - mean[0]) > 1e-9
 
 
 @pytest.mark.parametrize(
