@@ -36,7 +36,7 @@ def detection_factor(
 
     z: (m,) measured; R: (m, m), positive definite. Raises `FactorError`, now or when linearised where h is undefined.
     """
-    measured = checked("z", z, (model.dim,))
+    measured = checked("z", z, (model.dim,)).copy()
     function = _Detection(model, measured)
     return ResidualFactor(
         keys=(key,),
@@ -54,7 +54,7 @@ def detection_factors(
     keys: ArrayLike, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: Robust | None = None
 ) -> ResidualFactors:
     """Return n factors of one model, linearised together; keys: (n,), z: (n, m), R: (n, m, m), or (m, m) for all."""
-    measured = checked("z", z, (None, model.dim))
+    measured = checked("z", z, (None, model.dim)).copy()
     function = _Detection(model, measured)
     return ResidualFactors(
         rows=_column(keys, len(measured)),

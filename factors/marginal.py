@@ -6,11 +6,11 @@ with Q_2 the part of the QR factor of A_a that is orthogonal to it; for Gaussian
 constant. A node that disappears is marginalised, never just deleted together with its factors.
 
 Two eliminations, both GTSAM's. "cholesky" works on the information matrix A^T A, whose condition number is the square
-of A's; "qr" works on A itself. Over a hundred steps of five coupled nodes at coordinates of 1000 m, measured to 0.1 m ten
-times a second, Cholesky's means come to lie 2e-9 posterior sigmas from those of a covariance filter at an acceleration
-noise of 0.1 m^2/s^3, 2e-6 at 1e-4 and 4e-2 at 1e-8; QR's 1e-10, 1e-8 and 8e-7. QR takes half as long again on small
-components, and up to twenty times as long on a large, densely connected graph. Increments from a point nearby, in place
-of coordinates, shrink both errors alike.
+of A's; "qr" works on A itself. Over a hundred steps of five coupled nodes at coordinates of 1000 m, measured to 0.1 m
+ten times a second, Cholesky's means come to lie 2e-9 posterior sigmas from those of a covariance filter at an
+acceleration noise of 0.1 m^2/s^3, 2e-6 at 1e-4 and 4e-2 at 1e-8; QR's 1e-10, 1e-8 and 8e-7. QR takes half as long again
+on small components, and up to twenty times as long on a large, densely connected graph. Increments from a point nearby,
+in place of coordinates, shrink both errors alike.
 """
 
 from __future__ import annotations

@@ -69,7 +69,9 @@ class ResidualFactor:
         keys = checked_keys("keys", self.keys)
         if not keys or len(self.variables) != len(keys):
             raise FactorError(f"variables: expected one per key, got {len(self.variables)} for {len(keys)} keys")
-        covariance = checked("covariance", self.covariance, (None, None))
+        covariance = checked("covariance", self.covariance, (None, None)).copy()
+        if not len(covariance):
+            raise FactorError("covariance: expected at least one row")
         if any(not 0 <= component < len(covariance) for component in self.angles):
             raise FactorError(f"angles: expected components from 0 to {len(covariance) - 1}, got {self.angles}")
         object.__setattr__(self, "keys", keys)

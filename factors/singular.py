@@ -8,11 +8,13 @@ move without any factor noticing.
 
 from __future__ import annotations
 
+import re
+
 import gtsam
 import numpy as np
 
 from factors.errors import FactorError, SingularSystemError
-from factors.validation import FloatArray, format_keys
+from factors.validation import FloatArray, format_key, format_keys
 
 _LARGEST = 3000  # dimensions: beyond, the eigenvalues would take minutes
 _ZERO = 1e-11  # eigenvalue relative to the unit diagonal
@@ -29,8 +31,7 @@ def singular_system(graph: gtsam.GaussianFactorGraph, cause: Exception | None = 
     keys = [int(key) for key in graph.keyVector()]
     dims = [int(steps.dim(key)) for key in keys]
     if sum(dims) > _LARGEST:
-        reason = " ".join(str(cause).split(".")[0].split()) if cause else "not finite"
-        return SingularSystemError(f"the linear system cannot be solved: {reason}")
+        return _unresolved(cause or _complaint(graph))
     information, vector = graph.hessian(gtsam.Ordering(keys))
     owner = np.repeat(np.arange(len(keys)), dims)
     broken = ~(np.isfinite(information).all(axis=1) & np.isfinite(vector))
@@ -43,6 +44,24 @@ def singular_system(graph: gtsam.GaussianFactorGraph, cause: Exception | None = 
     return SingularSystemError(
         f"the linear system does not determine {format_keys(concerned)}; add factors, or a prior, that do",
         concerned,
+    )
+
+
+def _complaint(graph: gtsam.GaussianFactorGraph) -> Exception | None:
+    try:
+        graph.optimize()
+    except RuntimeError as error:
+        return error
+    return None
+
+
+def _unresolved(cause: Exception | None) -> FactorError:
+    near = re.search(r"near variable\s+(\d+)", str(cause))
+    if near is None:
+        return FactorError("the linear system cannot be solved: its factors hold numbers that are not finite")
+    key = int(near[1])
+    return SingularSystemError(
+        f"the linear system does not determine all variables: elimination stopped near {format_key(key)}", (key,)
     )
 
 

@@ -58,7 +58,9 @@ class ResidualFactors:
         check_distinct("rows", rows)
         if any(isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1 for dim in self.dims):
             raise FactorError(f"dims: expected positive integers, got {self.dims}")
-        stack = checked_covariances("covariances", self.covariances, len(rows), None)
+        stack = checked_covariances("covariances", self.covariances, len(rows), None).copy()
+        if not stack.shape[1]:
+            raise FactorError("covariances: expected at least one row")
         W = whiteners("covariances", stack)
         if any(not 0 <= component < W.shape[1] for component in self.angles):
             raise FactorError(f"angles: expected components from 0 to {W.shape[1] - 1}, got {self.angles}")

@@ -302,6 +302,15 @@ def test_missing_or_mistyped_variables_are_named():
         factor.error(posed)
 
 
+def test_factors_keep_no_view_of_the_callers_arrays():
+    Q = np.eye(2)
+    factor = CASES["following"][0].factor(1, 2, [3], 2, 0.1, Q)
+    values = values_of([0, 9], [0, 10], [40, 10])
+    before = factor.error(values), factor.as_custom_factor().error(values)
+    Q *= 100
+    assert (factor.error(values), factor.as_custom_factor().error(values)) == before
+
+
 def test_factors_of_named_functions_survive_pickling(covariance):
     *_, values, factor, _ = random_case("repulsion", 2, covariance, Robust("huber", 1.0))
     assert pickle.loads(pickle.dumps(factor)).error(values) == factor.error(values)

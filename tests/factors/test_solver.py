@@ -22,6 +22,7 @@ from factors import (
     nonlinear_graph,
     position,
     prior_factor,
+    prior_factors,
     solve,
 )
 
@@ -175,6 +176,15 @@ def test_only_the_free_direction_of_a_nonlinear_problem_is_named():
     known = detection_factor(X[1], position(2), [1.0, 2.0], np.eye(2))
     with pytest.raises(SingularSystemError, match="does not determine x3;"):
         solve(EMPTY, [ranges, known], values_of({X[1]: np.ones(2), X[3]: np.array([3.0, 3.0])}))
+
+
+def test_large_singular_system_is_still_named():
+    keys = [gtsam.symbol("x", i) for i in range(1100)]
+    factors = prior_factors(keys[:-1], np.zeros((1099, 3)), np.eye(3))
+    factors.append(gaussian_factor([keys[-1]], [np.ones((1, 3))], [0.0]))
+    with pytest.raises(SingularSystemError, match="near x1099") as caught:
+        solve(nonlinear_graph(factors, dict.fromkeys(keys, 3)), [], values_of(dict.fromkeys(keys, np.ones(3))))
+    assert caught.value.keys == (keys[-1],)
 
 
 def test_variable_without_any_factor_is_named():
