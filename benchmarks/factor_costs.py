@@ -1,8 +1,9 @@
 """What factors cost from Python: `OPENBLAS_NUM_THREADS=1 python benchmarks/factor_costs.py [--nodes N] [--seed S]`.
 
 One step of N nodes with states of 4 numbers and 4 neighbours each. Microseconds of processor time per node (a factor
-each; when solving, three), the best of several runs, and the ratio to a baseline of the same run: for native factors GTSAM's constructor called block by
-block, for nonlinear ones our factors one by one, for solving GTSAM's Gauss-Newton over `CustomFactor`s.
+each; when solving, three), the best of several runs, and the ratio to a baseline of the same run: for native factors
+GTSAM's constructor called block by block, for nonlinear ones our factors one by one, for solving GTSAM's Gauss-Newton
+over `CustomFactor`s.
 """
 
 from __future__ import annotations
