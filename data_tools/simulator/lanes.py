@@ -84,20 +84,15 @@ class Lanes:
         allowed = (target >= 0) & (target != self.ending if self.ending >= 0 else True)
         return np.asarray(allowed & ((lane != self.ending) | (s >= self.opening)))
 
-    def pose(
-        self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """World position (..., 2), heading (...) and metric (...) at travelled s, offset d, where dd/ds = `slope`.
-
-        The metric is the length travelled over ground per unit of s.
-        """
+    def pose(self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """World position (..., 2), m, and heading (...), rad, at travelled s, offset d, where dd/ds = `slope`."""
         sign = self.direction[lane]
         along = self.road_s(lane, s)
         stretch = 1 - self.road.curvature_at(along) * d
         tangent = self.road.heading_at(along)
         heading = tangent + np.where(sign > 0, 0.0, np.pi) + sign * np.arctan2(slope, stretch)
-        return self.road.position(along, d), heading, np.hypot(stretch, slope)
+        return self.road.position(along, d), heading
 
     def metric(self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray) -> FloatArray:
-        """The metric of `pose` alone."""
+        """Length travelled over ground per unit of s, at places as in `pose`."""
         return np.hypot(1 - self.road.curvature_at(self.road_s(lane, s)) * d, slope)

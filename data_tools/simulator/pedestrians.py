@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_tools.simulator.lanes import Lanes
+from data_tools.simulator.road import Road
 from data_tools.simulator.settings import PedestrianSettings
 from data_tools.simulator.trajectories import Trajectories
 from saga_fg.arrays import FloatArray
@@ -24,7 +24,7 @@ BODY = (0.65, 0.65, 1.72)  # length, width, height, m
 
 
 def walk(
-    lanes: Lanes,
+    road: Road,
     pavements: list[tuple[float, float]],
     window: tuple[float, float],
     time: FloatArray,
@@ -32,7 +32,6 @@ def walk(
     rng: np.random.Generator,
 ) -> Trajectories:
     """People on `pavements` (lowest and highest offset d each, m), starting at road s within `window`, m."""
-    road = lanes.road
     groups = int(rng.integers(settings.groups[0], settings.groups[1] + 1)) if pavements else 0
     count = rng.integers(settings.group_size[0], settings.group_size[1] + 1, size=groups)
     group = np.repeat(np.arange(groups), count)

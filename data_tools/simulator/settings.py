@@ -11,6 +11,17 @@ from saga_fg.settings import setting, settings_group
 Range = tuple[float, float]
 
 
+def _require_positive(settings: object, *names: str) -> None:
+    """Raise `InputError` unless the named settings, numbers or ranges of growing numbers, are above 0."""
+    for name in names:
+        value = getattr(settings, name)
+        is_range = isinstance(value, tuple | list)
+        low, high = value if is_range else (value, value)
+        if not 0 < low <= high:
+            expected = "two growing positive numbers (low, high)" if is_range else "a positive number"
+            raise InputError(f"{name}: expected {expected}, got {value}")
+
+
 @dataclass(frozen=True)
 class RoadSettings:
     """Shape of the road, in m; traffic keeps to the right."""
@@ -24,6 +35,11 @@ class RoadSettings:
     merge_probability: float = setting(0.3, "share of scenes with a lane that ends (an on-ramp or a lane drop)")
     median_probability: float = setting(0.5, "share of scenes with a hedge between the directions")
     median_width: float = setting(3.0, "width of the strip that carries the hedge, m")
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "lane_width", "lanes", "oncoming_lanes", "curve_radius", "median_width")
+        if not self.length >= 800:
+            raise InputError(f"length: expected at least 800 m, got {self.length}")
 
 
 @dataclass(frozen=True)
@@ -43,6 +59,10 @@ class DriverSettings:
     change_threshold: float = setting(0.3, "gain in acceleration that is worth a change of lanes, m/s^2")
     safe_deceleration: float = setting(3.0, "hardest braking a lane change may cause, m/s^2")
 
+    def __post_init__(self) -> None:
+        _require_positive(self, "desired_speed", "time_headway", "minimum_gap", "max_acceleration")
+        _require_positive(self, "comfortable_deceleration", "noise_time")
+
 
 @dataclass(frozen=True)
 class TrafficSettings:
@@ -59,6 +79,11 @@ class TrafficSettings:
     lane_wise_probability: float = setting(0.5, "share of scenes where lanes have lights or slow zones of their own")
     slow_speed: Range = setting((1.0, 4.0), "speed in a slow zone while it is active, m/s")
     slow_duration: Range = setting((5.0, 12.0), "how long a slow zone is active, and inactive, s")
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "platoon_size", "red_duration", "green_duration", "slow_speed", "slow_duration")
+        if not self.van_share + self.truck_share + self.bus_share <= 1:
+            raise InputError("van_share: expected the shares of vans, trucks and buses to be at most 1 together")
 
 
 @dataclass(frozen=True)
@@ -84,6 +109,9 @@ class SurroundingSettings:
     hedge_height: float = setting(2.2, "height of a hedge, m")
     building_length: Range = setting((10.0, 30.0), "length of a building, m")
     building_gap: Range = setting((2.0, 25.0), "gap between buildings, m")
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "hedge_length", "hedge_gap", "hedge_height", "building_length", "building_gap")
 
 
 @dataclass(frozen=True)
@@ -118,8 +146,7 @@ class SensorSettings:
     logit_noise: float = setting(0.8, "standard deviation of the logit of the score")
 
     def __post_init__(self) -> None:
-        if not self.rate > 0:
-            raise InputError(f"rate: expected a positive number of frames per second, got {self.rate}")
+        _require_positive(self, "rate", "max_range", "reach", "fading")
         if not 0 < self.field_of_view <= 2 * math.pi + 1e-9:
             raise InputError(f"field_of_view: expected an angle in (0, 2 pi] rad, got {self.field_of_view}")
         if not 0 <= self.detection_probability <= 1:
@@ -180,8 +207,6 @@ class SimulatorSettings:
     )
 
     def __post_init__(self) -> None:
-        for name in ("duration", "keyframe_rate", "step", "annotation_range"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        _require_positive(self, "duration", "keyframe_rate", "step", "annotation_range")
         if self.warm_up < 0:
             raise InputError(f"warm_up: expected a time of at least 0 s, got {self.warm_up}")

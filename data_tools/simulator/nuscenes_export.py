@@ -1,0 +1,124 @@
+"""Simulated scenes in the nuScenes layout, for every tool that reads it.
+
+    DIRECTORY/VERSION/*.json         the 13 tables, and splits.json with all scenes as split "all"
+    DIRECTORY/maps/placeholder.png   a black pixel: there is no map
+    DIRECTORY/detections/NAME.json   the detections of the sensor NAME in the official detection-result format
+
+Samples come at 2 Hz. A sensor's detections of a sample are those of its frame nearest in time, moved along their
+measured velocities to the sample's time; unknown velocities are NaN.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.atomic_files import atomic_directory
+from data_tools.simulator.dataset import SimulatedTraffic
+from data_tools.simulator.nuscenes_tables import (
+    Tables,
+    channel_of,
+    keyframes,
+    nearest_frames,
+    sample_tokens,
+    scene_tables,
+    shared_tables,
+)
+from saga_fg.dataset import Scene
+from saga_fg.errors import InputError
+from saga_fg.frame import Frame
+from saga_fg.geometry import yaw_quaternion
+
+ATTRIBUTE_OF_DETECTIONS = ""  # not estimated
+
+
+def write_nuscenes(directory: str | Path, dataset: SimulatedTraffic, version: str = "v1.0-mini") -> None:
+    """Write all scenes of `dataset` under `directory`; all files appear when the last scene is done.
+
+    Raises `InputError` for a directory that is not writable, and for a version that is not a plain name.
+    """
+    if not version or Path(version).name != version:
+        raise InputError(f"version: expected a plain name such as v1.0-mini, got {version!r}")
+    sensors = dataset.settings.sensors
+    with atomic_directory(directory) as folder:
+        tables: Tables = shared_tables(sensors, list(dataset.scenes))
+        results: dict[str, dict[str, Any]] = {name: {} for name in sensors}
+        for name in dataset.scenes:
+            scene = dataset.scene(name)
+            for table, records in scene_tables(scene, sensors).items():
+                tables.setdefault(table, []).extend(records)
+            for sensor, samples in results.items():
+                samples.update(_detections(scene, sensor))
+        (folder / version).mkdir()
+        for table, records in tables.items():
+            _write_json(folder / version / f"{table}.json", records)
+        _write_json(folder / version / "splits.json", {"all": list(dataset.scenes)})
+        (folder / "detections").mkdir()
+        for sensor, samples in results.items():
+            _write_json(folder / "detections" / f"{sensor}.json", {"meta": _meta(sensor), "results": samples})
+        (folder / "maps").mkdir()
+        (folder / "maps" / "placeholder.png").write_bytes(black_pixel())
+
+
+def _detections(scene: Scene, sensor: str) -> dict[str, list[dict[str, Any]]]:
+    """The detections of one sensor at the samples of a scene; samples far from any frame of the sensor are left out."""
+    frames = [frame for frame in scene.frames if frame.sensor == sensor]
+    times = scene.timestamps[keyframes(scene)]
+    nearest = zip(sample_tokens(scene), times.tolist(), nearest_frames(frames, times), strict=True)
+    return {sample: _boxes(sample, time, frame) for sample, time, frame in nearest if frame is not None}
+
+
+def _boxes(sample: str, time: float, frame: Frame) -> list[dict[str, Any]]:
+    boxes = frame.detections.boxes
+    position = boxes.position.copy()
+    position[:, :2] += (time - frame.timestamp) * np.nan_to_num(boxes.velocity)
+    columns = zip(
+        position.round(4).tolist(),
+        boxes.size[:, [1, 0, 2]].round(4).tolist(),
+        yaw_quaternion(boxes.yaw).tolist(),
+        boxes.velocity.round(4).tolist(),
+        boxes.label.tolist(),
+        frame.detections.score.round(6).tolist(),
+        strict=True,
+    )
+    return [
+        {
+            "sample_token": sample,
+            "translation": translation,
+            "size": size,
+            "rotation": rotation,
+            "velocity": velocity,
+            "detection_name": label,
+            "detection_score": score,
+            "attribute_name": ATTRIBUTE_OF_DETECTIONS,
+        }
+        for translation, size, rotation, velocity, label, score in columns
+    ]
+
+
+def _meta(sensor: str) -> dict[str, bool]:
+    modality = channel_of(sensor).modality
+    kinds = {f"use_{kind}": kind == modality for kind in ("camera", "lidar", "radar")}
+    return {**kinds, "use_map": False, "use_external": False}
+
+
+def _write_json(path: Path, content: object) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        json.dump(content, file)
+
+
+def black_pixel() -> bytes:
+    """A PNG image of one black pixel (W3C recommendation, https://www.w3.org/TR/png/)."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        checksum = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+
+    header = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)  # 1 x 1, 8 bits, grey
+    pixel = zlib.compress(b"\x00\x00")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixel) + chunk(b"IEND", b"")
