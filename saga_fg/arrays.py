@@ -49,6 +49,30 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: 
     return array
 
 
+def checked_covariances(name: str, value: ArrayLike, count: int, dim: int) -> FloatArray:
+    """Return `value` as read-only symmetric positive definite matrices (count, dim, dim).
+
+    What is off symmetry by rounding is made symmetric; what is singular to within rounding is refused.
+    """
+    P = checked(name, value, (count, dim, dim))
+    scale = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
+    asymmetric = np.abs(P - np.swapaxes(P, 1, 2)) > 1e-9 * scale[:, :, None] * scale[:, None, :]
+    if asymmetric.any():
+        raise InputError(f"{name}[{int(np.argwhere(asymmetric)[0][0])}]: expected a symmetric matrix")
+    P = (P + np.swapaxes(P, 1, 2)) / 2
+    try:
+        pivots = np.diagonal(np.linalg.cholesky(P), axis1=1, axis2=2)
+        margin = (pivots - 1e-7 * scale).min(axis=1, initial=np.inf)
+        singular = bool((margin <= 0).any())
+    except np.linalg.LinAlgError:
+        margin, singular = np.linalg.eigvalsh(P)[:, 0], True
+    if singular:
+        row = int(np.argmin(margin))
+        raise InputError(f"{name}[{row}]: expected a positive definite matrix, got {_short(P[row].tolist())}")
+    P.flags.writeable = False
+    return P
+
+
 def checked_labels(name: str, value: Any, length: int | None = None) -> StrArray:
     """Return `value` as a read-only array of non-empty strings of shape (length,)."""
     array = _listed(value)

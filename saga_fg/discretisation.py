@@ -43,8 +43,13 @@ _TAYLOR_DEGREE = 12
 _TAYLOR_RADIUS = 0.5  # (1/2)^13 / 13! = 2e-14 of the leading term
 
 
+@np.errstate(over="ignore", invalid="ignore")  # ends in an InputError
 def discretise(graph: SceneGraph, dt: float) -> Transition:
-    """The dynamics of `graph` over `dt` >= 0 seconds. Raises `InputError` for a dt that is negative or not finite."""
+    """The dynamics of `graph` over `dt` >= 0 seconds.
+
+    Raises `InputError` for a dt that is negative or not finite, and for one so long that a state, driven apart by its
+    interactions, leaves the range of numbers.
+    """
     if not (math.isfinite(dt) and dt >= 0):
         raise InputError(f"dt: expected a finite number of seconds >= 0, got {dt!r}")
     if len(graph) == 0:

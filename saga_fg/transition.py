@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
 from saga_fg.scene_graph import SceneGraph
 
 
@@ -36,6 +37,9 @@ class Transition:
     F       blocks of the transition matrix, each (target, source) pair at most once
     b       (D,) affine term
     Q       blocks of the process noise, all on the diagonal, every node exactly once
+
+    Raises `InputError` for blocks that do not fit the nodes, and for numbers that are not finite: the dynamics have
+    grown beyond all bounds within dt.
     """
 
     graph: SceneGraph
@@ -43,6 +47,25 @@ class Transition:
     F: tuple[Blocks, ...]
     b: FloatArray
     Q: tuple[Blocks, ...]
+
+    def __post_init__(self) -> None:
+        what = f"transition over {self.dt:g} s"
+        if np.shape(self.b) != (int(self.offsets[-1]),):
+            raise InputError(f"{what}: b: expected {int(self.offsets[-1])} entries, got shape {np.shape(self.b)}")
+        if not np.isfinite(self.b).all():
+            raise InputError(f"{what}: b: expected finite numbers")
+        for name, groups in (("F", self.F), ("Q", self.Q)):
+            for group in groups:
+                d_i, d_j = group.values.shape[1:]
+                if (self.graph.dims[group.target] != d_i).any() or (self.graph.dims[group.source] != d_j).any():
+                    raise InputError(
+                        f"{what}: {name}: blocks of size {d_i} x {d_j} do not fit the states of their nodes"
+                    )
+                if not np.isfinite(group.values).all():
+                    raise InputError(f"{what}: {name}: expected finite numbers")
+        noisy = np.concatenate([group.target for group in self.Q]) if self.Q else np.empty(0, dtype=np.int64)
+        if not np.array_equal(np.sort(noisy), np.arange(len(self.graph))):
+            raise InputError(f"{what}: Q: expected one block for each of {len(self.graph)} nodes")
 
     @property
     def nodes(self) -> IntArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray, checked, checked_ids
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids
 from saga_fg.errors import InputError, UnknownNodeError
 
 
@@ -65,13 +65,6 @@ class Layout:
 
 def checked_prior(nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Means (k, d) and symmetric positive definite covariances (k, d, d) of new nodes, or `InputError`."""
-    k = len(np.asarray(nodes))
+    k = len(checked_ids("nodes", nodes))
     mean = checked("means", means, (k, None))
-    covariance = checked("covariances", covariances, (k, mean.shape[1], mean.shape[1]))
-    if k and not np.allclose(covariance, np.swapaxes(covariance, 1, 2), rtol=1e-9, atol=1e-300):
-        raise InputError("covariances: expected symmetric matrices")
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        raise InputError("covariances: expected positive definite matrices") from None
-    return mean, covariance
+    return mean, checked_covariances("covariances", covariances, k, mean.shape[1])

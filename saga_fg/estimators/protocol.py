@@ -14,8 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray, checked
-from saga_fg.errors import InputError
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
 from saga_fg.transition import Transition
 
 
@@ -34,29 +33,26 @@ class Measurements:
     R: FloatArray
 
     def __post_init__(self) -> None:
-        nodes = np.array(self.nodes)
-        if nodes.size == 0:
-            nodes = nodes.astype(np.int64)
-        if nodes.ndim != 1 or nodes.dtype.kind not in "iu":
-            raise InputError(f"nodes: expected a list of integer ids, got shape {nodes.shape} of {nodes.dtype}")
+        nodes = checked_rows("nodes", self.nodes)
         m = len(nodes)
         z = checked("z", self.z, (m, None))
         k = z.shape[1]
-        H, R = (np.asarray(value, dtype=np.float64) for value in (self.H, self.R))
-        H = checked("H", np.broadcast_to(H, (m, *H.shape)) if H.ndim == 2 else H, (m, k, None))
-        R = checked("R", np.broadcast_to(R, (m, *R.shape)) if R.ndim == 2 else R, (m, k, k))
-        if m and not np.allclose(R, np.swapaxes(R, 1, 2), rtol=1e-9, atol=0):
-            raise InputError("R: expected symmetric matrices")
-        try:
-            np.linalg.cholesky(R)
-        except np.linalg.LinAlgError:
-            bad = int(np.argmin(np.linalg.eigvalsh(R)[:, 0]))
-            raise InputError(f"R[{bad}]: expected a positive definite matrix, got {R[bad].tolist()}") from None
-        for name, array in (("nodes", nodes.astype(np.int64)), ("z", z), ("H", H), ("R", R)):
+        H = checked("H", _one_each(self.H, m), (m, k, None))
+        R = checked_covariances("R", _one_each(self.R, m), m, k)
+        for name, array in (("nodes", nodes), ("z", z), ("H", H), ("R", R)):
             object.__setattr__(self, name, array)
 
     def __len__(self) -> int:
         return len(self.nodes)
+
+
+def _one_each(value: ArrayLike, m: int) -> ArrayLike:
+    """A matrix that serves all m measurements, repeated; anything else as it is."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths, which `checked` will name
+        return value
+    return np.broadcast_to(array, (m, *array.shape)) if array.ndim == 2 else value
 
 
 class Estimator(Protocol):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from saga_fg import InputError, SagaError
-from saga_fg.arrays import checked, checked_ids, checked_labels
+from saga_fg.arrays import checked, checked_covariances, checked_ids, checked_labels
 
 
 @given(arrays(np.float64, array_shapes(max_dims=3), elements=st.floats(allow_nan=False, allow_infinity=False)))
@@ -121,3 +121,41 @@ def test_ids_are_kept(ids):
 def test_wrong_ids_are_named(value, length, message):
     with pytest.raises(InputError, match=message):
         checked_ids("nodes", value, length)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 4), st.integers(1, 5))
+def test_covariances_are_accepted_and_made_exactly_symmetric(seed, count, dim):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(count, dim, dim)) * 10.0 ** rng.uniform(-6, 6, (count, dim, 1))
+    P = A @ np.swapaxes(A, 1, 2) + np.einsum("kii->ki", A @ np.swapaxes(A, 1, 2))[:, :, None] * 1e-3 * np.eye(dim)
+    off = P * (1 + 1e-13 * rng.normal(size=P.shape))
+    result = checked_covariances("R", off, count, dim)
+    assert np.array_equal(result, np.swapaxes(result, 1, 2))
+    assert np.allclose(result, P, rtol=1e-11, atol=0)
+    assert not result.flags.writeable
+
+
+def test_rounding_next_to_zero_is_no_asymmetry():
+    turned = np.array([[1.0, 1e-17], [-1e-17, 1.0]])
+    assert checked_covariances("R", [turned], 1, 2)[0].tolist() == np.eye(2).tolist()
+
+
+def test_units_do_not_make_a_matrix_singular():
+    assert checked_covariances("R", [np.diag([1e-12, 1e12])], 1, 2).shape == (1, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (np.diag([1.0, 0.0]), r"R\[1\]: expected a positive definite matrix, got \[\[1.0, 0.0\], \[0.0, 0.0\]\]"),
+        (np.zeros((2, 2)), r"R\[1\]: expected a positive definite matrix"),
+        (np.diag([1.0, -1.0]), r"R\[1\]: expected a positive definite matrix"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), r"R\[1\]: expected a positive definite matrix"),
+        (np.outer([0.1, 0.7], [0.1, 0.7]), r"R\[1\]: expected a positive definite matrix"),
+        (np.array([[1.0, 0.5], [0.4, 1.0]]), r"R\[1\]: expected a symmetric matrix"),
+        (np.array([[1.0, np.nan], [np.nan, 1.0]]), r"R\[1, 0, 1\]: expected a finite number"),
+    ],
+)
+def test_what_is_no_covariance_is_named(bad, message):
+    with pytest.raises(InputError, match=message):
+        checked_covariances("R", [np.eye(2), bad], 2, 2)
