@@ -44,6 +44,7 @@ class _Columns:
     existence: FloatArray
     score: FloatArray
     last_seen: FloatArray
+    last_in_view: FloatArray
     confirmed: BoolArray
 
     def select(self, rows: IntArray | BoolArray) -> _Columns:
@@ -97,7 +98,7 @@ class Tracker:
         self._next_id = 1
         none = np.empty(0)
         self._columns = _Columns(
-            np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none, none.astype(bool)
+            np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none, none, none.astype(bool)
         )
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
 
@@ -248,6 +249,7 @@ class Tracker:
             return
         position = self._kinematics()[0] + self._origin
         visible = sensor.sees(position, frame.world_T_ego)
+        columns.last_in_view[visible] = self._time
         elapsed = np.maximum(self._time - columns.last_seen, 0.0)
         p_detect = np.where(visible, sensor.detection_probability, 0.0)
         r = columns.existence
@@ -262,6 +264,7 @@ class Tracker:
         columns.existence[matching.track] = np.clip(after / (1 + after), 0.0, 0.999)
         columns.score[matching.track] = p
         columns.last_seen[matching.track] = self._time
+        columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
 
     def _bear(self, observed: _Observed, matching: Matching) -> None:
@@ -290,7 +293,7 @@ class Tracker:
             self._estimator.add(ids[rows], mean, P)
         now = np.full(len(born), self._time)
         self._columns = self._columns.extended(
-            _Columns(ids, boxes.label, p.copy(), p.copy(), now, p >= self.settings.existence.confirm)
+            _Columns(ids, boxes.label, p.copy(), p.copy(), now, now.copy(), p >= self.settings.existence.confirm)
         )
         self._box = self._box.extended(
             BoxFilter.born(
@@ -313,6 +316,7 @@ class Tracker:
         columns = self._columns
         coasting = self._time - columns.last_seen
         dead = coasting > self._of_class("max_coasting", columns.label)
+        dead |= self._time - columns.last_in_view > self.settings.max_out_of_view
         dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
         if dead.any():
             self._estimator.marginalise(columns.id[dead])
