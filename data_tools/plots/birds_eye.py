@@ -119,13 +119,13 @@ def _draw_tracks(ax: Any, panel: Panel, ego_T_world: FloatArray, extent: Extent)
         ax.plot(*_to_ego(past, ego_T_world).T, color=colour, linewidth=1.0, alpha=0.55, zorder=2)
         if np.hypot(*velocity[row]) > 0.5:
             ax.arrow(
-                *centre, *velocity[row], color=colour, width=0.12, head_width=0.7, length_includes_head=True, zorder=6
+                *centre, *velocity[row], width=0.12, head_width=0.7, length_includes_head=True, linewidth=0, **style
             )
         if coasting:
-            ax.plot(*_ellipse(centre, track.position_covariance, ego_T_world).T, color=colour, linewidth=0.8, zorder=6)
+            ax.plot(*_ellipse(centre, track.position_covariance, ego_T_world).T, linewidth=0.8, **style)
         ax.annotate(
-            str(track.id), centre, xytext=(0, 7), textcoords="offset points", color=colour, fontsize=7, ha="center",
-            annotation_clip=True, zorder=7,
+            str(track.id), centre, xytext=(0, 7), textcoords="offset points", fontsize=7, ha="center",
+            annotation_clip=True, **style,
         )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.summary import counted
 
 
 def demo(
@@ -37,7 +38,7 @@ def demo(
 
     with progress_bar() as progress:
         result = run_demo(output, load_config("simulated", config), scenes=scenes, seed=seed, progress=progress)
-    table = Table(title=f"{scenes} simulated scenes, seed {seed}", title_justify="left")
+    table = Table(title=f"{counted(scenes, 'simulated scene')}, seed {seed}", title_justify="left")
     for k, column in enumerate(COLUMNS):
         table.add_column(column, justify="right" if k else "left", no_wrap=k == 0)
     for row in table_rows(result.comparison):

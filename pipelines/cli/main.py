@@ -10,6 +10,7 @@ import typer
 from pipelines.cli.config import config
 from pipelines.cli.demo import demo
 from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.simulate import simulate
 from pipelines.cli.track import track_app
 
 app = typer.Typer(
@@ -21,6 +22,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(track_app, name="track")
+app.command()(simulate)
 app.command()(demo)
 app.command()(config)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import typer
@@ -63,6 +63,12 @@ def set_up_logging(verbose: bool) -> None:
         handler = _ConsoleHandler()
         handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
         root.addHandler(handler)
+
+
+def working(what: str) -> AbstractContextManager[object]:
+    """Says what is going on while it goes on, on stderr; nothing where stderr is not a terminal."""
+    console = error_console()
+    return console.status(what) if console.is_terminal else nullcontext()
 
 
 @contextmanager

@@ -36,9 +36,10 @@ class Summary:
         """Print the line on stdout."""
         rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
         counts = ((self.scenes, "scene"), (self.frames, "frame"), (len(self.tracks), "track"), (self.boxes, "box"))
-        typer.echo(f"{self.output}: {', '.join(_counted(*count) for count in counts)}{rate}")
+        typer.echo(f"{self.output}: {', '.join(counted(*count) for count in counts)}{rate}")
 
 
-def _counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """`1 box`, `2 boxes`."""
     plural = "" if number == 1 else "es" if noun.endswith("x") else "s"
     return f"{number} {noun}{plural}"

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,21 +21,13 @@ from saga_fg import InputError
 SAGA_FG = [sys.executable, "-c", "from pipelines.cli import main; main()"]
 
 
-@pytest.fixture(autouse=True)
-def _logging_as_it_was() -> Iterator[None]:
-    root = logging.getLogger()
-    handlers = list(root.handlers)
-    yield
-    root.handlers = handlers
-    for name in ("factors", "saga_fg", "data_tools", "pipelines"):
-        logging.getLogger(name).setLevel(logging.NOTSET)
-
-
 def saga_fg(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-@pytest.mark.parametrize("command", ["track nuscenes", "track kitti", "track file", "demo", "config"], ids=lambda c: c)
+@pytest.mark.parametrize(
+    "command", ["track nuscenes", "track kitti", "track file", "simulate", "demo", "config"], ids=lambda c: c
+)
 def test_help_shows_a_worked_example(command: str) -> None:
     result = saga_fg(*command.split(), "--help")
     assert result.exit_code == 0
