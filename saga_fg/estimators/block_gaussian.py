@@ -1,0 +1,140 @@
+"""A Gaussian over the joint state of all nodes whose covariance is block-diagonal by components."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
+
+_UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
+
+
+@dataclass(frozen=True, eq=False)
+class BlockGaussian:
+    """partition of the nodes; mean (D,); blocks of the covariance, one group of components each."""
+
+    partition: Partition
+    mean: FloatArray
+    blocks: BlockDiagonal
+
+    @staticmethod
+    def empty() -> BlockGaussian:
+        """Of no node."""
+        return BlockGaussian(Partition.apart(Layout()), np.empty(0), ())
+
+    @property
+    def layout(self) -> Layout:
+        return self.partition.layout
+
+    def over(self, partition: Partition) -> BlockGaussian:
+        """The same over a partition of the same nodes; what it leaves uncorrelated loses its correlation."""
+        if partition is self.partition:
+            return self
+        rows = np.arange(len(self.layout))
+        return BlockGaussian(partition, self.mean, regrouped(self.blocks, self.partition, partition, rows))
+
+    def extended(self, layout: Layout, means: FloatArray, covariances: FloatArray) -> BlockGaussian:
+        """With the further nodes of `layout`, independent of all others: means (k, d), covariances (k, d, d)."""
+        partition = self.partition.extended(layout)
+        old = np.arange(len(self.layout))
+        blocks = regrouped(self.blocks, self.partition, partition, old)
+        new = np.arange(len(old), len(layout))
+        if len(new):
+            blocks[partition.group[new[0]]][partition.row[new]] = covariances
+        return BlockGaussian(partition, np.concatenate([self.mean, means.ravel()]), blocks)
+
+    def without(self, rows: IntArray) -> BlockGaussian:
+        """With the nodes at `rows` integrated out."""
+        if len(rows) == 0:
+            return self
+        keep = np.ones(len(self.layout), dtype=bool)
+        keep[rows] = False
+        kept = np.flatnonzero(keep)
+        partition = self.partition.restricted(self.layout.without(rows), kept)
+        where = np.full(len(keep), -1)
+        where[kept] = np.arange(len(kept))
+        blocks = regrouped(self.blocks, self.partition, partition, where)
+        return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
+
+    def decoupled(self) -> BlockGaussian:
+        """With components taken apart whose parts are no longer correlated, long after the last interaction."""
+        partition, layout = self.partition, self.layout
+        if partition.count == len(layout):
+            return self
+        if self._tied().all():
+            return self
+        node_of = np.repeat(np.arange(len(layout)), layout.dims)
+        a, b = [], []
+        for places, P in zip(partition.groups, self.blocks, strict=True):
+            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+            k, i, j = np.nonzero(np.abs(P) > _UNCORRELATED * sigma[:, :, None] * sigma[:, None, :])
+            a.append(node_of[places[k, i]])
+            b.append(node_of[places[k, j]])
+        i, j = np.concatenate(a), np.concatenate(b)
+        pairs = scipy.sparse.coo_array((np.ones(len(i), dtype=bool), (i, j)), shape=(len(layout), len(layout)))
+        count, label = connected_components(pairs, directed=False)
+        return self if count == partition.count else self.over(Partition(layout, label.astype(np.int64)))
+
+    def _tied(self) -> BoolArray:
+        """(n,) whether a node is correlated with the first of its component: a quick look."""
+        layout, d = self.layout, int(self.layout.dims.min())
+        tied = np.zeros(layout.size, dtype=bool)
+        for places, P in zip(self.partition.groups, self.blocks, strict=True):
+            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+            tied[places] = (np.abs(P[:, :d]) > _UNCORRELATED * sigma[:, :d, None] * sigma[:, None, :]).any(axis=1)
+        return np.asarray(np.logical_or.reduceat(tied, layout.offsets[:-1]))
+
+    def covariances(self, rows: IntArray) -> FloatArray:
+        """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
+        return diagonal_blocks(self.blocks, self.partition, rows)
+
+    def joint(self, rows: IntArray) -> FloatArray:
+        """Joint covariance of the nodes at `rows`, in this order, of any sizes."""
+        return joint_block(self.blocks, self.partition, rows)
+
+    def variances(self) -> FloatArray:
+        """(D,)"""
+        variances = np.empty(len(self.mean))
+        for places, P in zip(self.partition.groups, self.blocks, strict=True):
+            variances[places] = np.diagonal(P, axis1=1, axis2=2)
+        return variances
+
+
+def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
+    """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
+    d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
+    result = np.empty((len(rows), d, d))
+    for number, members, at in partition.members(rows, d):
+        row = partition.row[rows[members]]
+        result[members] = blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]]
+    return result
+
+
+def joint_block(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
+    """The block of all nodes at `rows`, in this order, of any sizes: (D', D')."""
+    some = Layout(np.arange(len(rows)), partition.layout.dims[rows])
+    target = Partition(some, np.zeros(len(rows), dtype=np.int64))
+    if len(rows) == 0:
+        return np.empty((0, 0))
+    if len(np.unique(rows)) < len(rows):  # a node named twice
+        distinct, inverse = np.unique(rows, return_inverse=True)
+        places = Layout(distinct, partition.layout.dims[distinct]).places(inverse)
+        return np.asarray(joint_block(blocks, partition, distinct)[np.ix_(places, places)])
+    where = np.full(len(partition.layout), -1)
+    where[rows] = np.arange(len(rows))
+    joint: FloatArray = regrouped(blocks, partition, target, where)[0][0]
+    return joint
+
+
+def block_product(blocks: BlockDiagonal, partition: Partition, x: FloatArray) -> FloatArray:
+    """The product with a vector (D,)."""
+    result = np.empty(len(x))
+    for places, block in zip(partition.groups, blocks, strict=True):
+        result[places] = (block @ x[places][:, :, None])[:, :, 0]
+    return result

@@ -1,0 +1,129 @@
+r"""Correction of a joint state that is split into components by measurements of some nodes.
+
+    S = H P H^T + R = L L^T     W = L^-1 H P     m <- m + W^T L^-1 (z - H m)     P <- P - W^T W
+
+All components of one size take one batched operation. Where a measurement is so much better than what was known
+(a millionfold in variance) that P - W^T W cancels, one refinement with K = W^T L^-1 restores what must hold,
+H P = R K^T, so that the measured rows are as exact as in Joseph's form.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.estimators.block_gaussian import BlockGaussian
+
+_CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
+_BATCHED_BELOW = 100  # size from which a triangular system is worth a call of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Gain:
+    """What a correction did to c components of equal size s with up to a measured values each (rows of zeros fill up).
+
+    places (c, s) of the components; H (c, a, s); L (c, a, a) lower triangular, L L^T = S; W (c, a, s) = L^-1 H P;
+    whitened (c, a) = L^-1 (z - H m)
+    """
+
+    places: IntArray
+    H: FloatArray
+    L: FloatArray
+    W: FloatArray
+    whitened: FloatArray
+
+
+def correct(
+    x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[BlockGaussian, tuple[Gain, ...], float]:
+    """The posterior, the gains, and the log-likelihood of the innovation.
+
+    rows (m,) of the measured nodes, may repeat; z (m, k); H (m, k, d); R (m, k, k) positive definite.
+    """
+    partition, mean, blocks = x.partition, x.mean.copy(), list(x.blocks)
+    gains = []
+    log_likelihood = -0.5 * z.size * math.log(2 * math.pi)
+    for number, members, at in partition.members(rows, H.shape[2]):
+        active, component = np.unique(partition.row[rows[members]], return_inverse=True)
+        every = len(active) == len(partition.groups[number])
+        P = blocks[number] if every else blocks[number][active]
+        places = partition.groups[number] if every else partition.groups[number][active]
+        gain, P = _corrected(P, mean, places, component, at, z[members], H[members], R[members])
+        gains.append(gain)
+        mean[places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
+        if not every:
+            blocks[number] = blocks[number].copy()
+            blocks[number][active] = P
+        else:
+            blocks[number] = P
+        log_det = 2 * np.log(np.diagonal(gain.L, axis1=1, axis2=2)).sum()
+        log_likelihood -= 0.5 * float(np.vdot(gain.whitened, gain.whitened) + log_det)
+    return replace(x, mean=mean, blocks=tuple(blocks)), tuple(gains), log_likelihood
+
+
+def _corrected(
+    P: FloatArray,
+    mean: FloatArray,
+    places: IntArray,
+    component: IntArray,
+    at: IntArray,
+    z: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+) -> tuple[Gain, FloatArray]:
+    """Gain and posterior covariance of c components P (c, s, s).
+
+    component (m,): the one that a measurement is of; at (m, d): the entries of its state that H sees.
+    """
+    (c, s, _), k = P.shape, H.shape[1]
+    slot = _rank(component)  # of a measurement among those of its component
+    most = int(slot.max()) + 1
+    a = most * k
+    row = slot[:, None] * k + np.arange(k)
+    H_P, H_all, R_all, innovation = np.zeros((c, a, s)), np.zeros((c, a, s)), np.zeros((c, a, a)), np.zeros((c, a, 1))
+    H_P[component[:, None], row] = H @ P[component[:, None], at]
+    H_all[component[:, None, None], row[:, :, None], at[:, None, :]] = H
+    R_all[component[:, None, None], row[:, :, None], row[:, None, :]] = R
+    innovation[component[:, None], row, 0] = z - (H @ mean[places[component[:, None], at]][:, :, None])[:, :, 0]
+    if len(component) < c * most:
+        empty = np.ones((c, a), dtype=bool)
+        empty[component[:, None], row] = False
+        i, j = np.nonzero(empty)
+        R_all[i, j, j] = 1.0
+    S = H_P @ np.swapaxes(H_all, 1, 2) + R_all
+    L = np.asarray(np.linalg.cholesky((S + np.swapaxes(S, 1, 2)) / 2), dtype=np.float64)
+    solved = solve_lower(L, np.concatenate([H_P, innovation], axis=2))
+    gain = Gain(places, H_all, L, solved[:, :, :-1], solved[:, :, -1])
+    posterior = P - np.swapaxes(gain.W, 1, 2) @ gain.W
+    after, before = (np.diagonal(array, axis1=1, axis2=2) for array in (posterior, P))
+    lost = (after < _CANCELLATION * before).any(axis=1)
+    if lost.any():
+        K_T = solve_lower(L[lost], gain.W[lost], transposed=True)
+        refined = posterior[lost] + np.swapaxes(K_T, 1, 2) @ (R_all[lost] @ K_T - H_all[lost] @ posterior[lost])
+        posterior[lost] = (refined + np.swapaxes(refined, 1, 2)) / 2
+    return gain, posterior
+
+
+def solve_lower(L: FloatArray, B: FloatArray, transposed: bool = False) -> FloatArray:
+    """X of L X = B, or of L^T X = B, for a stack of lower triangular L (c, a, a) and B (c, a, b)."""
+    if L.shape[1] < _BATCHED_BELOW:
+        return np.asarray(np.linalg.solve(np.swapaxes(L, 1, 2) if transposed else L, B), dtype=np.float64)
+    solved = np.empty_like(B)
+    for component in range(len(L)):
+        solved[component] = scipy.linalg.solve_triangular(
+            L[component], B[component], trans="T" if transposed else "N", lower=True, check_finite=False
+        )
+    return solved
+
+
+def _rank(label: IntArray) -> IntArray:
+    """Running number of each entry among those of equal label."""
+    order = np.argsort(label, kind="stable")
+    ordered = label[order]
+    rank = np.empty(len(label), dtype=np.int64)
+    rank[order] = np.arange(len(label)) - np.searchsorted(ordered, ordered)
+    return rank

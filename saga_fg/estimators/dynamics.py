@@ -1,0 +1,150 @@
+"""Prediction of a joint state that is split into components.
+
+    m <- F m + b        P <- F P F^T + Q        F block-sparse, Q block-diagonal
+
+A component grows by the interactions that enter it; all of one size are predicted by one batched operation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.partition import BlockDiagonal, Partition
+from saga_fg.transition import Blocks, Transition
+
+_SPARSE_FROM = 100  # size of a component from which its part of F is kept sparse
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """x <- F x + b + q, q ~ N(0, Q) over the nodes of `layout` in its order; see `saga_fg.transition.Transition`."""
+
+    layout: Layout
+    F: tuple[Blocks, ...]
+    b: FloatArray
+    Q: tuple[Blocks, ...]
+
+    @staticmethod
+    def of(transition: Transition, layout: Layout) -> Dynamics:
+        """Those of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
+        rows = layout.rows(transition.nodes)
+        if len(rows) != len(layout):
+            raise InputError(f"transition: expected {len(layout)} nodes, got {len(rows)}")
+        if (layout.dims[rows] != transition.graph.dims).any():
+            raise InputError("transition: the sizes of its states differ from those of the estimator")
+        if (rows == np.arange(len(rows))).all():
+            return Dynamics(layout, transition.F, transition.b, transition.Q)
+        b = np.empty(layout.size)
+        b[layout.places(rows)] = transition.b
+        return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
+
+    @cached_property
+    def matrix(self) -> scipy.sparse.csr_array:
+        """F (D, D), sparse."""
+        return _sparse(self.F, self.layout.offsets[:-1], self.layout.size)
+
+    def joined(self, partition: Partition) -> Partition:
+        """The components that a prediction leaves of those of `partition`."""
+        if not self.F:
+            return partition
+        target = np.concatenate([blocks.target for blocks in self.F])
+        source = np.concatenate([blocks.source for blocks in self.F])
+        return partition.joined(target, source)
+
+    def propagated(self, partition: Partition, blocks: BlockDiagonal) -> BlockDiagonal:
+        """F X F^T of a block-diagonal symmetric X, over a partition whose components F does not leave."""
+        return self._congruence(partition, blocks, transposed=False)
+
+    def pulled_back(self, partition: Partition, blocks: BlockDiagonal) -> BlockDiagonal:
+        """F^T X F of a block-diagonal symmetric X, over a partition whose components F does not leave."""
+        return self._congruence(partition, blocks, transposed=True)
+
+    def add_noise(self, partition: Partition, blocks: BlockDiagonal) -> None:
+        """Add Q to the diagonal blocks of `blocks`, in place."""
+        for noise in self.Q:
+            for number, members, at in partition.members(noise.target, noise.values.shape[1]):
+                row = partition.row[noise.target[members]]
+                blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]] += noise.values[members]
+
+    def _congruence(self, partition: Partition, blocks: BlockDiagonal, transposed: bool) -> BlockDiagonal:
+        result = []
+        for number, X in enumerate(blocks):
+            product: FloatArray
+            if X.shape[1] < _SPARSE_FROM:
+                F = self._dense(partition, number)
+                product = np.swapaxes(F, 1, 2) @ X @ F if transposed else F @ X @ np.swapaxes(F, 1, 2)
+            else:
+                product = np.empty_like(X)
+                for component, factor in enumerate(self._components(partition, number)):
+                    left = factor.T.tocsr() if transposed else factor
+                    product[component] = left @ np.ascontiguousarray((left @ X[component]).T)
+            result.append((product + np.swapaxes(product, 1, 2)) / 2)
+        return tuple(result)
+
+    def _dense(self, partition: Partition, number: int) -> FloatArray:
+        """F of each component of a group, (c, s, s)."""
+        places = partition.groups[number]
+        F = np.zeros((*places.shape, places.shape[1]))
+        for blocks in self.F:
+            _, d_i, d_j = blocks.values.shape
+            target, source, values = blocks.target, blocks.source, blocks.values
+            if len(partition.groups) > 1:
+                members = np.flatnonzero(partition.group[target] == number)
+                target, source, values = target[members], source[members], values[members]
+            i = partition.offset[target][:, None, None] + np.arange(d_i)[:, None]
+            j = partition.offset[source][:, None, None] + np.arange(d_j)
+            F[partition.row[target][:, None, None], i, j] = values
+        return F
+
+    def _components(self, partition: Partition, number: int) -> list[scipy.sparse.csr_array]:
+        """F of each component of a group, sparse (s, s)."""
+        count, size = partition.groups[number].shape
+        if size == self.layout.size:
+            return [self.matrix]
+        parts = []
+        for row in range(count):
+            blocks = []
+            for group in self.F:
+                mine = (partition.group[group.target] == number) & (partition.row[group.target] == row)
+                blocks.append(Blocks(group.target[mine], group.source[mine], group.values[mine]))
+            parts.append(_sparse(tuple(blocks), partition.offset, size))
+        return parts
+
+
+def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
+    """The prior after the interval. Raises `InputError` where it is not finite."""
+    partition = dynamics.joined(x.partition)
+    mean = np.asarray(dynamics.matrix @ x.mean + dynamics.b)
+    blocks = dynamics.propagated(partition, x.over(partition).blocks)
+    dynamics.add_noise(partition, blocks)
+    if not (np.isfinite(mean).all() and all(np.isfinite(block).all() for block in blocks)):
+        raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
+    return BlockGaussian(partition, mean, blocks)
+
+
+def _renamed(groups: tuple[Blocks, ...], rows: IntArray) -> tuple[Blocks, ...]:
+    return tuple(Blocks(rows[blocks.target], rows[blocks.source], blocks.values) for blocks in groups)
+
+
+def _sparse(groups: tuple[Blocks, ...], starts: IntArray, size: int) -> scipy.sparse.csr_array:
+    """The matrix (size, size) of blocks whose nodes begin at `starts`."""
+    rows, columns, values = [], [], []
+    for blocks in groups:
+        _, d_i, d_j = blocks.values.shape
+        i = starts[blocks.target][:, None, None] + np.arange(d_i)[:, None]
+        j = starts[blocks.source][:, None, None] + np.arange(d_j)
+        rows.append(np.broadcast_to(i, blocks.values.shape).ravel())
+        columns.append(np.broadcast_to(j, blocks.values.shape).ravel())
+        values.append(blocks.values.ravel())
+    if not rows:
+        return scipy.sparse.csr_array((size, size))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return scipy.sparse.csr_array(entries, shape=(size, size))

@@ -1,0 +1,156 @@
+"""Components of the joint state: sets of nodes that are correlated among themselves and with nobody else.
+
+    P = blockdiag( P_1, ..., P_C )       one dense block a component
+
+Interactions join components; between components every covariance is exactly zero and is neither stored nor computed.
+Components of equal size are stacked, so that all of them take one batched operation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.estimators.layout import Layout
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """The components of a joint state.
+
+    layout  the nodes and their places in the joint state
+    label   (n,) component of every node, numbered from 0 without gaps
+    """
+
+    layout: Layout
+    label: IntArray
+
+    @staticmethod
+    def apart(layout: Layout) -> Partition:
+        """Every node a component of its own."""
+        return Partition(layout, np.arange(len(layout)))
+
+    @cached_property
+    def count(self) -> int:
+        """Number of components."""
+        return int(self.label.max(initial=-1)) + 1
+
+    @cached_property
+    def groups(self) -> tuple[IntArray, ...]:
+        """For each size s of components, (c, s): the places of their states in the joint state; nodes in order."""
+        return self._tables[0]
+
+    @property
+    def group(self) -> IntArray:
+        """(n,) number of the group of each node's component."""
+        return self._tables[1]
+
+    @property
+    def row(self) -> IntArray:
+        """(n,) row of each node's component within its group."""
+        return self._tables[2]
+
+    @property
+    def offset(self) -> IntArray:
+        """(n,) where each node's state begins within its component."""
+        return self._tables[3]
+
+    @cached_property
+    def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]:
+        layout, label = self.layout, self.label
+        none = np.empty(0, dtype=np.int64)
+        if len(label) == 0:
+            return (), none, none, none
+        order = np.argsort(label, kind="stable")
+        size = np.bincount(label, weights=layout.dims).astype(np.int64)
+        start = np.cumsum(size) - size
+        ends = np.cumsum(layout.dims[order])
+        first = ends - layout.dims[order]  # of each node, in the order of components
+        offset = np.empty(len(label), dtype=np.int64)
+        offset[order] = first - start[label[order]]
+        places = np.repeat(layout.offsets[:-1][order] - first, layout.dims[order]) + np.arange(layout.size)
+        sizes, group = np.unique(size, return_inverse=True)
+        row = np.empty(len(size), dtype=np.int64)
+        groups = []
+        for number, s in enumerate(sizes.tolist()):
+            members = np.flatnonzero(group == number)
+            row[members] = np.arange(len(members))
+            groups.append(places[start[members][:, None] + np.arange(s)])
+        return tuple(groups), group[label], row[label], offset
+
+    def members(self, rows: IntArray, dim: int) -> list[tuple[int, IntArray, IntArray]]:
+        """Node rows (m,) of states of size `dim`, by group of components: its number, which of them, where.
+
+        Where: (., dim), the places of each state within its component.
+        """
+        group = self.group[rows]
+        at = self.offset[rows][:, None] + np.arange(dim)
+        numbers = np.unique(group).tolist()
+        if len(numbers) == 1:
+            return [(numbers[0], np.arange(len(rows)), at)]
+        members = [np.flatnonzero(group == number) for number in numbers]
+        return [(number, mine, at[mine]) for number, mine in zip(numbers, members, strict=True)]
+
+    def joined(self, target: IntArray, source: IntArray) -> Partition:
+        """With the components of node rows target[k] and source[k] made one; itself where they are already."""
+        a, b = self.label[target], self.label[source]
+        across = a != b
+        if not across.any():
+            return self
+        pairs = scipy.sparse.coo_array((np.ones(int(across.sum())), (a[across], b[across])), (self.count, self.count))
+        return Partition(self.layout, connected_components(pairs, directed=False)[1].astype(np.int64)[self.label])
+
+    def extended(self, layout: Layout) -> Partition:
+        """With the further nodes at the end of `layout`, each a component of its own."""
+        return Partition(layout, np.concatenate([self.label, self.count + np.arange(len(layout) - len(self.layout))]))
+
+    def restricted(self, layout: Layout, rows: IntArray) -> Partition:
+        """Of the nodes at `rows` alone, which are those of `layout`."""
+        return Partition(layout, np.unique(self.label[rows], return_inverse=True)[1].astype(np.int64))
+
+
+BlockDiagonal = tuple[FloatArray, ...]  # (c, s, s) for each group of a partition
+
+
+def zeros(partition: Partition) -> BlockDiagonal:
+    """The blocks of the zero matrix."""
+    return tuple(np.zeros((*places.shape, places.shape[1])) for places in partition.groups)
+
+
+def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, rows: IntArray) -> BlockDiagonal:
+    """The blocks of the same matrix for another partition.
+
+    rows: for each node of `old` its row in `new`, -1 for one that is gone. Entries between nodes that are in different
+    components of `new` are left out, those between nodes that were in different components of `old` are zero.
+    """
+    result = zeros(new)
+    kept = np.flatnonzero(rows >= 0)
+    if len(kept) == 0:
+        return result
+    moved = rows[kept]
+    # a piece: nodes that share a component, before and after
+    _, piece = np.unique(old.label[kept] * new.count + new.label[moved], return_inverse=True)
+    order = np.argsort(piece, kind="stable")
+    kept, moved, piece = kept[order], moved[order], piece[order]
+    dims = old.layout.dims[kept]
+    within = np.arange(dims.sum()) - np.repeat(np.cumsum(dims) - dims, dims)
+    before = np.repeat(old.offset[kept], dims) + within
+    after = np.repeat(new.offset[moved], dims) + within
+    size = np.bincount(piece, weights=dims).astype(np.int64)
+    start = np.cumsum(size) - size
+    node = kept[np.searchsorted(piece, np.arange(len(size)))]  # one of each piece
+    kind = (old.group[node] * len(new.groups) + new.group[rows[node]]) * (old.layout.size + 1) + size
+    for number in np.unique(kind).tolist():
+        alike = np.flatnonzero(kind == number)
+        i, j = node[alike], rows[node[alike]]
+        places = start[alike][:, None] + np.arange(size[alike[0]])
+        a, b = before[places], after[places]
+        result[new.group[j[0]]][new.row[j][:, None, None], b[:, :, None], b[:, None, :]] = blocks[old.group[i[0]]][
+            old.row[i][:, None, None], a[:, :, None], a[:, None, :]
+        ]
+    return result
