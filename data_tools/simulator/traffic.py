@@ -132,7 +132,7 @@ class Traffic:
             gap = (s[leader] - s) * metric - (self._fleet.length[leader] + self._fleet.length) / 2
             term = following_acceleration(v, np.maximum(gap, 0.0), v[leader], drivers)
             pull = np.minimum(pull, np.where(leader >= 0, term, 0.0))
-        pull = np.minimum(pull, self._stops())
+        pull = np.minimum(np.minimum(pull, self._stops()), self._courtesy(order))
         return np.maximum(free_acceleration(v, drivers, limit) + pull, -HARDEST_BRAKING)
 
     def _stops(self) -> FloatArray:
@@ -153,6 +153,26 @@ class Traffic:
             gap = np.maximum(self._lanes.end - s - self._fleet.length / 2, 0.0)
             term = following_acceleration(v, gap, np.zeros(len(s)), drivers)
             pull = np.minimum(pull, np.where(self.lane == self._lanes.ending, term, 0.0))
+        return pull
+
+    def _courtesy(self, order: LaneOrder) -> FloatArray:
+        """Zip merging (N,), m/s^2: whoever has to leave a lane that ends fits himself in behind the next vehicle of the
+        other lane, and the one behind that place opens it for him, both braking comfortably at most.
+        """
+        pull = np.zeros(len(self.s))
+        if self._lanes.ending < 0:
+            return pull
+        merging = (self.lane == self._lanes.ending) & (self.s >= self._lanes.opening) & self.on_road
+        rows = np.flatnonzero(merging)
+        target = self._lanes.neighbour(self.lane[rows], -1)
+        pairs = ((rows, order.ahead(target, self.s[rows])), (order.behind(target, self.s[rows]), rows))
+        for behind, front in pairs:
+            both = (behind >= 0) & (front >= 0)
+            i, j = behind[both], front[both]
+            gap = np.maximum(self.s[j] - self.s[i] - (self._fleet.length[i] + self._fleet.length[j]) / 2, 0.0)
+            drivers = self._fleet.drivers.select(i)
+            term = following_acceleration(self.speed[i], gap, self.speed[j], drivers)
+            np.minimum.at(pull, i, np.maximum(term, -drivers.comfortable_deceleration))
         return pull
 
     def _start_changes(self, wish: FloatArray, order: LaneOrder) -> None:
