@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg
 
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 
 _CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
@@ -42,7 +43,8 @@ def correct(
 ) -> tuple[BlockGaussian, tuple[Gain, ...], float]:
     """The posterior, the gains, and the log-likelihood of the innovation.
 
-    rows (m,) of the measured nodes, may repeat; z (m, k); H (m, k, d); R (m, k, k) positive definite.
+    rows (m,) of the measured nodes, may repeat; z (m, k); H (m, k, d); R (m, k, k) positive definite. Raises
+    `InputError` where a covariance has grown so large that R no longer counts among its digits.
     """
     partition, mean, blocks = x.partition, x.mean.copy(), list(x.blocks)
     gains = []
@@ -95,7 +97,12 @@ def _corrected(
         i, j = np.nonzero(empty)
         R_all[i, j, j] = 1.0
     S = H_P @ np.swapaxes(H_all, 1, 2) + R_all
-    L = np.asarray(np.linalg.cholesky((S + np.swapaxes(S, 1, 2)) / 2), dtype=np.float64)
+    try:
+        L = np.asarray(np.linalg.cholesky((S + np.swapaxes(S, 1, 2)) / 2), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"measurements: their noise is lost in the rounding of what is predicted, variances up to {S.max():.3g}"
+        ) from None
     solved = solve_lower(L, np.concatenate([H_P, innovation], axis=2))
     gain = Gain(places, H_all, L, solved[:, :, :-1], solved[:, :, -1])
     posterior = P - np.swapaxes(gain.W, 1, 2) @ gain.W

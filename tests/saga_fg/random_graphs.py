@@ -72,13 +72,13 @@ def random_types(rng, n, kinds=(CAR, BUS, TRAM, CONE, POLE)):
     return tuple(kinds[k] for k in rng.integers(0, len(kinds), n))
 
 
-def random_graph(rng, types, ids=None, density=0.4, max_rate=1.0):
-    """Shared velocity, car-following and arbitrary edges over nodes of the given types, pairs repeating."""
+def random_graph(rng, types, ids=None, density=0.4, max_rate=1.0, arbitrary=True):
+    """Shared velocity, car-following and (if wanted) arbitrary edges over nodes of the given types, pairs repeating."""
     nodes = node_table(rng, types, ids)
     groups = [
         *interaction_edges(rng, nodes, SharedVelocity(), density, max_rate),
         *interaction_edges(rng, nodes, SharedVelocity(along_heading=True), density / 2, max_rate),
         *interaction_edges(rng, nodes, CarFollowing(headway=0.5), density / 2, max_rate),
-        *arbitrary_edges(rng, types, density / 2, max_rate),
+        *(arbitrary_edges(rng, types, density / 2, max_rate) if arbitrary else ()),
     ]
     return SceneGraph(nodes.id, nodes.types, tuple(groups))
