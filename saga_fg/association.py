@@ -9,6 +9,7 @@ one of least total cost, where an unmatched track or detection costs as much as 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -41,6 +42,7 @@ def mahalanobis(
     return (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det, np.log(det)
 
 
+@lru_cache
 def gate(probability: float, dim: int = 2) -> float:
     """The chi-square gate that lets `probability` of the true pairs through."""
     return float(chi2.ppf(probability, dim))

@@ -28,7 +28,6 @@ otherwise F_ij is read off the exponential of the block matrix [[M_i, K_ij A_oth
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -36,6 +35,7 @@ import scipy.sparse
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
+from saga_fg.node import NodeType
 from saga_fg.scene_graph import Edges, SceneGraph
 from saga_fg.transition import Blocks, Transition
 
@@ -54,31 +54,33 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         raise InputError(f"dt: expected a finite number of seconds >= 0, got {dt!r}")
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
-    groups = _coupled_groups(graph)
+    kinds, kind = _kinds(graph)
+    coupled = np.zeros(len(graph), dtype=bool)
+    for edges in graph.edges:
+        coupled[edges.target[edges.rate > 0]] = True
     offsets = np.concatenate([[0], np.cumsum(graph.dims)])
     b = np.zeros(int(offsets[-1]))
     F: list[Blocks] = []
     Q: list[Blocks] = []
-    where = np.full(len(graph), -1)  # node row -> its row within its coupled group
-    phis: dict[int, list[FloatArray]] = {}
-    for number, group in enumerate(groups):
-        phi, noise = _phi_and_noise(group.M, group.Qc, dt, group.order)
-        rows = group.rows
-        if len(group.M) == 1 and len(rows) > 1:  # nodes without edges share their dynamics
-            phi = [np.broadcast_to(p, (len(rows), *p.shape[1:])) for p in phi]
-            noise = np.broadcast_to(noise, (len(rows), *noise.shape[1:]))
+    for number, node_type in enumerate(kinds):  # nodes that nobody acts on share their dynamics
+        rows = np.flatnonzero((kind == number) & ~coupled)
+        if len(rows):
+            (phi,), noise = _phi_and_noise(node_type.generator, node_type.diffusion, dt, 0)
+            F.append(Blocks(rows, rows, np.broadcast_to(phi, (len(rows), *phi.shape))))
+            Q.append(Blocks(rows, rows, np.broadcast_to(noise, (len(rows), *noise.shape))))
+    order = max(1, *(t.nilpotency or 0 for t in kinds))
+    for d in np.unique(graph.dims[coupled]).tolist():
+        rows = np.flatnonzero(coupled & (graph.dims == d))
+        M, Qc, c = _own_dynamics(graph, rows, kinds, kind)
+        phi, noise = _phi_and_noise(M, Qc, dt, order)
         F.append(Blocks(rows, rows, phi[0]))
         Q.append(Blocks(rows, rows, noise))
-        if group.c is not None:
-            span = offsets[rows][:, None] + np.arange(group.M.shape[1])
-            b[span] = dt * (phi[1] @ group.c[:, :, None])[..., 0]
-            where[rows] = np.arange(len(rows))
-            phis[number] = phi
-    owner = np.full(len(graph), -1)
-    for number in phis:
-        owner[groups[number].rows] = number
-    for edges in graph.edges:
-        F.extend(_coupling_blocks(graph, edges, dt, owner, where, phis, groups))
+        b[offsets[rows][:, None] + np.arange(d)] = dt * (phi[1] @ c[:, :, None])[..., 0]
+        position = np.empty(len(graph), dtype=np.int64)
+        position[rows] = np.arange(len(rows))
+        for edges in graph.edges:
+            if edges.A_other.shape[1] == d and edges.rate.any():
+                F.append(_coupling_blocks(edges, dt, M, phi, position, kinds, kind))
     return Transition(graph, dt, _merged(F, len(graph)), b, tuple(Q))
 
 
@@ -101,59 +103,29 @@ def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArr
     return G, c, Qc
 
 
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Nodes integrated together: M (m, d, d) or (1, d, d) if shared, Qc (m or 1, d, d), c (m, d) or None, phi order."""
-
-    rows: IntArray
-    M: FloatArray
-    Qc: FloatArray
-    c: FloatArray | None
-    order: int
+def _kinds(graph: SceneGraph) -> tuple[list[NodeType], IntArray]:
+    """The distinct node types of the graph, and the number (n,) of each node's."""
+    number: dict[int, int] = {}
+    kind = np.array([number.setdefault(id(t), len(number)) for t in graph.types], dtype=np.int64)
+    return [graph.types[int(np.argmax(kind == k))] for k in range(len(number))], kind
 
 
-def _coupled_groups(graph: SceneGraph) -> list[_Group]:
-    """Nodes grouped by type, those that no edge acts on apart."""
-    coupled = np.zeros(len(graph), dtype=bool)
+def _own_dynamics(
+    graph: SceneGraph, rows: IntArray, kinds: list[NodeType], kind: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """M (m, d, d), Qc (m, d, d), c (m, d) of the nodes `rows`, whose states have equal size."""
+    M = np.stack([kinds[k].generator for k in kind[rows]])
+    Qc = np.stack([kinds[k].diffusion for k in kind[rows]])
+    c = np.zeros(M.shape[:2])
+    position = np.full(len(graph), -1)
+    position[rows] = np.arange(len(rows))
     for edges in graph.edges:
-        coupled[edges.target[edges.rate > 0]] = True
-    kinds: dict[int, int] = {}
-    type_number = np.array([kinds.setdefault(id(t), len(kinds)) for t in graph.types])
-    highest = max((_nilpotency(t.generator) or 0 for t in graph.types), default=1)
-    groups: list[_Group] = []
-    position = np.empty(len(graph), dtype=np.int64)
-    for number in range(len(kinds)):
-        of_type = type_number == number
-        node_type = graph.types[int(np.argmax(of_type))]
-        A, Qc = node_type.generator[None], node_type.diffusion[None]
-        free = np.flatnonzero(of_type & ~coupled)
-        if len(free):
-            groups.append(_Group(free, A, Qc, None, 0))
-        bound = np.flatnonzero(of_type & coupled)
-        if len(bound) == 0:
-            continue
-        position[bound] = np.arange(len(bound))
-        M = np.repeat(A, len(bound), axis=0)
-        c = np.zeros((len(bound), node_type.dim))
-        for edges in graph.edges:
-            mine = of_type[edges.target] & coupled[edges.target]
-            if not mine.any():  # edges between states of another size, perhaps
-                continue
-            at = position[edges.target[mine]]
-            np.add.at(M, at, edges.rate[mine, None, None] * edges.A_self[mine])
-            np.add.at(c, at, edges.rate[mine, None] * edges.b[mine])
-        groups.append(_Group(bound, M, np.broadcast_to(Qc, M.shape), c, max(1, highest)))
-    return groups
-
-
-def _nilpotency(A: FloatArray) -> int | None:
-    """Smallest k with A^k = 0, or None."""
-    power = np.eye(len(A))
-    for k in range(len(A) + 1):
-        if not power.any():
-            return k
-        power = power @ A
-    return None
+        at = position[edges.target]
+        if edges.A_self.shape[1] == M.shape[1] and len(at):
+            acting = edges.rate > 0
+            np.add.at(M, at[acting], edges.rate[acting, None, None] * edges.A_self[acting])
+            np.add.at(c, at[acting], edges.rate[acting, None] * edges.b[acting])
+    return M, Qc, c
 
 
 def _phi_and_noise(M: FloatArray, Qc: FloatArray, dt: float, order: int) -> tuple[list[FloatArray], FloatArray]:
@@ -188,39 +160,33 @@ def _phi_and_noise(M: FloatArray, Qc: FloatArray, dt: float, order: int) -> tupl
 
 
 def _coupling_blocks(
-    graph: SceneGraph,
     edges: Edges,
     dt: float,
-    owner: IntArray,
-    where: IntArray,
-    phis: dict[int, list[FloatArray]],
-    groups: list[_Group],
-) -> list[Blocks]:
-    """The off-diagonal blocks F_ij of one group of edges, by the types of their sources and targets."""
-    blocks = []
-    source_kind = np.array([id(graph.types[j]) for j in edges.source], dtype=np.int64)
-    for number, kind in sorted({(int(o), int(k)) for o, k in zip(owner[edges.target], source_kind, strict=True)}):
-        if number < 0:  # no edge of a rate above zero acts on these
-            continue
-        mine = np.flatnonzero((owner[edges.target] == number) & (source_kind == kind))
-        target, source = edges.target[mine], edges.source[mine]
-        A_j = graph.types[source[0]].generator
-        C = edges.rate[mine, None, None] * edges.A_other[mine]
-        at = where[target]
-        steps = _nilpotency(A_j)
-        if steps is None:
-            values = _van_loan(groups[number].M[at], C, A_j, dt)
-        else:
-            values = np.zeros_like(C)
-            for k in range(steps):
-                values += dt ** (k + 1) * (phis[number][k + 1][at] @ C)
-                C = C @ A_j
-        blocks.append(Blocks(target, source, values))
-    return blocks
+    M: FloatArray,
+    phi: list[FloatArray],
+    position: IntArray,
+    kinds: list[NodeType],
+    kind: IntArray,
+) -> Blocks:
+    """The off-diagonal blocks F_ij of some edges; M and phi are of the coupled nodes, `position` their rows there."""
+    acting = np.flatnonzero(edges.rate > 0)
+    target, source = edges.target[acting], edges.source[acting]
+    C = edges.rate[acting, None, None] * edges.A_other[acting]
+    at = position[target]
+    used = {int(k): kinds[k] for k in np.unique(kind[source])}
+    A_j = np.stack([kinds[k].generator for k in kind[source]])
+    steps = [t.nilpotency for t in used.values()]
+    if any(step is None for step in steps):
+        return Blocks(target, source, _van_loan(M[at], C, A_j, dt))
+    values = np.zeros_like(C)
+    for k in range(max(step for step in steps if step is not None)):
+        values += dt ** (k + 1) * (phi[k + 1][at] @ C)
+        C = C @ A_j
+    return Blocks(target, source, values)
 
 
 def _van_loan(M: FloatArray, C: FloatArray, A: FloatArray, dt: float) -> FloatArray:
-    """int_0^dt exp(M (dt - s)) C exp(A s) ds for stacks M (m, d_i, d_i), C (m, d_i, d_j) and one A (d_j, d_j)."""
+    """int_0^dt exp(M (dt - s)) C exp(A s) ds for stacks M (m, d_i, d_i), C (m, d_i, d_j), A (m, d_j, d_j)."""
     m, d_i, d_j = C.shape
     block = np.zeros((m, d_i + d_j, d_i + d_j))
     block[:, :d_i, :d_i], block[:, :d_i, d_i:], block[:, d_i:, d_i:] = M, C, A

@@ -112,8 +112,8 @@ def build_graph(nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1
     """
     groups: list[Edges] = []
     if len(nodes) > 1:
-        kinds: dict[int, int] = {}
-        kind = np.array([kinds.setdefault(id(t), len(kinds)) for t in nodes.types])
+        kinds: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
+        kind = np.array([kinds.setdefault(t.components, len(kinds)) for t in nodes.types])
         for rule in rules:
             target, source, rate = _checked_pairs(rule, nodes)
             keep = rate >= min_rate

@@ -152,6 +152,16 @@ class NodeType:
         """Qc (d, d), per s."""
         return checked("diffusion", self.motion.diffusion, (self.dim, self.dim))
 
+    @cached_property
+    def nilpotency(self) -> int | None:
+        """Smallest k with A^k = 0, so that exp(A s) is a polynomial in s of degree k - 1; None if there is none."""
+        power = np.eye(self.dim)
+        for k in range(self.dim + 1):
+            if not power.any():
+                return k
+            power = power @ self.generator
+        return None
+
     def has(self, names: Sequence[str]) -> bool:
         """Whether the state has all these components."""
         return set(names) <= set(self.components)

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,7 +23,7 @@ from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.frame import Frame
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable
-from saga_fg.node import NodeType
+from saga_fg.node import Motion, NodeType
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.track import Tracks
@@ -52,6 +53,15 @@ class _Columns:
 
     def extended(self, other: _Columns) -> _Columns:
         return _Columns(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+
+class _Kinematics(NamedTuple):
+    """Of n tracks, in local coordinates: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2)."""
+
+    position: FloatArray
+    velocity: FloatArray
+    P: FloatArray
+    P_velocity: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +104,14 @@ class Tracker:
         self._estimator = JointKalmanFilter()
         self._time = -math.inf  # of the state; no frame yet
         self._origin = np.zeros(2)
-        self._types: dict[str, NodeType] = {}
+        self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
         self._next_id = 1
         none = np.empty(0)
         self._columns = _Columns(
             np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none, none, none.astype(bool)
         )
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
+        self._kinematics_now: _Kinematics | None = None  # until the estimator's state changes
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far."""
@@ -133,6 +144,7 @@ class Tracker:
         self._box = box.select(np.arange(len(box.z)))
         self._predict(timestamp)
         tracks = self._report(timestamp)
+        self._kinematics_now = None
         self._estimator.restore(state)
         self._box, self._time = box, now
         return tracks
@@ -154,6 +166,7 @@ class Tracker:
         if dt == 0 or len(self._columns.id) == 0:
             return
         self.graph = build_graph(self._nodes(), self.rules)
+        self._kinematics_now = None
         self._estimator.predict(discretise(self.graph, dt))
         self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
 
@@ -232,6 +245,7 @@ class Tracker:
                     value = np.concatenate([value, boxes.velocity[d]], axis=1)
                 if delay > 0:
                     H, R = _moved_to_present(node_type, H, R, delay)
+                self._kinematics_now = None
                 self._estimator.update(Measurements(columns.id[t], value, H, R))
         t, d = matching.track, matching.detection
         p = observed.probability[d]
@@ -290,6 +304,7 @@ class Tracker:
             mean[:, at_v] = velocity[rows]
             P[:, at_p[:, None], at_p] = observed.R[born[rows]]
             P[:, at_v[:, None], at_v] = P_velocity[rows]
+            self._kinematics_now = None
             self._estimator.add(ids[rows], mean, P)
         now = np.full(len(born), self._time)
         self._columns = self._columns.extended(
@@ -319,6 +334,7 @@ class Tracker:
         dead |= self._time - columns.last_in_view > self.settings.max_out_of_view
         dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
         if dead.any():
+            self._kinematics_now = None
             self._estimator.marginalise(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
 
@@ -344,16 +360,27 @@ class Tracker:
     # views on the state
 
     def _type(self, label: str) -> NodeType:
-        if label not in self._types:
-            self._types[label] = NodeType(label, self.class_settings(label).motion)
-        return self._types[label]
+        motion = self.class_settings(label).motion
+        if motion not in self._types:
+            self._types[motion] = NodeType(type(motion).__name__, motion)
+        return self._types[motion]
 
     def _by_type(self, label: StrArray) -> list[tuple[NodeType, IntArray]]:
-        """Rows of equal class, with their node type."""
-        return [(self._type(str(c)), np.flatnonzero(label == c)) for c in np.unique(label)]
+        """Rows of equal node type, with the type."""
+        classes, index = np.unique(label, return_inverse=True)
+        types = [self._type(str(c)) for c in classes]
+        distinct = list(dict.fromkeys(map(id, types)))
+        number = np.array([distinct.index(id(t)) for t in types], dtype=np.int64)[index]
+        by_id = {id(t): t for t in types}
+        return [(by_id[key], np.flatnonzero(number == k)) for k, key in enumerate(distinct)]
 
-    def _kinematics(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _kinematics(self) -> _Kinematics:
         """Of all tracks, local: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2)."""
+        if self._kinematics_now is None:
+            self._kinematics_now = self._read_kinematics()
+        return self._kinematics_now
+
+    def _read_kinematics(self) -> _Kinematics:
         columns = self._columns
         n = len(columns.id)
         position, velocity = np.zeros((n, 2)), np.zeros((n, 2))
@@ -363,7 +390,7 @@ class Tracker:
             at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
             position[rows], velocity[rows] = mean[:, at_p], mean[:, at_v]
             P[rows], P_velocity[rows] = covariance[:, at_p[:, None], at_p], covariance[:, at_v[:, None], at_v]
-        return position, velocity, P, P_velocity
+        return _Kinematics(position, velocity, P, P_velocity)
 
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them."""
