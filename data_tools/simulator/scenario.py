@@ -34,9 +34,10 @@ class Scenario:
 
     @property
     def edges(self) -> tuple[float, float]:
-        """Offsets d of the outer borders of the lanes, m: right (negative), left."""
-        width = abs(self.lanes.offset[1] - self.lanes.offset[0])
-        return float(self.lanes.offset.min() - width / 2), float(self.lanes.offset.max() + width / 2)
+        """Offsets d of the outer borders of all traffic, m: right (negative), left."""
+        half = abs(self.lanes.offset[1] - self.lanes.offset[0]) / 2
+        outermost = self.lanes.offset.min() - self.lanes.approach
+        return float(outermost - half), float(self.lanes.offset.max() + half)
 
 
 def draw_scenario(settings: SimulatorSettings, rng: np.random.Generator) -> Scenario:
