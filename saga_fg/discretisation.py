@@ -65,8 +65,8 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     for number, node_type in enumerate(kinds):  # nodes that nobody acts on share their dynamics
         rows = np.flatnonzero((kind == number) & ~coupled)
         if len(rows):
-            (phi,), noise = _phi_and_noise(node_type.generator, node_type.diffusion, dt, 0)
-            F.append(Blocks(rows, rows, np.broadcast_to(phi, (len(rows), *phi.shape))))
+            (own,), noise = _phi_and_noise(node_type.generator, node_type.diffusion, dt, 0)
+            F.append(Blocks(rows, rows, np.broadcast_to(own, (len(rows), *own.shape))))
             Q.append(Blocks(rows, rows, np.broadcast_to(noise, (len(rows), *noise.shape))))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
     for d in np.unique(graph.dims[coupled]).tolist():
