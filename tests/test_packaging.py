@@ -58,3 +58,20 @@ def test_the_wheel_names_licence_command_and_pythons(wheel: zipfile.ZipFile) -> 
     assert "Requires-Python: <3.14,>=3.11" in metadata
     assert f"{info}/licenses/LICENSE" in wheel.namelist()
     assert "saga-fg = pipelines.cli.main:main" in wheel.read(f"{info}/entry_points.txt").decode()
+
+
+def test_what_the_wheel_holds_works_on_its_own(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """Configurations and the page of the demo are found where the packages are, not where the sources are."""
+    wheel.extractall(tmp_path)
+    code = (
+        "from importlib.resources import files\n"
+        "from pipelines.config import load_config\n"
+        "import pipelines\n"
+        "for family in ('nuscenes', 'kitti', 'simulated', 'file'):\n"
+        "    load_config(family)\n"
+        "assert (files('pipelines.demo') / 'page.html').is_file()\n"
+        "print(pipelines.__file__)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert Path(run.stdout.strip()).is_relative_to(tmp_path)
