@@ -1,14 +1,24 @@
 """Estimators behind one protocol, and the textbook reference they must agree with."""
 
+from saga_fg.estimators.factor_graph import FactorGraph
+from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.kalman import JointKalmanFilter
+from saga_fg.estimators.motion import NodeMotion
 from saga_fg.estimators.protocol import Estimator, Measurements
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
+from saga_fg.estimators.sighting import Observations
+from saga_fg.estimators.smoothed import Smoothed
 
 __all__ = [
     "Estimator",
+    "FactorGraph",
+    "FixedLagSmoother",
     "Gaussian",
     "JointKalmanFilter",
     "Measurements",
+    "NodeMotion",
+    "Observations",
+    "Smoothed",
     "kalman_predict",
     "kalman_update",
     "rts_smooth",

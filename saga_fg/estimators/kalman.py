@@ -17,6 +17,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.transition import Transition
@@ -30,10 +31,15 @@ class JointKalmanFilter:
     def __init__(self) -> None:
         self._state = BlockGaussian.empty()
         self._predictions = 0
+        self._time = 0.0
 
     @property
     def nodes(self) -> IntArray:
         return self._state.layout.nodes
+
+    @property
+    def time(self) -> float:
+        return self._time
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         mean, covariance = checked_prior(nodes, means, covariances)
@@ -42,6 +48,7 @@ class JointKalmanFilter:
     def predict(self, transition: Transition) -> None:
         state = predict(self._state, Dynamics.of(transition, self._state.layout))
         self._predictions += 1
+        self._time += transition.dt
         self._state = state.decoupled() if self._predictions % _DECOUPLE_EVERY == 0 else state
 
     def update(self, measurements: Measurements) -> float:
@@ -77,10 +84,14 @@ class JointKalmanFilter:
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         return self._state.joint(self._state.layout.rows(nodes))
 
-    def snapshot(self) -> tuple[BlockGaussian, int]:
-        """The whole state, as a value."""
-        return self._state, self._predictions
+    def graph(self) -> FactorGraph:
+        """One joint prior a component: the filter keeps nothing of the past but this."""
+        return prior_graph(self._state)
 
-    def restore(self, snapshot: tuple[BlockGaussian, int]) -> None:
+    def snapshot(self) -> tuple[BlockGaussian, int, float]:
+        """The whole state, as a value."""
+        return self._state, self._predictions, self._time
+
+    def restore(self, state: tuple[BlockGaussian, int, float]) -> None:
         """Continue from a snapshot, bit-identically."""
-        self._state, self._predictions = snapshot
+        self._state, self._predictions, self._time = state

@@ -9,13 +9,16 @@ Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md fo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
 from saga_fg.transition import Transition
+
+if TYPE_CHECKING:  # it is made of measurements itself
+    from saga_fg.estimators.factor_graph import FactorGraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,11 @@ class Estimator(Protocol):
         """(n,) ids in the order of the joint state."""
         ...
 
+    @property
+    def time(self) -> float:
+        """Sum of all intervals since the start, s."""
+        ...
+
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         """Nodes that appear, independent of all others: ids (k,), means (k, d), covariances (k, d, d)."""
         ...
@@ -93,4 +101,16 @@ class Estimator(Protocol):
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         """Joint covariance of some nodes, in the order given, of any sizes."""
+        ...
+
+    def graph(self) -> FactorGraph:
+        """The equivalent factor graph and its solution; GTSAM's own solvers come to the same."""
+        ...
+
+    def snapshot(self) -> Any:
+        """The whole state as a value, which can be pickled."""
+        ...
+
+    def restore(self, state: Any) -> None:
+        """Continue from a snapshot of an estimator of the same kind."""
         ...

@@ -31,6 +31,8 @@ from saga_fg.transition import Blocks
 
 ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
+    pytest.param("saga_fg.estimators:FixedLagSmoother(0.0)", id="fixed-lag-0"),
+    pytest.param("saga_fg.estimators:FixedLagSmoother(1.0)", id="fixed-lag"),
 ]
 TOLERANCE = 1e-9
 

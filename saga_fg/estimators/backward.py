@@ -1,0 +1,178 @@
+r"""Smoothing: from the filter's pass back to the marginals given everything (modified Bryson-Frazier smoother).
+
+Backwards through the same interval, from r = 0 and N = 0 after the last moment,
+
+    smoothed    m + P r                      P - P N P              with m, P the filter's posterior of the moment
+    correction  r <- r + H^T L^-T (w - W r)  N <- A^T N A + B^T B   B = L^-1 H, A = 1 - W^T B, w = L^-1 (z - H m)
+    prediction  r <- F^T r                   N <- F^T N F
+
+It needs no inverse of a covariance, so that singular noise does no harm, and nodes that appear or go are rows that
+begin or end. Sources: Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 18 (1973); Durbin
+and Koopman, Time Series Analysis by State Space Methods (2012), section 4.4. It gives the marginals of Rauch, Tung
+and Striebel (1965).
+
+Components: what is uncorrelated when it is filtered may be joined by a later interaction, and is then correlated
+given the future. Covariances are therefore smoothed over components joined through all moments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.estimators.block_gaussian import BlockGaussian, block_product, joint_block
+from saga_fg.estimators.correction import Gain, solve_lower
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.moment import Pass
+from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped, zeros
+
+
+def smoothed_means(passes: Sequence[Pass]) -> list[FloatArray]:
+    """Smoothed joint mean of every moment, over all its nodes."""
+    means = []
+    after: FloatArray | None = None  # r of the next moment, before it saw anything
+    for k in range(len(passes) - 1, -1, -1):
+        state = passes[k]
+        x, dynamics = state.filtered, state.dynamics
+        r = np.zeros(len(x.mean))
+        if after is None or dynamics is None:
+            means.append(x.mean)
+        else:
+            back: FloatArray = np.asarray(dynamics.matrix.T @ after)
+            if len(back) == len(r):
+                r = back
+            else:
+                r[x.layout.places(x.layout.rows(dynamics.layout.nodes))] = back
+            means.append(x.mean + block_product(x.blocks, x.partition, r))
+        for gain in reversed(state.gains):
+            local = r[gain.places]
+            unexplained = gain.whitened - (gain.W @ local[:, :, None])[:, :, 0]
+            y = solve_lower(gain.L, unexplained[:, :, None], transposed=True)
+            r[gain.places] = local + (np.swapaxes(gain.H, 1, 2) @ y)[:, :, 0]
+        after = r[: x.layout.offsets[state.carried]]
+    return means[::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedCovariance:
+    """P - P N P of one moment, computed where it is asked for; P and N over one partition."""
+
+    partition: Partition
+    P: BlockDiagonal
+    N: BlockDiagonal
+
+    def blocks(self, rows: IntArray) -> FloatArray:
+        """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
+        partition = self.partition
+        d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
+        result = np.empty((len(rows), d, d))
+        for number, members, at in partition.members(rows, d):
+            row = partition.row[rows[members]]
+            P = self.P[number][row[:, None], at]
+            if 4 * len(members) * d < len(self.P[number]) * self.P[number].shape[1]:  # a few nodes only
+                P_N = P @ self.N[number][row]
+            else:
+                P_N = (self.P[number] @ self.N[number])[row[:, None], at]
+            own = np.take_along_axis(P, at[:, None, :], axis=2)
+            reduced = own - P_N @ np.swapaxes(P, 1, 2)
+            result[members] = (reduced + np.swapaxes(reduced, 1, 2)) / 2
+        return result
+
+    def joint(self, rows: IntArray) -> FloatArray:
+        """Joint covariance of the nodes at `rows`, in this order, of any sizes."""
+        whole = tuple(P - P @ N @ P for P, N in zip(self.P, self.N, strict=True))
+        whole = tuple((block + np.swapaxes(block, 1, 2)) / 2 for block in whole)
+        return joint_block(whole, self.partition, rows)
+
+
+def smoothed_covariances(passes: Sequence[Pass]) -> Iterator[SmoothedCovariance]:
+    """Smoothed covariance of every moment, from the last to the first."""
+    partitions = joined_partitions(passes)
+    after: BlockDiagonal | None = None  # N of the next moment, before it saw anything, over the nodes carried there
+    after_partition: Partition | None = None
+    for k in range(len(passes) - 1, -1, -1):
+        state, partition = passes[k], partitions[k]
+        x = state.filtered.over(partition)
+        if after is None or after_partition is None or state.dynamics is None:
+            N = zeros(partition)
+        else:
+            back = state.dynamics.pulled_back(after_partition, after)
+            N = _moved(back, after_partition, partition)
+        yield SmoothedCovariance(partition, x.blocks, N)
+        for gain in reversed(state.gains):
+            N = _before(gain, N, state.filtered, partition)
+        after_partition = partition
+        if state.carried < len(partition.layout):
+            carried = np.arange(state.carried)
+            layout = Layout(partition.layout.nodes[carried], partition.layout.dims[carried])
+            after_partition = partition.restricted(layout, carried)
+        after = _moved(N, partition, after_partition)
+
+
+def joined_partitions(passes: Sequence[Pass]) -> list[Partition]:
+    """The components of every moment's nodes, joined through all moments before and after."""
+    fine = [state.filtered.partition for state in passes]
+    starts = np.concatenate([[0], np.cumsum([partition.count for partition in fine])]).astype(np.int64)
+    a, b = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    for k, state in enumerate(passes[:-1]):
+        if state.dynamics is not None:
+            stay = state.dynamics.layout
+            rows = state.layout.rows(stay.nodes) if len(stay) < len(state.layout) else np.arange(len(stay))
+            a.append(starts[k] + fine[k].label[rows])
+            b.append(starts[k + 1] + fine[k + 1].label[: len(stay)])
+    i, j = np.concatenate(a), np.concatenate(b)
+    pairs = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), shape=(int(starts[-1]), int(starts[-1])))
+    label = connected_components(pairs, directed=False)[1]
+    joined = []
+    for k, partition in enumerate(fine):
+        own = label[starts[k] : starts[k + 1]]
+        distinct, number = np.unique(own, return_inverse=True)
+        same = len(distinct) == partition.count
+        joined.append(partition if same else Partition(partition.layout, number.astype(np.int64)[partition.label]))
+    return joined
+
+
+def _moved(blocks: BlockDiagonal, old: Partition, new: Partition) -> BlockDiagonal:
+    """The blocks over the nodes of another partition; zero for nodes that are only there."""
+    if old is new or (
+        len(old.layout) == len(new.layout)
+        and (old.layout.nodes == new.layout.nodes).all()
+        and (old.label == new.label).all()
+    ):
+        return blocks
+    where = {int(node): row for row, node in enumerate(new.layout.nodes)}
+    return regrouped(blocks, old, new, np.array([where.get(int(node), -1) for node in old.layout.nodes]))
+
+
+def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition) -> BlockDiagonal:
+    """N before a correction, from N after it."""
+    fine = x.partition
+    node = np.searchsorted(fine.layout.offsets, gain.places[:, 0], side="right") - 1
+    number, rows = int(fine.group[node[0]]), fine.row[node]
+    B = solve_lower(gain.L, gain.H)
+    B_T = np.swapaxes(B, 1, 2)
+    if partition is fine:
+        N_active = N[number][rows]
+        W_N = gain.W @ N_active
+        inner = W_N @ np.swapaxes(gain.W, 1, 2)
+        half = B_T @ ((np.eye(B.shape[1]) + inner) @ B / 2 - W_N)
+        changed = N[number].copy()
+        changed[rows] = N_active + half + np.swapaxes(half, 1, 2)
+        return (*N[:number], changed, *N[number + 1 :])
+    A = [
+        np.broadcast_to(np.eye(places.shape[1]), (len(places), places.shape[1], places.shape[1]))
+        for places in fine.groups
+    ]
+    A[number] = A[number].copy()
+    A[number][rows] -= np.swapaxes(gain.W, 1, 2) @ B
+    C = list(zeros(fine))
+    C[number][rows] = B_T @ B
+    every = np.arange(len(fine.layout))
+    A_joined, C_joined = regrouped(tuple(A), fine, partition, every), regrouped(tuple(C), fine, partition, every)
+    products = (np.swapaxes(a, 1, 2) @ n @ a + c for a, n, c in zip(A_joined, N, C_joined, strict=True))
+    return tuple((product + np.swapaxes(product, 1, 2)) / 2 for product in products)

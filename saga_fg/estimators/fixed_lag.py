@@ -1,0 +1,139 @@
+"""The fixed-lag smoother: everything within a window of seconds, smoothed; late measurements where they belong.
+
+The factors of the window, with what the filter knew at its start as prior,
+
+    prior        phi(x(t0))
+    interaction  || x_i(t+dt) - sum_j F_ij x_j(t) - b_i ||_{Q_i}     one a node and interval
+    detection    || z - h(x_i(t)) ||_{R}                              optionally robust
+
+are solved exactly where they are linear, by Gauss-Newton over the window where they are not. The elimination order is
+that of time, which for a chain of dense joint states is the best there is; it is carried out in covariance form, as
+filter and smoother, by components (`saga_fg.estimators.backward`). The newest state is the filter's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors import Robust
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
+from saga_fg.estimators.factor_graph import FactorGraph
+from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
+from saga_fg.estimators.sighting import Observations, Sighting
+from saga_fg.estimators.smoothed import Smoothed
+from saga_fg.transition import Transition
+
+
+class FixedLagSmoother:
+    """The exact smoother over the last `lag` seconds. See `saga_fg.estimators.protocol.Estimator` for the methods.
+
+    lag       s; at 0 it is the filter. The window begins at the last moment that is at least `lag` old, so that every
+              measurement up to `lag` late finds its interval
+    settings  of Gauss-Newton, for what is nonlinear or robust
+
+    `mean`, `covariance` and their like speak of the newest moment, `smoothed` of all moments in the window.
+    """
+
+    def __init__(self, lag: float, settings: GaussNewtonSettings | None = None) -> None:
+        if not (math.isfinite(lag) and lag >= 0):
+            raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
+        self._lag = float(lag)
+        self._recording = Recording(settings)
+
+    @property
+    def lag(self) -> float:
+        """Length of the window, s."""
+        return self._lag
+
+    @property
+    def time(self) -> float:
+        """Of the newest moment: the sum of all intervals, s."""
+        return self._recording.time
+
+    @property
+    def start(self) -> float:
+        """Time at which the window begins; nothing older can be taken in, s."""
+        return self._recording.moments[0].time
+
+    @property
+    def nodes(self) -> IntArray:
+        return self._recording.layout.nodes
+
+    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+        self._recording.add(nodes, means, covariances)
+
+    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
+        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
+        self._recording.move(Motion(transition, tuple(nonlinear)))
+        self._recording.forget(self.time - self._lag)
+
+    def update(
+        self, measurements: Measurements | Observations, time: float | None = None, robust: Robust | None = None
+    ) -> float:
+        """Take in measurements made at `time` (s, on the smoother's clock), None for now.
+
+        An interval that contains `time` is split: its recorded graph is discretised anew over both parts, its edges
+        kept. Returns the log-likelihood of the measurements given all taken in before; where the window holds something
+        nonlinear or robust, that of its linearisation. Raises `InputError` for a time outside the window.
+        """
+        return self._recording.see(Sighting(measurements, robust), time)
+
+    def marginalise(self, nodes: ArrayLike) -> None:
+        self._recording.leave(nodes)
+
+    def mean(self, nodes: ArrayLike) -> FloatArray:
+        x, layout = self._recording.newest()
+        return np.asarray(x.mean[layout.spans(self._rows(nodes))])
+
+    def covariance(self, nodes: ArrayLike) -> FloatArray:
+        x, layout = self._recording.newest()
+        rows = self._rows(nodes)
+        layout.spans(rows)
+        return x.covariances(rows)
+
+    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
+        x, layout = self._recording.newest()
+        return np.asarray(x.mean[layout.places(self._rows(nodes))])
+
+    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
+        x, _ = self._recording.newest()
+        return x.joint(self._rows(nodes))
+
+    def smoothed(self, covariances: bool = True) -> tuple[Smoothed, ...]:
+        """Every moment in the window, oldest first; without `covariances` means only, which costs much less."""
+        return smoothed_moments(self._recording, covariances)
+
+    def graph(self) -> FactorGraph:
+        """The window as a GTSAM graph: a prior at its start, all factors since, the smoothed means as values."""
+        return self._recording.graph()
+
+    def snapshot(self) -> RecordingState:
+        """The whole state, as a value."""
+        return self._recording.snapshot()
+
+    def restore(self, state: RecordingState) -> None:
+        """Continue from a snapshot, bit-identically."""
+        self._recording.restore(state)
+
+    def _rows(self, nodes: ArrayLike) -> IntArray:
+        """Rows of nodes that are there now, in the layout of the newest moment."""
+        live = self._recording.layout
+        rows = live.rows(nodes)
+        return self._recording.newest()[1].rows(live.nodes[rows])
+
+
+def smoothed_moments(recording: Recording, covariances: bool) -> tuple[Smoothed, ...]:
+    """Every moment of a recording, oldest first."""
+    means = recording.means()
+    P = recording.covariances() if covariances else [None] * len(means)
+    return tuple(
+        Smoothed(moment.time, state.layout, mean, covariance)
+        for moment, state, mean, covariance in zip(recording.moments, recording.passes, means, P, strict=True)
+    )

@@ -1,0 +1,118 @@
+r"""The dynamics of one interval as an estimator records them: a transition, and nodes that move nonlinearly.
+
+    x_i(t+dt) = f( x_i(t), [x_j(t)], dt ) + q_i,   q_i ~ N(0, Q_i(dt))         for the nodes with an interaction f
+
+in place of the transition's own row; Q_i is the transition's. The frozen graph of the transition can be discretised
+again over parts of the interval, and so can f, which is what a late measurement needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factors import FactorError, NonlinearInteraction
+from saga_fg.arrays import FloatArray
+from saga_fg.discretisation import discretise
+from saga_fg.errors import InputError
+from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.layout import Layout
+from saga_fg.transition import Blocks, Transition
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMotion:
+    """A node that moves by a nonlinear interaction function of its own state and those of `neighbours` (ids)."""
+
+    node: int
+    neighbours: tuple[int, ...]
+    interaction: NonlinearInteraction
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The record of an interval."""
+
+    transition: Transition
+    nonlinear: tuple[NodeMotion, ...] = ()
+
+    @property
+    def dt(self) -> float:
+        """Seconds."""
+        return self.transition.dt
+
+    @property
+    def linear(self) -> bool:
+        """Whether linearising it again elsewhere gives the same."""
+        return not self.nonlinear
+
+    def check(self, layout: Layout) -> None:
+        """Raise `InputError` or `UnknownNodeError` unless it is about exactly the nodes of `layout`, each once."""
+        Dynamics.of(self.transition, layout)
+        moving = [motion.node for motion in self.nonlinear]
+        layout.rows(moving)
+        if len(set(moving)) < len(moving):
+            raise InputError(f"nonlinear: expected each node once, got {moving}")
+        for motion in self.nonlinear:
+            layout.rows(motion.neighbours)
+            if len({motion.node, *motion.neighbours}) <= len(motion.neighbours):
+                raise InputError(f"nonlinear: node {motion.node}: expected distinct neighbours other than itself")
+
+    def parts(self, dt: float) -> tuple[Motion, Motion]:
+        """The first `dt` seconds of the interval and the rest, with the same edges."""
+        graph = self.transition.graph
+        first, rest = discretise(graph, dt), discretise(graph, self.transition.dt - dt)
+        return Motion(first, self.nonlinear), Motion(rest, self.nonlinear)
+
+    def dynamics(self, layout: Layout, mean: FloatArray) -> Dynamics:
+        """The linear dynamics over the nodes of `layout`, nonlinear ones linearised at the joint state `mean`."""
+        linear = Dynamics.of(self.transition, layout)
+        if not self.nonlinear:
+            return linear
+        own = np.zeros(len(layout), dtype=bool)
+        own[layout.rows([motion.node for motion in self.nonlinear])] = True
+        F = []
+        for blocks in linear.F:
+            kept = ~own[blocks.target]
+            F.append(Blocks(blocks.target[kept], blocks.source[kept], blocks.values[kept]))
+        b = linear.b.copy()
+        for motion in self.nonlinear:
+            rows = layout.rows([motion.node, *motion.neighbours])
+            x, *others = (mean[layout.places(rows[k : k + 1])] for k in range(len(rows)))
+            matrices, offset = _affine(motion, x, others, self.transition.dt)
+            b[layout.places(rows[:1])] = offset
+            F += [Blocks(rows[:1], rows[k : k + 1], matrix[None]) for k, matrix in enumerate(matrices)]
+        return Dynamics(layout, tuple(F), b, linear.Q)
+
+
+@dataclass(frozen=True, eq=False)
+class Standstill:
+    """No time passes: what divides two moments at the same time."""
+
+    dt: float = 0.0
+    linear: bool = True
+
+    def dynamics(self, layout: Layout, mean: FloatArray) -> Dynamics:
+        """The identity."""
+        F = []
+        for d in np.unique(layout.dims).tolist():
+            rows = np.flatnonzero(layout.dims == d)
+            F.append(Blocks(rows, rows, np.broadcast_to(np.eye(d), (len(rows), d, d))))
+        return Dynamics(layout, tuple(F), np.zeros(len(mean)), ())
+
+
+def _affine(
+    motion: NodeMotion, x: FloatArray, others: list[FloatArray], dt: float
+) -> tuple[list[FloatArray], FloatArray]:
+    """[F_i, F_j, ...] and b of f around x, others; angles of the prediction are those next to the node's own."""
+    try:
+        F, F_others, b = motion.interaction.affine(x, others, dt)
+    except FactorError as error:
+        raise InputError(f"interaction of node {motion.node}: {error}") from error
+    angles = list(motion.interaction.angles)
+    predicted = (
+        b + F @ x + sum((block @ other for block, other in zip(F_others, others, strict=True)), np.zeros(len(x)))
+    )
+    b[angles] -= 2 * np.pi * np.round((predicted[angles] - x[angles]) / (2 * np.pi))
+    return [F, *F_others], b
