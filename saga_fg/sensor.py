@@ -108,7 +108,10 @@ class Sensor:
     def position_covariance(
         self, label: StrArray, position: FloatArray, probability: FloatArray, origin: FloatArray
     ) -> FloatArray:
-        """R (N, 2, 2), m^2, of positions (N, 2) seen from the sensor's place `origin` (2,), all in one frame."""
+        """R (N, 2, 2), m^2, of positions (N, 2) seen from `origin` (2,), the sensor's place, all in one frame.
+
+        Where each has an origin (N, 2) of its own that is the position itself, range and bearing add no noise.
+        """
         offset = position - origin
         distance = np.hypot(*offset.T)
         u = offset / np.maximum(distance, 1e-9)[:, None]

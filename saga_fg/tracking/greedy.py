@@ -103,7 +103,8 @@ class GreedyTracker:
         projected = memory.position[:, :2] + memory.velocity * (now - memory.last_seen)[:, None]
         distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - projected[None], -1, 0))
         limits = self.settings.max_distance
-        limit = np.array([limits.get(str(label), limits[DEFAULT]) for label in boxes.label])
+        otherwise = limits.get(DEFAULT, GreedySettings().max_distance[DEFAULT])
+        limit = np.array([limits.get(str(label), otherwise) for label in boxes.label])
         possible = (boxes.label[:, None] == memory.label[None]) & (distance <= limit[:, None])
         distance = np.where(possible, distance, np.inf)
         for d in np.argsort(-p, kind="stable"):

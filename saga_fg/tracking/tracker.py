@@ -13,13 +13,13 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.association import Matching, assign, gate, mahalanobis
 from saga_fg.boxes import Boxes
 from saga_fg.discretisation import discretise
 from saga_fg.edge_rules import EdgeRule, build_graph
+from saga_fg.errors import InputError
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.frame import Frame
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable
@@ -118,36 +118,45 @@ class Tracker:
         sensor = self.sensor(frame.sensor)
         timestamp = frame.timestamp + sensor.time_offset
         if self._time == -math.inf:
-            self._time, self._origin = timestamp, _origin(frame)
+            self._time = timestamp
+        if len(self._columns.id) == 0:
+            self._origin = _origin(frame)
         delay = max(0.0, self._time - timestamp)
         if delay > self.settings.max_delay:
             self.late_frames += 1
             log.warning("frame of %s at %.3f s comes %.3f s late and is left out", frame.sensor, timestamp, delay)
             return self._report(self._time)
+        before = self._time
         self._predict(max(timestamp, self._time))
         world_T_sensor = None if frame.world_T_ego is None else frame.world_T_ego @ sensor.extrinsics.ego_T_sensor
         observed = self._observe(frame, sensor, world_T_sensor)
-        matching = self._associate(observed)
+        matching = self._associate(observed, delay)
         self._update(observed, matching, delay)
-        self._believe(observed, matching, sensor, frame)
-        self._bear(observed, matching)
+        self._believe(observed, matching, sensor, frame, self._time - before, delay)
+        self._bear(observed, matching, delay)
         self._bury()
         return self._report(self._time)
 
     def tracks(self, timestamp: float) -> Tracks:
-        """The tracks predicted to `timestamp` (s), without taking anything in; the present ones for an earlier time."""
+        """The tracks predicted to `timestamp` (s), without taking anything in; the present ones for an earlier time.
+
+        Raises `InputError` for a timestamp that is not finite.
+        """
+        if not math.isfinite(timestamp):
+            raise InputError(f"timestamp: expected a finite number of seconds, got {timestamp!r}")
         if self._time == -math.inf:
             return Tracks.empty(timestamp)
         if timestamp <= self._time:
             return self._report(timestamp)
-        state, box, now = self._estimator.snapshot(), self._box, self._time
+        state, box, now, graph = self._estimator.snapshot(), self._box, self._time, self.graph
         self._box = box.select(np.arange(len(box.z)))
-        self._predict(timestamp)
-        tracks = self._report(timestamp)
-        self._kinematics_now = None
-        self._estimator.restore(state)
-        self._box, self._time = box, now
-        return tracks
+        try:
+            self._predict(timestamp)
+            return self._report(timestamp)
+        finally:
+            self._kinematics_now = None
+            self._estimator.restore(state)
+            self._box, self._time, self.graph = box, now, graph
 
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
@@ -162,13 +171,13 @@ class Tracker:
 
     def _predict(self, timestamp: float) -> None:
         dt = timestamp - self._time
+        if dt > 0 and len(self._columns.id):
+            graph = build_graph(self._nodes(), self.rules, explained_noise=self.settings.explained_noise)
+            self._estimator.predict(discretise(graph, dt))
+            self._kinematics_now = None
+            self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
+            self.graph = graph
         self._time = timestamp
-        if dt == 0 or len(self._columns.id) == 0:
-            return
-        self.graph = build_graph(self._nodes(), self.rules)
-        self._kinematics_now = None
-        self._estimator.predict(discretise(self.graph, dt))
-        self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
 
     def _observe(self, frame: Frame, sensor: Sensor, world_T_sensor: FloatArray | None) -> _Observed:
         detections = frame.detections
@@ -183,7 +192,8 @@ class Tracker:
         apart = self._of_class("duplicate_distance", detections.boxes.label[keep])
         keep = keep[strongest(detections.boxes.select(keep), probability[keep], apart)]
         boxes, probability = detections.boxes.select(keep), probability[keep]
-        place = np.zeros(2) if world_T_sensor is None else world_T_sensor[:2, 3]
+        # where the sensor stood is unknown without a pose, and so is the range: its part of the noise is left out
+        place = boxes.position[:, :2] if world_T_sensor is None else world_T_sensor[:2, 3]
         known_yaw = np.isfinite(boxes.yaw)
         return _Observed(
             boxes,
@@ -196,12 +206,12 @@ class Tracker:
             np.where(known_yaw, sensor.deviations(boxes.label, "yaw"), UNKNOWN_YAW_NOISE),
         )
 
-    def _associate(self, observed: _Observed) -> Matching:
-        """Class by class, the assignment of least cost on the joint filter's covariance."""
+    def _associate(self, observed: _Observed, delay: float) -> Matching:
+        """Class by class, the assignment of least cost on the joint filter's covariance, as of `delay` s ago."""
         columns = self._columns
         tracks, detections, distances = [], [], []
         if len(columns.id) and len(observed):
-            position, _, P, _ = self._kinematics()
+            position, P = self._positions_before(delay)
             measured = observed.boxes.position[:, :2] - self._origin
             for label in np.unique(columns.label):
                 t = np.flatnonzero(columns.label == label)
@@ -255,8 +265,13 @@ class Tracker:
         if len(columns.id):
             self._box.face_motion(self._kinematics()[1])
 
-    def _believe(self, observed: _Observed, matching: Matching, sensor: Sensor, frame: Frame) -> None:
-        """Existence: fewer odds for a miss where a detection was to be expected, more for a match by its score."""
+    def _believe(
+        self, observed: _Observed, matching: Matching, sensor: Sensor, frame: Frame, elapsed: float, delay: float
+    ) -> None:
+        """Existence: fewer odds for a miss where a detection was to be expected, more for a match by its score.
+
+        elapsed: since the latest frame, s; delay: by which this one comes late, s
+        """
         columns, settings = self._columns, self.settings.existence
         n = len(columns.id)
         if n == 0:
@@ -264,25 +279,24 @@ class Tracker:
         position = self._kinematics()[0] + self._origin
         visible = sensor.sees(position, frame.world_T_ego)
         columns.last_in_view[visible] = self._time
-        elapsed = np.maximum(self._time - columns.last_seen, 0.0)
         p_detect = np.where(visible, sensor.detection_probability, 0.0)
         r = columns.existence
         missed = np.ones(n, dtype=bool)
         missed[matching.track] = False
         lost = r * (1 - p_detect) / np.maximum(1 - r * p_detect, 1e-9)
-        columns.existence = np.where(missed, lost * np.exp(-elapsed * missed / settings.lifetime), r)
+        columns.existence = np.where(missed, lost * math.exp(-elapsed / settings.lifetime), r)
         p = observed.probability[matching.detection]
         odds = p / (1 - p) * (1 - settings.clutter_score) / settings.clutter_score
         before = np.clip(r[matching.track], 1e-3, 1 - 1e-3)
         after = before / (1 - before) * odds
         columns.existence[matching.track] = np.clip(after / (1 + after), 0.0, 0.999)
         columns.score[matching.track] = p
-        columns.last_seen[matching.track] = self._time
+        columns.last_seen[matching.track] = np.maximum(columns.last_seen[matching.track], self._time - delay)
         columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
 
-    def _bear(self, observed: _Observed, matching: Matching) -> None:
-        """New tracks from detections that no track explains."""
+    def _bear(self, observed: _Observed, matching: Matching, delay: float) -> None:
+        """New tracks from detections that no track explains; those of `delay` s ago have moved on since."""
         free = np.ones(len(observed), dtype=bool)
         free[matching.detection] = False
         born = np.flatnonzero(free & (observed.probability >= self._of_class("birth_score", observed.boxes.label)))
@@ -304,11 +318,14 @@ class Tracker:
             mean[:, at_v] = velocity[rows]
             P[:, at_p[:, None], at_p] = observed.R[born[rows]]
             P[:, at_v[:, None], at_v] = P_velocity[rows]
+            if delay > 0:
+                F, Q = _own_motion(node_type, delay)
+                mean, P = mean @ F.T, F @ P @ F.T + Q
             self._kinematics_now = None
             self._estimator.add(ids[rows], mean, P)
-        now = np.full(len(born), self._time)
+        seen, now = np.full(len(born), self._time - delay), np.full(len(born), self._time)
         self._columns = self._columns.extended(
-            _Columns(ids, boxes.label, p.copy(), p.copy(), now, now.copy(), p >= self.settings.existence.confirm)
+            _Columns(ids, boxes.label, p.copy(), p.copy(), seen, now, p >= self.settings.existence.confirm)
         )
         self._box = self._box.extended(
             BoxFilter.born(
@@ -392,6 +409,19 @@ class Tracker:
             P[rows], P_velocity[rows] = covariance[:, at_p[:, None], at_p], covariance[:, at_v[:, None], at_v]
         return _Kinematics(position, velocity, P, P_velocity)
 
+    def _positions_before(self, delay: float) -> tuple[FloatArray, FloatArray]:
+        """Of all tracks, local: positions (n, 2) `delay` s ago and their covariances (n, 2, 2)."""
+        if delay == 0:
+            position, _, P, _ = self._kinematics()
+            return position, P
+        columns = self._columns
+        position, P = np.zeros((len(columns.id), 2)), np.zeros((len(columns.id), 2, 2))
+        for node_type, rows in self._by_type(columns.label):
+            H, R = _moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
+            position[rows] = self._estimator.mean(columns.id[rows]) @ H.T
+            P[rows] = H @ self._estimator.covariance(columns.id[rows]) @ H.T + R
+        return position, P
+
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them."""
         columns, box = self._columns, self._box
@@ -429,7 +459,12 @@ def _origin(frame: Frame) -> FloatArray:
 
 def _moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
     """A measurement `delay` s old as one of the present state, x(t - delay) = exp(-A delay) x(t) + noise."""
-    graph = SceneGraph.of([0], node_type)
-    Q = discretise(graph, delay).Q[0].values[0]
-    H_past = H @ scipy.linalg.expm(-node_type.generator * delay)
+    F, Q = _own_motion(node_type, delay)
+    H_past = H @ np.linalg.inv(F)
     return H_past, R + H_past @ Q @ H_past.T
+
+
+def _own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
+    """F (d, d) and Q (d, d) of a node on its own over `dt` s."""
+    transition = discretise(SceneGraph.of([0], node_type), dt)
+    return transition.F[0].values[0], transition.Q[0].values[0]
