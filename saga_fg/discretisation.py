@@ -55,7 +55,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
     kinds, kind = _kinds(graph)
-    coupled = np.zeros(len(graph), dtype=bool)
+    coupled = np.asarray(graph.diffusion_scale != 1.0)
     for edges in graph.edges:
         coupled[edges.target[edges.rate > 0]] = True
     offsets = np.concatenate([[0], np.cumsum(graph.dims)])
@@ -91,7 +91,8 @@ def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArr
     """
     offsets = np.concatenate([[0], np.cumsum(graph.dims)])
     G = scipy.linalg.block_diag(*(t.generator for t in graph.types)) if len(graph) else np.empty((0, 0))
-    Qc = scipy.linalg.block_diag(*(t.diffusion for t in graph.types)) if len(graph) else np.empty((0, 0))
+    scaled = (t.diffusion * scale for t, scale in zip(graph.types, graph.diffusion_scale, strict=True))
+    Qc = scipy.linalg.block_diag(*scaled) if len(graph) else np.empty((0, 0))
     c = np.zeros(int(offsets[-1]))
     for edges in graph.edges:
         for k, (i, j, rate) in enumerate(zip(edges.target, edges.source, edges.rate, strict=True)):
@@ -115,7 +116,7 @@ def _own_dynamics(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M (m, d, d), Qc (m, d, d), c (m, d) of the nodes `rows`, whose states have equal size."""
     M = np.stack([kinds[k].generator for k in kind[rows]])
-    Qc = np.stack([kinds[k].diffusion for k in kind[rows]])
+    Qc = np.stack([kinds[k].diffusion for k in kind[rows]]) * graph.diffusion_scale[rows, None, None]
     c = np.zeros(M.shape[:2])
     position = np.full(len(graph), -1)
     position[rows] = np.arange(len(rows))

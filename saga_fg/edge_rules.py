@@ -105,12 +105,18 @@ class Following:
         return Pairs(target[nearest], source[nearest], rate[nearest])
 
 
-def build_graph(nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1e-3) -> SceneGraph:
+def build_graph(
+    nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1e-3, explained_noise: float = 0.0
+) -> SceneGraph:
     """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out.
+
+    A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
+    a driver who does what his leader does is no longer a surprise.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
     """
     groups: list[Edges] = []
+    total_rate = np.zeros(len(nodes))
     if len(nodes) > 1:
         kinds: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
         kind = np.array([kinds.setdefault(t.components, len(kinds)) for t in nodes.types])
@@ -125,7 +131,8 @@ def build_graph(nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1
                 if rule.interaction.applies(nodes.types[t[0]], nodes.types[s[0]]):
                     name = type(rule.interaction).__name__
                     groups.append(Edges(name, t, s, rate[mine], *rule.interaction.triples(nodes, t, s)))
-    return SceneGraph(nodes.id, nodes.types, tuple(groups))
+                    np.add.at(total_rate, t, rate[mine])
+    return SceneGraph(nodes.id, nodes.types, tuple(groups), np.exp(-explained_noise * total_rate))
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:

@@ -70,6 +70,8 @@ class SceneGraph:
     nodes  (n,) ids, unique
     types  n node types
     edges  one or more groups of edges, by rows of `nodes`
+    diffusion_scale  (n,) > 0, factors on the diffusion of the nodes' own motion, 1 if not given: what an interaction
+                     explains of a node's motion is noise no more
 
     Raises `InputError` for edges that name a row the graph has not, or triples whose sizes don't fit the nodes.
     """
@@ -77,6 +79,7 @@ class SceneGraph:
     nodes: IntArray
     types: tuple[NodeType, ...]
     edges: tuple[Edges, ...] = ()
+    diffusion_scale: FloatArray = None  # type: ignore[assignment]  # an array from construction on
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
@@ -84,6 +87,13 @@ class SceneGraph:
         object.__setattr__(self, "types", tuple(self.types))
         if len(self.types) != len(nodes):
             raise InputError(f"types: expected {len(nodes)} node types, got {len(self.types)}")
+        given = np.ones(len(nodes)) if self.diffusion_scale is None else self.diffusion_scale
+        scale = checked("diffusion_scale", given, (len(nodes),))
+        if (scale <= 0).any():
+            raise InputError(
+                f"diffusion_scale[{int(np.argmax(scale <= 0))}]: expected a factor > 0, got {scale.min():g}"
+            )
+        object.__setattr__(self, "diffusion_scale", scale)
         for group in self.edges:
             for name, rows, dim in (
                 ("target", group.target, group.A_other.shape[1]),

@@ -67,6 +67,9 @@ class TrackerSettings:
     edges: tuple[Following | Neighbours, ...] = settings_group(
         lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
     )
+    explained_noise: float = setting(
+        0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
+    )
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
     max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
