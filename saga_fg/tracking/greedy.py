@@ -24,7 +24,7 @@ NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 a
 
 @dataclass(frozen=True, eq=False)
 class _Memory:
-    """n tracks: where they were last seen."""
+    """n tracks: where they were last seen, and the place and time from which their velocity is measured."""
 
     id: IntArray
     label: StrArray
@@ -34,6 +34,8 @@ class _Memory:
     velocity: FloatArray
     score: FloatArray
     last_seen: FloatArray
+    anchor: FloatArray
+    anchor_time: FloatArray
 
     def select(self, rows: IntArray) -> _Memory:
         return _Memory(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -52,8 +54,9 @@ class GreedyTracker:
         self._time = -np.inf
         empty = Boxes.empty()
         none = np.empty(0)
+        flat = np.empty((0, 2))
         self._memory = _Memory(
-            np.empty(0, dtype=np.int64), empty.label, empty.position, empty.size, none, empty.velocity, none, none
+            np.empty(0, dtype=np.int64), empty.label, empty.position, empty.size, none, flat, none, none, flat, none
         )
 
     def step(self, frame: Frame) -> Tracks:
@@ -71,18 +74,34 @@ class GreedyTracker:
         memory = self._memory
         match = self._match(boxes, p, now)
         seen = match >= 0
-        velocity = boxes.velocity.copy()
-        elapsed = now - memory.last_seen[match[seen]]
-        moved = boxes.position[seen, :2] - memory.position[match[seen], :2]
-        previous = memory.velocity[match[seen]]
-        difference = np.where(elapsed[:, None] > 1e-6, moved / np.maximum(elapsed, 1e-6)[:, None], previous)
+        position, velocity = boxes.position[:, :2], boxes.velocity.copy()
+        anchor, anchor_time = position.copy(), np.full(len(boxes), now)
+        elapsed = now - memory.anchor_time[match[seen]]
+        young = (
+            elapsed < self.settings.baseline - 1e-6
+        )  # the anchor is too young for a difference: detections are noisy
+        moved = (position[seen] - memory.anchor[match[seen]]) / np.maximum(elapsed, 1e-6)[:, None]
+        difference = np.where(young[:, None], memory.velocity[match[seen]], moved)
         velocity[seen] = np.where(np.isfinite(velocity[seen]), velocity[seen], difference)
         velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+        anchor[seen] = np.where(young[:, None], memory.anchor[match[seen]], anchor[seen])
+        anchor_time[seen] = np.where(young, memory.anchor_time[match[seen]], anchor_time[seen])
         ids = np.empty(len(boxes), dtype=np.int64)
         ids[seen] = memory.id[match[seen]]
         ids[~seen] = np.arange(self._next_id, self._next_id + int((~seen).sum()))
         self._next_id += int((~seen).sum())
-        fresh = _Memory(ids, boxes.label, boxes.position, boxes.size, boxes.yaw, velocity, p, np.full(len(boxes), now))
+        fresh = _Memory(
+            ids,
+            boxes.label,
+            boxes.position,
+            boxes.size,
+            boxes.yaw,
+            velocity,
+            p,
+            np.full(len(boxes), now),
+            anchor,
+            anchor_time,
+        )
         unseen = np.ones(len(memory.id), dtype=bool)
         unseen[match[seen]] = False
         kept = np.flatnonzero(unseen & (now - memory.last_seen <= self.settings.max_coasting))

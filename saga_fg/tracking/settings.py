@@ -88,6 +88,7 @@ class GreedySettings:
         metadata={"comment": "largest distance between prediction and detection by class, m"},
     )
     max_coasting: float = setting(1.2, "a track without detection is kept this long, s")
+    baseline: float = setting(0.2, "velocities are differences of positions at least this far apart in time, s")
     min_score: float = setting(0.0, "detections with a lower probability are not used")
 
     def __post_init__(self) -> None:
