@@ -1,19 +1,25 @@
 """Estimators behind one protocol, and the textbook reference they must agree with."""
 
+from saga_fg.estimators.batch import BatchSmoother
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
+from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.kalman import JointKalmanFilter
 from saga_fg.estimators.motion import NodeMotion
 from saga_fg.estimators.protocol import Estimator, Measurements
+from saga_fg.estimators.recording import GaussNewtonSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
 from saga_fg.estimators.sighting import Observations
 from saga_fg.estimators.smoothed import Smoothed
 
 __all__ = [
+    "BatchSmoother",
     "Estimator",
     "FactorGraph",
     "FixedLagSmoother",
+    "GaussNewtonSettings",
     "Gaussian",
+    "GraduatedNonConvexity",
     "JointKalmanFilter",
     "Measurements",
     "NodeMotion",

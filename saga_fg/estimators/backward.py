@@ -25,6 +25,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian, block_product, joint_block
 from saga_fg.estimators.correction import Gain, solve_lower
 from saga_fg.estimators.layout import Layout
@@ -88,6 +89,35 @@ class SmoothedCovariance:
         whole = tuple(P - P @ N @ P for P, N in zip(self.P, self.N, strict=True))
         whole = tuple((block + np.swapaxes(block, 1, 2)) / 2 for block in whole)
         return joint_block(whole, self.partition, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class MarginalCovariances:
+    """The covariances of single nodes of one moment: for each size of states, its rows and blocks (k, d, d)."""
+
+    layout: Layout
+    own: dict[int, FloatArray]
+    place: IntArray  # (n,) of each node among those of its size
+
+    @staticmethod
+    def of(whole: SmoothedCovariance) -> MarginalCovariances:
+        """Those of all nodes."""
+        layout = whole.partition.layout
+        own, place = {}, np.empty(len(layout), dtype=np.int64)
+        for d in np.unique(layout.dims).tolist():
+            rows = np.flatnonzero(layout.dims == d)
+            own[d], place[rows] = whole.blocks(rows), np.arange(len(rows))
+        return MarginalCovariances(layout, own, place)
+
+    def blocks(self, rows: IntArray) -> FloatArray:
+        """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
+        if len(rows) == 0:
+            return np.empty((0, 0, 0))
+        return self.own[int(self.layout.dims[rows[0]])][self.place[rows]]
+
+    def joint(self, rows: IntArray) -> FloatArray:
+        """Raises `InputError`: joint covariances were not kept."""
+        raise InputError("joint covariance: only those of single nodes were kept; ask for joint covariances")
 
 
 def smoothed_covariances(passes: Sequence[Pass]) -> Iterator[SmoothedCovariance]:

@@ -88,7 +88,7 @@ def _recording_graph(
             linear += prior_factors([keys[k][node] for node in birth.nodes.tolist()], birth.means, birth.covariances)
         for sighting in moment.sightings:
             seen = [keys[k][node] for node in sighting.measured.nodes.tolist()]
-            if sighting.robust is None and isinstance(sighting.measured, Measurements):
+            if sighting.loss is None and isinstance(sighting.measured, Measurements):
                 linear += _detection_factors(seen, sighting, layout, means[k])
             else:
                 for factor in _nonlinear_detections(seen, sighting):
@@ -126,7 +126,7 @@ def _detection_factors(
 
 
 def _nonlinear_detections(keys: list[int], sighting: Sighting) -> list[ResidualFactor]:
-    measured, robust = sighting.measured, sighting.robust
+    measured, robust = sighting.measured, sighting.loss
     weights = np.ones(len(keys)) if sighting.weights is None else sighting.weights
     factors = []
     for k in np.flatnonzero(weights > 0).tolist():

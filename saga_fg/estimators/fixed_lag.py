@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import Robust
@@ -27,7 +26,7 @@ from saga_fg.estimators.motion import Motion, NodeMotion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.estimators.smoothed import Smoothed
+from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
 from saga_fg.transition import Transition
 
 
@@ -89,26 +88,20 @@ class FixedLagSmoother:
         self._recording.leave(nodes)
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
-        x, layout = self._recording.newest()
-        return np.asarray(x.mean[layout.spans(self._rows(nodes))])
+        return self._newest().mean(nodes)
 
     def covariance(self, nodes: ArrayLike) -> FloatArray:
-        x, layout = self._recording.newest()
-        rows = self._rows(nodes)
-        layout.spans(rows)
-        return x.covariances(rows)
+        return self._newest().covariance(nodes)
 
     def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        x, layout = self._recording.newest()
-        return np.asarray(x.mean[layout.places(self._rows(nodes))])
+        return self._newest().joint_mean(nodes)
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        x, _ = self._recording.newest()
-        return x.joint(self._rows(nodes))
+        return self._newest().joint_covariance(nodes)
 
     def smoothed(self, covariances: bool = True) -> tuple[Smoothed, ...]:
         """Every moment in the window, oldest first; without `covariances` means only, which costs much less."""
-        return smoothed_moments(self._recording, covariances)
+        return smoothed_moments(self._recording, covariances, joint=True)
 
     def graph(self) -> FactorGraph:
         """The window as a GTSAM graph: a prior at its start, all factors since, the smoothed means as values."""
@@ -122,18 +115,5 @@ class FixedLagSmoother:
         """Continue from a snapshot, bit-identically."""
         self._recording.restore(state)
 
-    def _rows(self, nodes: ArrayLike) -> IntArray:
-        """Rows of nodes that are there now, in the layout of the newest moment."""
-        live = self._recording.layout
-        rows = live.rows(nodes)
-        return self._recording.newest()[1].rows(live.nodes[rows])
-
-
-def smoothed_moments(recording: Recording, covariances: bool) -> tuple[Smoothed, ...]:
-    """Every moment of a recording, oldest first."""
-    means = recording.means()
-    P = recording.covariances() if covariances else [None] * len(means)
-    return tuple(
-        Smoothed(moment.time, state.layout, mean, covariance)
-        for moment, state, mean, covariance in zip(recording.moments, recording.passes, means, P, strict=True)
-    )
+    def _newest(self) -> Newest:
+        return Newest(self._recording.layout, self._recording.newest())

@@ -1,8 +1,8 @@
 """A record of moments with the filter's pass over it: what the smoothers are made of.
 
-Whatever is told is taken in by the filter at once. Told of the past, the filter's pass is done again from there; and
-where something is nonlinear or robust, everything recorded is linearised again at the smoothed means until they stand
-still, which is Gauss-Newton over the recording (Bell, The iterated Kalman smoother as a Gauss-Newton method, 1994).
+Told of the past, the filter's pass is done again from there. Where something is nonlinear or robust, everything
+recorded is linearised again at the smoothed means until they stand still, which is Gauss-Newton over the recording
+(Bell, The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994).
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
-from saga_fg.estimators.backward import SmoothedCovariance, smoothed_covariances, smoothed_means
+from saga_fg.estimators.backward import (
+    MarginalCovariances,
+    SmoothedCovariance,
+    smoothed_covariances,
+    smoothed_means,
+)
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.factor_graph import FactorGraph, recording_graph
 from saga_fg.estimators.layout import Layout, checked_prior
@@ -35,7 +40,7 @@ _SAME_TIME = 1e-9  # s
 class GaussNewtonSettings:
     """When the linearisation of what is nonlinear or robust is good enough."""
 
-    max_iterations: int = setting(50, "linearisations of the whole recording at most")
+    max_iterations: int = setting(50, "linearisations of everything recorded at most")
     tolerance: float = setting(1e-10, "largest step of a mean, in standard deviations, at which it has converged")
 
     def __post_init__(self) -> None:
@@ -47,30 +52,43 @@ class GaussNewtonSettings:
 
 @dataclass(frozen=True, eq=False)
 class RecordingState:
-    """A recording as a value: what was known before, the moments, the filter's pass, whether it has converged."""
+    """A recording as a value.
+
+    prior of the first moment; moments; layout of each one's nodes; the filter's pass as far as it has come; whether
+    everything is linearised where it should be
+    """
 
     prior: BlockGaussian
     moments: tuple[Moment, ...]
+    layouts: tuple[Layout, ...]
     passes: tuple[Pass, ...]
     converged: bool
 
 
 class Recording:
-    """Moments in order of time, from `time` 0 s on. Every method checks all it is given before it changes anything."""
+    """Moments in order of time, from 0 s on. Every method checks all it is given before it changes anything.
 
-    def __init__(self, settings: GaussNewtonSettings | None = None) -> None:
-        self.settings = settings or GaussNewtonSettings()
-        self._layout: Layout | None
-        self._means: list[FloatArray] | None
-        self._covariances: list[SmoothedCovariance] | None
-        self.restore(RecordingState(BlockGaussian.empty(), (Moment(0.0),), (arrival(BlockGaussian.empty()),), True))
+    With `lazy` the filter's pass waits until somebody asks for an estimate; nobody learns the likelihoods meanwhile.
+    """
+
+    def __init__(self, settings: GaussNewtonSettings | None = None, lazy: bool = False) -> None:
+        self._settings = settings or GaussNewtonSettings()
+        self._lazy = lazy
+        self._layout: Layout | None = None
+        self._means: list[FloatArray] | None = None
+        self._covariances: list[SmoothedCovariance] | None = None
+        self._marginals: list[MarginalCovariances] | None = None
+        nothing = BlockGaussian.empty()
+        self.restore(RecordingState(nothing, (Moment(0.0),), (nothing.layout,), (arrival(nothing),), True))
 
     def snapshot(self) -> RecordingState:
-        return RecordingState(self._prior, tuple(self._moments), tuple(self._passes), self._converged)
+        return RecordingState(
+            self._prior, tuple(self._moments), tuple(self._layouts), tuple(self._passes), self._converged
+        )
 
     def restore(self, state: RecordingState) -> None:
         self._prior, self._converged = state.prior, state.converged
-        self._moments, self._passes = list(state.moments), list(state.passes)
+        self._moments, self._layouts, self._passes = list(state.moments), list(state.layouts), list(state.passes)
         self._nonlinear = not all(moment.linear for moment in state.moments)
         self._changed()
 
@@ -89,8 +107,13 @@ class Recording:
         return self._moments
 
     @property
+    def layouts(self) -> Sequence[Layout]:
+        """Of each moment: all its nodes, those that go afterwards too."""
+        return self._layouts
+
+    @property
     def passes(self) -> Sequence[Pass]:
-        """The filter's pass, converged."""
+        """The filter's pass, complete and converged."""
         self.solve()
         return self._passes
 
@@ -98,14 +121,9 @@ class Recording:
     def layout(self) -> Layout:
         """The nodes that are there now."""
         if self._layout is None:
-            layout = self._passes[-1].layout
-            self._layout = layout.without(layout.rows(self._moments[-1].gone))
+            gone = self._layouts[-1].rows(self._moments[-1].gone)
+            self._layout = self._layouts[-1].without(gone) if len(gone) else self._layouts[-1]
         return self._layout
-
-    def newest(self) -> tuple[BlockGaussian, Layout]:
-        """The filter's posterior at the newest moment, and the layout it is over (nodes that go included)."""
-        self.solve()
-        return self._passes[-1].filtered, self._passes[-1].layout
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         mean, covariance = checked_prior(nodes, means, covariances)
@@ -114,10 +132,11 @@ class Recording:
             return
         if np.isin(added, self._moments[-1].gone).any():  # gone and back at the same time: another moment
             self._move(Standstill())
-        birth = Birth(added, mean, covariance)
-        moment = self._moments[-1]
-        self._passes[-1] = self._passes[-1].born(birth)
+        birth, moment = Birth(added, mean, covariance), self._moments[-1]
+        if len(self._passes) == len(self._moments):
+            self._passes[-1] = self._passes[-1].born(birth)
         self._moments[-1] = replace(moment, births=(*moment.births, birth))
+        self._layouts[-1] = self._layouts[-1].extended(added, mean.shape[1])
         self._changed()
 
     def move(self, motion: Motion) -> None:
@@ -128,25 +147,29 @@ class Recording:
     def see(self, sighting: Sighting, time: float | None = None) -> float:
         """Take in measurements, of the newest moment or of any `time` within the recording.
 
-        Returns their log-likelihood given all that was known. An interval that contains `time` is split in two.
+        Returns their log-likelihood given all that was known, NaN if lazy. An interval that contains `time` is split.
         """
-        k, moments, passes = self._moment_at(self.time if time is None else time)
+        k, moments, layouts = self._moment_at(self.time if time is None else time)
         newest = k == len(moments) - 1
-        sighting.check(self.layout if newest else passes[k].layout)
+        sighting.check(self.layout if newest else layouts[k])
         if len(sighting.measured) == 0:
             return 0.0
-        before = sum(state.log_likelihood for state in self._passes[k:])
+        inserted = len(moments) > len(self._moments)
         moments[k] = replace(moments[k], sightings=(*moments[k].sightings, sighting))
-        passes[k] = passes[k].seen(sighting)
-        motion = moments[k].motion
-        if motion is not None:
-            passes[k], prior = passes[k].moved(moments[k].gone, motion)
-            passes[k + 1 :] = passed(prior, moments[k + 1 :])
-        self._moments, self._passes = moments, passes
+        passes, likelihood = self._passes[:k], math.nan
+        if not self._lazy:
+            before = sum(state.log_likelihood for state in self._passes[k:])
+            if not inserted:
+                passes.append(self._passes[k].seen(sighting))
+            passes = _completed(passes, self._prior, moments)
+            likelihood = sum(state.log_likelihood for state in passes[k:]) - before
+        elif newest and not inserted and len(self._passes) == len(moments):
+            passes.append(self._passes[k].seen(sighting))
+        self._moments, self._layouts, self._passes = moments, layouts, passes
         self._nonlinear |= not sighting.linear
         self._converged = not self._nonlinear
         self._changed()
-        return sum(state.log_likelihood for state in passes[k:]) - before
+        return likelihood
 
     def leave(self, nodes: ArrayLike) -> None:
         rows = self.layout.rows(nodes)
@@ -167,9 +190,14 @@ class Recording:
         self._prior = self._passes[k].arrived
         first = replace(self._passes[k], carried=len(self._prior.layout))
         self._moments = [replace(self._moments[k], births=()), *self._moments[k + 1 :]]
-        self._passes = [first, *self._passes[k + 1 :]]
+        self._layouts, self._passes = self._layouts[k:], [first, *self._passes[k + 1 :]]
         self._nonlinear = not all(moment.linear for moment in self._moments)
         self._changed()
+
+    def newest(self) -> BlockGaussian:
+        """The filter's posterior at the newest moment, over all its nodes."""
+        self.solve()
+        return self._passes[-1].filtered
 
     def means(self) -> list[FloatArray]:
         """Smoothed joint mean of every moment, over all its nodes (those that go afterwards, too)."""
@@ -178,65 +206,66 @@ class Recording:
             self._means = smoothed_means(self._passes)
         return self._means
 
-    def covariances(self) -> list[SmoothedCovariance]:
-        """Smoothed covariance of every moment."""
+    def covariances(self, joint: bool) -> Sequence[SmoothedCovariance | MarginalCovariances]:
+        """Smoothed covariance of every moment, joint ones or only those of single nodes, which take less memory."""
         self.solve()
-        if self._covariances is None:
+        if self._covariances is None and joint:
             self._covariances = list(smoothed_covariances(self._passes))[::-1]
-        return self._covariances
+        if self._covariances is not None:
+            return self._covariances
+        if self._marginals is None:
+            self._marginals = [MarginalCovariances.of(whole) for whole in smoothed_covariances(self._passes)][::-1]
+        return self._marginals
 
     def graph(self) -> FactorGraph:
         """The equivalent factor graph, with the smoothed means as values."""
-        means = self.means()
-        return recording_graph(self._prior, self._moments, [state.layout for state in self._passes], means)
+        return recording_graph(self._prior, self._moments, self._layouts, self.means())
 
-    def replace_sightings(self, moments: Sequence[Moment]) -> None:
-        """Put other moments in place, which differ in their sightings only, and pass over them again."""
-        self._passes = passed(self._prior, list(moments), self.means())
-        self._moments = list(moments)
-        self._nonlinear = not all(moment.linear for moment in moments)
+    def reweigh(self, moments: Sequence[Moment]) -> None:
+        """Put moments in place that differ in the weights of their sightings only."""
+        passes = passed(self._prior, list(moments), self.means() if self._nonlinear else None)
+        self._moments, self._passes = list(moments), passes
         self._converged = not self._nonlinear
         self._changed()
 
     def solve(self) -> None:
-        """Linearise again until the smoothed means stand still, if anything is nonlinear or robust."""
+        """Complete the filter's pass; linearise until the smoothed means stand still where that makes a difference."""
+        self._passes = _completed(self._passes, self._prior, self._moments)
         if self._converged:
             return
-        means, before, share = smoothed_means(self._passes), math.inf, 1.0
-        for iteration in range(self.settings.max_iterations):
+        means, before, share, step = smoothed_means(self._passes), math.inf, 1.0, math.inf
+        for iteration in range(self._settings.max_iterations):
             passes = passed(self._prior, self._moments, means)
             solved = smoothed_means(passes)
-            step = max(
-                (
-                    float(np.max(np.abs(new - old) / np.sqrt(state.filtered.variances()), initial=0.0))
-                    for new, old, state in zip(solved, means, passes, strict=True)
-                ),
-                default=0.0,
-            )
+            step = _largest_step(means, solved, passes)
             log.debug("iteration %d: largest step %.3g standard deviations", iteration + 1, step)
-            if step <= self.settings.tolerance:
+            if step <= self._settings.tolerance:
                 break
             if step >= before:  # it does not settle: shorter steps
                 share /= 2
             before = step
             means = [old + share * (new - old) for new, old in zip(solved, means, strict=True)]
         else:
-            log.warning("no convergence in %d iterations; last step %.2g", self.settings.max_iterations, step)
-        self._passes, self._means, self._covariances, self._converged = passes, solved, None, True
+            log.warning("no convergence in %d iterations; last step %.2g sigma", self._settings.max_iterations, step)
+        self._passes, self._converged = passes, True
+        self._changed()
+        self._means = solved
 
     def _move(self, motion: Motion | Standstill) -> None:
-        self.solve()
-        moment = self._moments[-1]
-        state, prior = self._passes[-1].moved(moment.gone, motion)
-        self._moments[-1], self._passes[-1] = replace(moment, motion=motion), state
-        self._moments.append(Moment(moment.time + motion.dt))
-        self._passes.append(arrival(prior))
+        moment, layout, passes = self._moments[-1], self.layout, self._passes
+        if not self._lazy:
+            self.solve()
+            state, prior = self._passes[-1].moved(moment.gone, motion)
+            passes = [*self._passes[:-1], state, arrival(prior)]
+        self._moments = [*self._moments[:-1], replace(moment, motion=motion), Moment(moment.time + motion.dt)]
+        self._layouts, self._passes = [*self._layouts, layout], passes
         self._nonlinear |= not motion.linear
+        self._converged &= motion.linear or not self._lazy
         self._changed()
 
-    def _moment_at(self, time: float) -> tuple[int, list[Moment], list[Pass]]:
-        """The moment of `time`, with moments and passes in which it is, an interval split if need be."""
-        moments, passes = list(self._moments), list(self._passes)
+    def _moment_at(self, time: float) -> tuple[int, list[Moment], list[Layout]]:
+        """The moment of `time`, with moments and layouts in which it is, an interval split if need be."""
+        moments, layouts = list(self._moments), list(self._layouts)
         if not math.isfinite(time):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
         first, last = moments[0].time, moments[-1].time
@@ -244,21 +273,42 @@ class Recording:
             raise InputError(f"time: {time:.6f} s is after the newest moment, {last:.6f} s; predict first")
         if time < first - _SAME_TIME:
             raise InputError(f"time: {time:.6f} s is before what is remembered, which begins at {first:.6f} s")
-        k = int(np.searchsorted([moment.time for moment in moments], time - _SAME_TIME))
-        while k + 1 < len(moments) and moments[k + 1].time <= time + _SAME_TIME:
-            k += 1
-        if moments[k].time <= time + _SAME_TIME:
-            return k, moments, passes
-        motion = moments[k - 1].motion
+        k = len(moments) - 1
+        while moments[k].time > time + _SAME_TIME:
+            k -= 1
+        if moments[k].time >= time - _SAME_TIME:
+            return k, moments, layouts
+        motion = moments[k].motion
         assert isinstance(motion, Motion)  # a standstill has no inside
-        first_part, rest = motion.parts(time - moments[k - 1].time)
-        passes[k - 1], prior = passes[k - 1].moved(moments[k - 1].gone, first_part)
-        moments[k - 1] = replace(moments[k - 1], motion=first_part)
-        moments.insert(k, Moment(time, motion=rest))
-        passes.insert(k, arrival(prior))
-        return k, moments, passes
+        start, rest = motion.parts(time - moments[k].time)
+        gone = layouts[k].rows(moments[k].gone)
+        moments[k] = replace(moments[k], motion=start)
+        moments.insert(k + 1, Moment(time, motion=rest))
+        layouts.insert(k + 1, layouts[k].without(gone) if len(gone) else layouts[k])
+        return k + 1, moments, layouts
 
     def _changed(self) -> None:
         self._layout = None
-        self._means = None
-        self._covariances = None
+        self._means = self._covariances = self._marginals = None
+
+
+def _completed(passes: list[Pass], prior: BlockGaussian, moments: list[Moment]) -> list[Pass]:
+    """The filter's pass over all moments, given that over the first ones."""
+    k = len(passes)
+    if k == len(moments):
+        return passes
+    done = list(passes)
+    if k > 0:
+        motion = moments[k - 1].motion
+        assert motion is not None
+        done[-1], prior = done[-1].moved(moments[k - 1].gone, motion)
+    return done + passed(prior, moments[k:])
+
+
+def _largest_step(before: list[FloatArray], after: list[FloatArray], passes: list[Pass]) -> float:
+    """In standard deviations of the filter."""
+    steps = (
+        float(np.max(np.abs(new - old) / np.sqrt(state.filtered.variances()), initial=0.0))
+        for new, old, state in zip(after, before, passes, strict=True)
+    )
+    return max(steps, default=0.0)

@@ -19,6 +19,7 @@ import numpy as np
 from factors import FactorError, MeasurementModel, Robust
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
+from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.protocol import Measurements
 
@@ -58,16 +59,24 @@ class LinearRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Measurements as an estimator records them; `weights` (m,) in place of those of a robust loss."""
+    """Measurements as an estimator records them.
+
+    robust: a loss whose weights follow the residuals, or one whose `weights` (m,) a batch smoother sets.
+    """
 
     measured: Measurements | Observations
-    robust: Robust | None = None
+    robust: Robust | GraduatedNonConvexity | None = None
     weights: FloatArray | None = None
+
+    @property
+    def loss(self) -> Robust | None:
+        """The loss whose weights follow the residuals."""
+        return self.robust if isinstance(self.robust, Robust) else None
 
     @property
     def linear(self) -> bool:
         """Whether linearising it again elsewhere gives the same."""
-        return isinstance(self.measured, Measurements) and self.robust is None
+        return isinstance(self.measured, Measurements) and self.loss is None
 
     @property
     def state_dim(self) -> int:
@@ -93,10 +102,7 @@ class Sighting:
         x = mean[layout.spans(rows)]
         residual, H = self._residual(x)
         z = measured.z if isinstance(measured, Measurements) else residual + (H @ x[:, :, None])[:, :, 0]
-        w = self.weights
-        if w is None:
-            w = np.ones(len(rows)) if self.robust is None else self.robust.weight(_distances(residual, measured.R))
-        root = np.sqrt(w)
+        root = np.sqrt(self.counted(layout, mean))
         return LinearRows(rows, root[:, None] * z, root[:, None, None] * H, measured.R)
 
     def distances(self, layout: Layout, mean: FloatArray) -> FloatArray:
@@ -104,7 +110,13 @@ class Sighting:
         residual, _ = self._residual(mean[layout.spans(layout.rows(self.measured.nodes))])
         return _distances(residual, self.measured.R)
 
-    def weighted(self, weights: FloatArray | None) -> Sighting:
+    def counted(self, layout: Layout, mean: FloatArray) -> FloatArray:
+        """(m,) the weight of each measurement at the joint state `mean`."""
+        if self.weights is not None:
+            return self.weights
+        return np.ones(len(self.measured)) if self.loss is None else self.loss.weight(self.distances(layout, mean))
+
+    def weighted(self, weights: FloatArray) -> Sighting:
         """The same with fixed weights."""
         return replace(self, weights=weights)
 

@@ -1,4 +1,4 @@
-"""What a smoother says of one moment: the marginals of its nodes, given everything measured before and after."""
+"""What a smoother answers: the marginals of a moment's nodes, given everything measured before and after."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
-from saga_fg.estimators.backward import SmoothedCovariance
+from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,7 @@ class Smoothed:
     time: float
     layout: Layout
     state: FloatArray
-    P: SmoothedCovariance | None = None
+    P: SmoothedCovariance | MarginalCovariances | None = None
 
     @property
     def nodes(self) -> IntArray:
@@ -49,7 +51,48 @@ class Smoothed:
         """Joint covariance of some nodes, in the order given, of any sizes."""
         return self._covariance().joint(self.layout.rows(nodes))
 
-    def _covariance(self) -> SmoothedCovariance:
+    def _covariance(self) -> SmoothedCovariance | MarginalCovariances:
         if self.P is None:
             raise InputError("covariances: only means were smoothed; ask for covariances")
         return self.P
+
+
+@dataclass(frozen=True, eq=False)
+class Newest:
+    """The filter's posterior of the nodes that are there now; the methods are those of `Estimator`.
+
+    layout of those nodes; x of these and of the ones that go after this moment
+    """
+
+    layout: Layout
+    x: BlockGaussian
+
+    def mean(self, nodes: ArrayLike) -> FloatArray:
+        mean: FloatArray = self.x.mean[self.x.layout.spans(self._rows(nodes))]
+        return mean
+
+    def covariance(self, nodes: ArrayLike) -> FloatArray:
+        rows = self._rows(nodes)
+        self.x.layout.spans(rows)
+        return self.x.covariances(rows)
+
+    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
+        mean: FloatArray = self.x.mean[self.x.layout.places(self._rows(nodes))]
+        return mean
+
+    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
+        return self.x.joint(self._rows(nodes))
+
+    def _rows(self, nodes: ArrayLike) -> IntArray:
+        rows = self.layout.rows(nodes)
+        return rows if len(self.layout) == len(self.x.layout) else self.x.layout.rows(self.layout.nodes[rows])
+
+
+def smoothed_moments(recording: Recording, covariances: bool, joint: bool) -> tuple[Smoothed, ...]:
+    """Every moment of a recording, oldest first."""
+    means = recording.means()
+    P = recording.covariances(joint) if covariances else [None] * len(means)
+    return tuple(
+        Smoothed(moment.time, layout, mean, covariance)
+        for moment, layout, mean, covariance in zip(recording.moments, recording.layouts, means, P, strict=True)
+    )

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 
+import gtsam
 import numpy as np
 import pytest
 from estimator_programs import (
@@ -33,6 +34,7 @@ ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
     pytest.param("saga_fg.estimators:FixedLagSmoother(0.0)", id="fixed-lag-0"),
     pytest.param("saga_fg.estimators:FixedLagSmoother(1.0)", id="fixed-lag"),
+    pytest.param("saga_fg.estimators:BatchSmoother()", id="batch"),
 ]
 TOLERANCE = 1e-9
 
@@ -52,6 +54,15 @@ def recipe(request):
 def maker(recipe):
     module, expression = recipe.split(":")
     return lambda: eval(expression, vars(__import__(module, fromlist=["_"])))
+
+
+SMOOTHERS = [kind for kind in ESTIMATORS if hasattr(maker(kind.values[0])(), "smoothed")]
+
+
+@pytest.fixture(params=SMOOTHERS)
+def make_smoother(request):
+    """Makes fresh estimators of those kinds that tell of earlier moments too."""
+    return maker(request.param)
 
 
 def assert_equal(estimator, textbook, tolerance=TOLERANCE):
@@ -166,6 +177,41 @@ def test_numbers_without_a_digit_left_do_no_harm(make, seed):
         assert np.array_equal(estimator.joint_covariance(nodes), before[1])
     estimator.marginalise(nodes)
     in_step([births(rng, [901, 902], CAR), Update(measured([901]))], estimator)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_every_moment_is_smoothed_as_by_rauch_tung_striebel(make_smoother, seed):
+    """Of those in the smoother's window, after every operation of a random program."""
+    smoother, textbook = make_smoother(), TextbookEstimator()
+    for operation in random_program(np.random.default_rng(200 + seed), moments=6):
+        operation.run(smoother)
+        operation.run(textbook)
+        moments = smoother.smoothed()
+        assert len(moments) > 0
+        for moment, reference in zip(moments[::-1], textbook.smoothed()[::-1], strict=False):
+            assert set(reference) <= set(moment.nodes.tolist())
+            for node, (mean, P) in reference.items():
+                assert np.abs((moment.mean([node])[0] - mean) / np.sqrt(np.diag(P))).max() <= TOLERANCE
+                assert np.linalg.norm(moment.covariance([node])[0] - P) <= TOLERANCE * np.linalg.norm(P)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
+    """GTSAM's own optimiser, from zero. Its arithmetic agrees to 1e-7 of a standard deviation."""
+    estimator, _ = run(random_program(np.random.default_rng(seed), moments=5), make())
+    equivalent = estimator.graph()
+    start = gtsam.Values()
+    for key in equivalent.values.keys():  # noqa: SIM118 -- gtsam.Values is no dict
+        start.insert(key, np.zeros_like(equivalent.values.atVector(key)))
+    settings = gtsam.GaussNewtonParams()
+    settings.setLinearSolverType("MULTIFRONTAL_QR")
+    solved = gtsam.GaussNewtonOptimizer(equivalent.graph, start, settings).optimize()
+    marginals = gtsam.Marginals(equivalent.graph, solved, gtsam.Marginals.Factorization.QR)
+    for node in estimator.nodes.tolist():
+        key, P = equivalent.keys[-1][node], estimator.covariance([node])[0]
+        for values in (solved, equivalent.values):
+            assert np.abs((values.atVector(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 1e-7
+        assert np.linalg.norm(marginals.marginalCovariance(key) - P) < 1e-7 * np.linalg.norm(P)
 
 
 def test_any_subset_in_any_order_can_be_read(make):

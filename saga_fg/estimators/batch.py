@@ -1,0 +1,183 @@
+"""The batch smoother: a whole recording, every state given everything measured.
+
+All factors since the start are solved at once, with the means and covariances of every node at every moment. Robust
+losses are solved by iteratively reweighted least squares, or by graduated non-convexity, which finds outliers without
+a good start (`saga_fg.estimators.graduated`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors import Robust
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.estimators.factor_graph import FactorGraph
+from saga_fg.estimators.graduated import GraduatedNonConvexity
+from saga_fg.estimators.moment import Moment
+from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
+from saga_fg.estimators.sighting import Observations, Sighting
+from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
+from saga_fg.transition import Transition
+
+log = logging.getLogger(__name__)
+
+_MAX_STAGES = 200  # of graduated non-convexity
+
+
+class BatchSmoother:
+    """The exact smoother over everything. See `saga_fg.estimators.protocol.Estimator` for the methods.
+
+    settings     of Gauss-Newton, for what is nonlinear or robust
+    likelihoods  whether `update` returns the likelihood of what it takes in; without, nothing is computed before an
+                 estimate is asked for, and `update` returns NaN
+
+    `mean`, `covariance` and their like speak of the newest moment, `smoothed` of all moments.
+    """
+
+    def __init__(self, settings: GaussNewtonSettings | None = None, likelihoods: bool = True) -> None:
+        self._recording = Recording(settings, lazy=not likelihoods)
+        self._graduated = True  # whether the weights of graduated non-convexity are those of the whole recording
+
+    @property
+    def time(self) -> float:
+        """Of the newest moment: the sum of all intervals, s."""
+        return self._recording.time
+
+    @property
+    def nodes(self) -> IntArray:
+        return self._recording.layout.nodes
+
+    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+        self._recording.add(nodes, means, covariances)
+
+    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
+        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
+        self._recording.move(Motion(transition, tuple(nonlinear)))
+
+    def update(
+        self,
+        measurements: Measurements | Observations,
+        time: float | None = None,
+        robust: Robust | GraduatedNonConvexity | None = None,
+    ) -> float:
+        """Take in measurements made at `time` (s, on the smoother's clock), None for now.
+
+        An interval that contains `time` is split: its recorded graph is discretised anew over both parts. Returns the
+        log-likelihood of the measurements given all taken in before; where something is nonlinear or robust, that of
+        the linearisation.
+        """
+        likelihood = self._recording.see(Sighting(measurements, robust), time)
+        self._graduated &= not isinstance(robust, GraduatedNonConvexity)
+        return likelihood
+
+    def marginalise(self, nodes: ArrayLike) -> None:
+        self._recording.leave(nodes)
+
+    def mean(self, nodes: ArrayLike) -> FloatArray:
+        return self._newest().mean(nodes)
+
+    def covariance(self, nodes: ArrayLike) -> FloatArray:
+        return self._newest().covariance(nodes)
+
+    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
+        return self._newest().joint_mean(nodes)
+
+    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
+        return self._newest().joint_covariance(nodes)
+
+    def smoothed(self, covariances: bool = True, joint: bool = False) -> tuple[Smoothed, ...]:
+        """Every moment, oldest first.
+
+        Without `covariances` means only, which costs much less; with `joint` the joint covariances of each moment's
+        nodes too, which takes more memory.
+        """
+        self._graduate()
+        return smoothed_moments(self._recording, covariances, joint)
+
+    def weights(self) -> list[list[FloatArray]]:
+        """For each moment, for each of its updates, (m,) how much each measurement counts: 1 fully, 0 not at all."""
+        self._graduate()
+        moments, layouts, means = self._recording.moments, self._recording.layouts, self._recording.means()
+        return [
+            [sighting.counted(layout, mean) for sighting in moment.sightings]
+            for moment, layout, mean in zip(moments, layouts, means, strict=True)
+        ]
+
+    def graph(self) -> FactorGraph:
+        """The recording as a GTSAM graph; outliers found by graduated non-convexity count by their weights."""
+        self._graduate()
+        return self._recording.graph()
+
+    def snapshot(self) -> tuple[RecordingState, bool]:
+        """The whole state, as a value."""
+        return self._recording.snapshot(), self._graduated
+
+    def restore(self, state: tuple[RecordingState, bool]) -> None:
+        """Continue from a snapshot, bit-identically."""
+        recording, self._graduated = state
+        self._recording.restore(recording)
+
+    def _newest(self) -> Newest:
+        self._graduate()
+        return Newest(self._recording.layout, self._recording.newest())
+
+    def _graduate(self) -> None:
+        """Find the weights of graduated non-convexity, from all ones."""
+        if self._graduated:
+            return
+        losses = {sighting.robust for sighting in _sightings(self._recording.moments)}
+        kinds = [loss for loss in losses if isinstance(loss, GraduatedNonConvexity)]
+        weights = {loss: np.ones(len(self._distances(loss))) for loss in kinds}
+        self._weigh(weights)
+        distances = {loss: self._distances(loss) for loss in kinds}
+        mu: dict[GraduatedNonConvexity, float | None] = {loss: loss.first(distances[loss]) for loss in kinds}
+        for stage in range(_MAX_STAGES):
+            before = weights
+            weights = {loss: loss.weights(loss.last if at is None else at, distances[loss]) for loss, at in mu.items()}
+            settled = all(at is None for at in mu.values())
+            if settled and all(np.abs(weights[loss] - before[loss]).max(initial=0.0) < 1e-6 for loss in kinds):
+                break
+            self._weigh(weights)
+            distances = {loss: self._distances(loss) for loss in kinds}
+            mu = {loss: at if at is None else loss.next(at, weights[loss]) for loss, at in mu.items()}
+            log.debug("stage %d of graduated non-convexity: mu %s", stage + 1, list(mu.values()))
+        else:
+            log.warning("graduated non-convexity has not settled in %d stages", _MAX_STAGES)
+        self._graduated = True
+
+    def _distances(self, loss: GraduatedNonConvexity) -> FloatArray:
+        """Of all residuals under this loss, standard deviations."""
+        moments, layouts, means = self._recording.moments, self._recording.layouts, self._recording.means()
+        parts = [
+            sighting.distances(layout, mean)
+            for moment, layout, mean in zip(moments, layouts, means, strict=True)
+            for sighting in moment.sightings
+            if sighting.robust == loss
+        ]
+        return np.concatenate([np.empty(0), *parts])
+
+    def _weigh(self, weights: dict[GraduatedNonConvexity, FloatArray]) -> None:
+        """Set the weights of all measurements under each loss, in their order."""
+        used = dict.fromkeys(weights, 0)
+        moments: list[Moment] = []
+        for moment in self._recording.moments:
+            sightings = []
+            for sighting in moment.sightings:
+                loss, count = sighting.robust, len(sighting.measured)
+                if isinstance(loss, GraduatedNonConvexity):
+                    sighting = sighting.weighted(weights[loss][used[loss] : used[loss] + count])
+                    used[loss] += count
+                sightings.append(sighting)
+            moments.append(replace(moment, sightings=tuple(sightings)))
+        self._recording.reweigh(moments)
+
+
+def _sightings(moments: Sequence[Moment]) -> Iterable[Sighting]:
+    return (sighting for moment in moments for sighting in moment.sightings)
