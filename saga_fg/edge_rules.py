@@ -22,6 +22,7 @@ from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVel
 from saga_fg.scene_graph import Edges, SceneGraph
 from saga_fg.settings import require_between, require_positive, setting, settings_group
 
+_MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
 
@@ -132,7 +133,8 @@ def build_graph(
                     name = type(rule.interaction).__name__
                     groups.append(Edges(name, t, s, rate[mine], *rule.interaction.triples(nodes, t, s)))
                     np.add.at(total_rate, t, rate[mine])
-    return SceneGraph(nodes.id, nodes.types, tuple(groups), np.exp(-explained_noise * total_rate))
+    scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
+    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale)
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:

@@ -77,9 +77,8 @@ class GreedyTracker:
         position, velocity = boxes.position[:, :2], boxes.velocity.copy()
         anchor, anchor_time = position.copy(), np.full(len(boxes), now)
         elapsed = now - memory.anchor_time[match[seen]]
-        young = (
-            elapsed < self.settings.baseline - 1e-6
-        )  # the anchor is too young for a difference: detections are noisy
+        # where the anchor is too young for a difference, since detections are noisy, the velocity stays
+        young = elapsed < max(self.settings.baseline - 1e-6, 1e-6)
         moved = (position[seen] - memory.anchor[match[seen]]) / np.maximum(elapsed, 1e-6)[:, None]
         difference = np.where(young[:, None], memory.velocity[match[seen]], moved)
         velocity[seen] = np.where(np.isfinite(velocity[seen]), velocity[seen], difference)

@@ -76,7 +76,8 @@ class TrackerSettings:
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
 
     def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "max_delay", "report_coasting")
+        require_between(self, 0, math.inf, "explained_noise", "max_delay", "report_coasting")
+        require_positive(self, "max_out_of_view", infinite=True)
 
 
 @dataclass(frozen=True)
@@ -93,4 +94,5 @@ class GreedySettings:
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1, "min_score")
+        require_between(self, 0, math.inf, "baseline")
         require_positive(self, "max_coasting", infinite=True)

@@ -276,6 +276,23 @@ def test_the_order_of_the_nodes_does_not_matter(seed, dt):
     assert np.allclose(Q[np.ix_(places, places)], Q_permuted, rtol=1e-12, atol=1e-12)
 
 
+@given(seeds, st.floats(0.01, 5))
+def test_scaled_diffusion_is_scaled_noise(seed, dt):
+    rng = np.random.default_rng(seed)
+    graph = random_graph(rng, random_types(rng, 5))
+    scale = rng.uniform(0.1, 3, 5)
+    scaled = SceneGraph(graph.nodes, graph.types, graph.edges, scale)
+    F, b, Q = dense(discretise(graph, dt))
+    F_scaled, b_scaled, Q_scaled = dense(discretise(scaled, dt))
+    by_component = np.repeat(scale, graph.dims)
+    assert np.allclose(F_scaled, F, rtol=1e-12, atol=1e-13)
+    assert np.allclose(b_scaled, b, rtol=1e-12, atol=1e-13)
+    assert np.allclose(Q_scaled, by_component[:, None] * Q, rtol=1e-10, atol=1e-14)
+    assert np.allclose(
+        joint_generator(scaled)[2], by_component[:, None] * joint_generator(graph)[2], rtol=1e-12, atol=0
+    )
+
+
 # laws of the shipped interactions
 
 

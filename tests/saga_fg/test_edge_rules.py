@@ -236,6 +236,19 @@ def test_weak_edges_and_edges_between_types_that_do_not_fit_are_left_out():
     assert [(g.target.tolist(), g.source.tolist()) for g in graph.edges] == [([2], [0])]
 
 
+def test_what_interactions_explain_is_noise_no_more():
+    nodes = table(*straight(3))
+    plain = build_graph(nodes, (Following(), Ring(rate=0.5)))
+    assert plain.diffusion_scale.tolist() == [1.0, 1.0, 1.0]
+    explained = build_graph(nodes, (Following(), Ring(rate=0.5)), explained_noise=2.0)
+    total = np.zeros(3)
+    for group in plain.edges:
+        np.add.at(total, group.target, group.rate)
+    assert explained.diffusion_scale == pytest.approx(np.exp(-2.0 * total))
+    assert build_graph(nodes, (), explained_noise=2.0).diffusion_scale.tolist() == [1.0, 1.0, 1.0]
+    assert (build_graph(nodes, (Ring(rate=1e6),), explained_noise=1e6).diffusion_scale > 0).all()
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_too_few_nodes_for_an_edge(n):
     nodes = table(*straight(n))

@@ -33,6 +33,18 @@ def test_velocity_is_the_detectors_or_else_the_difference_of_positions():
     assert GreedyTracker().step(frame(0.0, [(0, 0)])).boxes.velocity.tolist() == [[0.0, 0.0]]
 
 
+@pytest.mark.parametrize("baseline", [0.0, 0.2])
+def test_positions_too_close_in_time_give_no_velocity(baseline):
+    tracker = GreedyTracker(GreedySettings(baseline=baseline))
+    tracker.step(frame(0.0, [(0, 0)]))
+    assert tracker.step(frame(0.5, [(1, 0)])).boxes.velocity[0].tolist() == [2.0, 0.0]
+    at_once = tracker.step(frame(0.5, [(1.1, 0)], "camera"))
+    assert at_once.boxes.velocity[0].tolist() == [2.0, 0.0]
+    soon = tracker.step(frame(0.6, [(1.5, 0)]))
+    assert soon.boxes.velocity[0, 0] == pytest.approx(2.0 if baseline else 5.0)
+    assert tracker.step(frame(0.75, [(1.5, 0)])).boxes.velocity[0, 0] == pytest.approx(2.0 if baseline else 0.0)
+
+
 def test_the_strongest_detection_chooses_first():
     tracker = GreedyTracker()
     tracker.step(frame(0.0, [(0, 0)]))

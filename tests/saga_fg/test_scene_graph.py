@@ -84,6 +84,18 @@ def test_wrong_graphs_are_refused(nodes, types, groups, message):
         SceneGraph(nodes, types, groups)
 
 
+def test_diffusion_may_be_scaled_node_by_node():
+    assert SceneGraph.of([1, 2], CAR).diffusion_scale.tolist() == [1.0, 1.0]
+    assert SceneGraph([1, 2], (CAR, CAR), (), [0.5, 2.0]).diffusion_scale.tolist() == [0.5, 2.0]
+    for scale, message in (
+        ([0.5], r"diffusion_scale: expected shape \(2,\)"),
+        ([0.5, 0.0], r"diffusion_scale\[1\]: expected a factor > 0, got 0"),
+        ([np.nan, 1.0], r"diffusion_scale\[0\]: expected a finite number"),
+    ):
+        with pytest.raises(InputError, match=message):
+            SceneGraph([1, 2], (CAR, CAR), (), scale)
+
+
 def test_columns_are_read_only():
     assert not edges().rate.flags.writeable
     assert not edges().target.flags.writeable
