@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pipelines.cli.bench import bench_app
 from pipelines.cli.config import config
 from pipelines.cli.demo import demo
 from pipelines.cli.reporting import ReportingGroup
@@ -22,6 +23,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(track_app, name="track")
+app.add_typer(bench_app, name="bench")
 app.command()(simulate)
 app.command()(demo)
 app.command()(config)

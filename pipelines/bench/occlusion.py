@@ -1,0 +1,86 @@
+"""What the graph is worth where objects hide: `saga` against `kf` on simulated traffic.
+
+The process noise of both is fitted by likelihood, class by class, on scenes of other seeds than those they are compared
+on; they differ in nothing but the edges. The error is that of hidden objects, by the track that followed each when it
+was last seen, lost ones counted at a cap (`data_tools.metrics.scene`); the interval is a paired bootstrap over scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from data_tools.metrics import Interval, SceneMetrics, paired_bootstrap, scene_metrics
+from data_tools.sightings import sightings
+from data_tools.simulator import SimulatorSettings, simulate_scene
+from pipelines.config import Method, TrackConfig
+from pipelines.tracking import track_scene
+from saga_fg.learning import Sightings, fit_acceleration_noise
+from saga_fg.node import ConstantVelocity
+from saga_fg.sensor import DEFAULT
+
+METHODS: tuple[Method, Method] = ("kf", "saga")
+FEWEST_OBJECTS = 10  # a class with fewer has the noise of all objects together
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class OcclusionResult:
+    """Pooled metrics of each method, the relative change of the hidden objects' RMSE, and the fitted noise by class."""
+
+    metrics: dict[Method, SceneMetrics]
+    change: Interval
+    acceleration_noise: dict[str, float]
+    seeds: tuple[int, ...]
+    fit_seeds: tuple[int, ...]
+
+
+def occlusion(
+    config: TrackConfig,
+    seeds: Sequence[int],
+    fit_seeds: Sequence[int],
+    simulator: SimulatorSettings | None = None,
+    progress: Progress | None = None,
+) -> OcclusionResult:
+    """Fit on `fit_seeds`, compare on `seeds`."""
+    simulator = simulator or SimulatorSettings()
+    total = len(fit_seeds) + len(seeds)
+    objects: dict[str, list[Sightings]] = {}
+    for done, seed in enumerate(fit_seeds):
+        for label, found in sightings(simulate_scene(simulator, seed), config.sensors).items():
+            objects.setdefault(label, []).extend(found.values())
+        if progress is not None:
+            progress("fitting", done + 1, total)
+    noise = _fitted(objects)
+    config = with_acceleration_noise(config, noise)
+    metrics: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}
+    for done, seed in enumerate(seeds):
+        scene = simulate_scene(simulator, seed)
+        assert scene.ground_truth is not None
+        for method in METHODS:
+            tracked = track_scene(scene, config.new_tracker(method))
+            metrics[method].append(scene_metrics(scene.ground_truth, tracked.tracks))
+        if progress is not None:
+            progress("tracking", len(fit_seeds) + done + 1, total)
+    kf, saga = ([m.carried.square_sums for m in metrics[method]] for method in METHODS)
+    pooled = {method: SceneMetrics.pool(metrics[method]) for method in METHODS}
+    return OcclusionResult(pooled, paired_bootstrap(saga, kf), noise, tuple(seeds), tuple(fit_seeds))
+
+
+def with_acceleration_noise(config: TrackConfig, noise: dict[str, float]) -> TrackConfig:
+    """The configuration with constant velocity and this noise (m^2/s^3) for each class; `default` serves the rest."""
+    classes = dict(config.tracker.classes)
+    for label, q in noise.items():
+        motion = ConstantVelocity(acceleration_noise=q)
+        classes[label] = replace(classes.get(label, classes[DEFAULT]), motion=motion)
+    return replace(config, tracker=replace(config.tracker, classes=classes))
+
+
+def _fitted(objects: dict[str, list[Sightings]]) -> dict[str, float]:
+    everything = [found for same in objects.values() for found in same]
+    noise = {DEFAULT: fit_acceleration_noise(everything)}
+    for label, same in sorted(objects.items()):
+        if len(same) >= FEWEST_OBJECTS:
+            noise[label] = fit_acceleration_noise(same)
+    return noise

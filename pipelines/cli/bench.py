@@ -1,0 +1,79 @@
+"""`saga-fg bench`: benchmarks that print ratios to a baseline measured in the same run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import ReportingGroup, progress_bar
+
+bench_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
+
+Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
+
+
+@bench_app.callback()
+def bench() -> None:
+    """Measure: every figure is compared with a baseline in the same run."""
+
+
+@bench_app.command()
+def occlusion(
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes to compare on.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first of them.")] = 0,
+    fit_scenes: Annotated[int, typer.Option("--fit-scenes", min=1, help="Scenes the process noise is fitted on.")] = 6,
+    fit_seed: Annotated[int, typer.Option("--fit-seed", min=0, help="Seed of the first of those.")] = 1000,
+    json_file: Json = None,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """What the graph is worth where objects hide, on simulated traffic.
+
+    Both methods have the process noise that is most likely on the fitting scenes, and differ in the edges alone. An
+    object is hidden when no sensor sees it; a lost one counts with an error of 5 m.
+
+    \b
+    Examples:
+      saga-fg bench occlusion
+      saga-fg bench occlusion --scenes 20 --seed 100 --json figures.json
+    """
+    from data_tools.atomic_files import write_text
+    from pipelines.bench.occlusion import occlusion as run
+    from pipelines.config import load_config
+    from saga_fg.errors import InputError
+
+    fit_seeds, seeds = range(fit_seed, fit_seed + fit_scenes), range(seed, seed + scenes)
+    if set(fit_seeds) & set(seeds):
+        raise InputError(f"--fit-seed {fit_seed}: expected other scenes to fit on than to compare on")
+    with progress_bar() as progress:
+        result = run(load_config("simulated", config), seeds, fit_seeds, progress=progress)
+    table = Table(title=f"hidden objects in {scenes} simulated scenes", title_justify="left")
+    for column in ("method", "RMSE, m", "mean, m", "median, m", "in view: RMSE, m", "MOTA", "ID switches"):
+        table.add_column(column, justify="left" if column == "method" else "right")
+    for method, m in result.metrics.items():
+        errors = (m.carried.rmse, m.carried.mean, m.carried.median, m.position.rmse, m.mota)
+        table.add_row(method, *(f"{x:.3f}" for x in errors), str(m.switches))
+    Console().print(table)
+    noise = ", ".join(f"{label} {q:.3g}" for label, q in result.acceleration_noise.items())
+    typer.echo(f"acceleration noise fitted on {fit_scenes} other scenes, m^2/s^3: {noise}")
+    change = result.change
+    typer.echo(
+        f"RMSE of hidden objects, saga against kf: {100 * change.estimate:+.1f} % "
+        f"({100 * change.confidence:.0f} % interval {100 * change.low:+.1f} to {100 * change.high:+.1f} %)"
+    )
+    if json_file is not None:
+        figures = {
+            "seeds": result.seeds,
+            "fit_seeds": result.fit_seeds,
+            "acceleration_noise": result.acceleration_noise,
+            "hidden_rmse": {method: m.carried.rmse for method, m in result.metrics.items()},
+            "hidden_median": {method: m.carried.median for method, m in result.metrics.items()},
+            "change": {"estimate": change.estimate, "low": change.low, "high": change.high},
+        }
+        write_text(json_file, json.dumps(figures, indent=1) + "\n")
