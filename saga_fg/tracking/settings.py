@@ -5,12 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
+import numpy as np
+
+from saga_fg.arrays import FloatArray, StrArray
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
 from saga_fg.node import ConstantAcceleration, ConstantVelocity
 from saga_fg.sensor import DEFAULT
 from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,18 @@ class ClassSettings:
         require_positive(self, "max_distance", "max_coasting", infinite=True)
         if self.gate == 1:
             raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
+
+
+def settings_of(classes: Mapping[str, ClassSettings], label: str) -> ClassSettings:
+    """The settings of a class: its own, else those named default."""
+    return classes.get(label) or classes.get(DEFAULT) or ClassSettings()
+
+
+def class_values(classes: Mapping[str, ClassSettings], name: str, label: StrArray) -> FloatArray:
+    """(n,) the setting `name` of each label's class."""
+    distinct, index = np.unique(label, return_inverse=True)
+    values = np.array([getattr(settings_of(classes, str(c)), name) for c in distinct], dtype=np.float64)
+    return values[index] if len(label) else np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -70,13 +88,15 @@ class TrackerSettings:
     explained_noise: float = setting(
         0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
     )
+    estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
+    lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
     max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
 
     def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "explained_noise", "max_delay", "report_coasting")
+        require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting")
         require_positive(self, "max_out_of_view", infinite=True)
 
 

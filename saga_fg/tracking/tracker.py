@@ -10,26 +10,23 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import NamedTuple
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.association import Matching, assign, gate, mahalanobis
 from saga_fg.boxes import Boxes
-from saga_fg.discretisation import discretise
 from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.errors import InputError
-from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.frame import Frame
-from saga_fg.interactions import POSITION, VELOCITY, NodeTable
-from saga_fg.node import Motion, NodeType
+from saga_fg.interactions import NodeTable
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.track import Tracks
 from saga_fg.tracking.box_filter import BoxFilter
-from saga_fg.tracking.settings import ClassSettings, TrackerSettings
-from saga_fg.tracking.suppression import strongest
+from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
+from saga_fg.tracking.observation import Observed, observe
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 
 log = logging.getLogger(__name__)
 
@@ -55,30 +52,6 @@ class _Columns:
         return _Columns(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
-class _Kinematics(NamedTuple):
-    """Of n tracks, in local coordinates: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2)."""
-
-    position: FloatArray
-    velocity: FloatArray
-    P: FloatArray
-    P_velocity: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Observed:
-    """The usable detections of a frame, in local coordinates, with all that the sensor's model says of them."""
-
-    boxes: Boxes
-    probability: FloatArray
-    R: FloatArray
-    R_velocity: FloatArray
-    z_noise: FloatArray
-    yaw_noise: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.boxes)
-
-
 class Tracker:
     """Tracks all objects of one scene. `step(frame)` takes a frame of any sensor and returns the tracks at its time.
 
@@ -86,8 +59,9 @@ class Tracker:
     sensors   models by sensor name; the entry named "default" serves all others
     rules     edge rules, in place of `settings.edges`
 
-    A frame older than the newest one by up to `settings.max_delay` is used, its measurements moved to the present along
-    the objects' own motion; an older one is left out and counted in `late_frames`.
+    A frame older than the newest one by up to `max_delay` is used: the fixed-lag estimator puts its measurements where
+    they belong, a filter moves them to the present along the objects' own motion. An older one is left out and counted
+    in `late_frames`.
     """
 
     def __init__(
@@ -101,17 +75,17 @@ class Tracker:
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.late_frames = 0
         self.graph: SceneGraph | None = None  # of the latest interval
-        self._estimator = JointKalmanFilter()
+        self._state = JointTrackState(
+            new_estimator(self.settings.estimator, self.settings.lag), lambda label: self.class_settings(label).motion
+        )
         self._time = -math.inf  # of the state; no frame yet
         self._origin = np.zeros(2)
-        self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
         self._next_id = 1
         none = np.empty(0)
         self._columns = _Columns(
             np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none, none, none.astype(bool)
         )
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
-        self._kinematics_now: _Kinematics | None = None  # until the estimator's state changes
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far."""
@@ -122,14 +96,13 @@ class Tracker:
         if len(self._columns.id) == 0:
             self._origin = _origin(frame)
         delay = max(0.0, self._time - timestamp)
-        if delay > self.settings.max_delay:
+        if delay > self.max_delay:
             self.late_frames += 1
             log.warning("frame of %s at %.3f s comes %.3f s late and is left out", frame.sensor, timestamp, delay)
             return self._report(self._time)
         before = self._time
         self._predict(max(timestamp, self._time))
-        world_T_sensor = None if frame.world_T_ego is None else frame.world_T_ego @ sensor.extrinsics.ego_T_sensor
-        observed = self._observe(frame, sensor, world_T_sensor)
+        observed = observe(frame, sensor, self.settings.classes)
         matching = self._associate(observed, delay)
         self._update(observed, matching, delay)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
@@ -148,14 +121,13 @@ class Tracker:
             return Tracks.empty(timestamp)
         if timestamp <= self._time:
             return self._report(timestamp)
-        state, box, now, graph = self._estimator.snapshot(), self._box, self._time, self.graph
+        state, box, now, graph = self._state.snapshot(), self._box, self._time, self.graph
         self._box = box.select(np.arange(len(box.z)))
         try:
             self._predict(timestamp)
             return self._report(timestamp)
         finally:
-            self._kinematics_now = None
-            self._estimator.restore(state)
+            self._state.restore(state)
             self._box, self._time, self.graph = box, now, graph
 
     def sensor(self, name: str) -> Sensor:
@@ -164,8 +136,13 @@ class Tracker:
 
     def class_settings(self, label: str) -> ClassSettings:
         """The settings of a class."""
-        classes = self.settings.classes
-        return classes.get(label) or classes.get(DEFAULT) or ClassSettings()
+        return settings_of(self.settings.classes, label)
+
+    @property
+    def max_delay(self) -> float:
+        """How late a frame may come and still be used, s."""
+        settings = self.settings
+        return max(settings.max_delay, settings.lag) if settings.estimator == "fixed-lag" else settings.max_delay
 
     # one frame, step by step
 
@@ -173,45 +150,17 @@ class Tracker:
         dt = timestamp - self._time
         if dt > 0 and len(self._columns.id):
             graph = build_graph(self._nodes(), self.rules, explained_noise=self.settings.explained_noise)
-            self._estimator.predict(discretise(graph, dt))
-            self._kinematics_now = None
+            self._state.predict(graph, dt)
             self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
             self.graph = graph
         self._time = timestamp
 
-    def _observe(self, frame: Frame, sensor: Sensor, world_T_sensor: FloatArray | None) -> _Observed:
-        detections = frame.detections
-        if frame.coordinates == "sensor":
-            assert world_T_sensor is not None
-            detections = detections.transformed(world_T_sensor)
-        elif frame.coordinates == "ego":
-            assert frame.world_T_ego is not None
-            detections = detections.transformed(frame.world_T_ego)
-        probability = sensor.probability(detections.score)
-        keep = np.flatnonzero(probability >= self._of_class("min_score", detections.boxes.label))
-        apart = self._of_class("duplicate_distance", detections.boxes.label[keep])
-        keep = keep[strongest(detections.boxes.select(keep), probability[keep], apart)]
-        boxes, probability = detections.boxes.select(keep), probability[keep]
-        # where the sensor stood is unknown without a pose, and so is the range: its part of the noise is left out
-        place = boxes.position[:, :2] if world_T_sensor is None else world_T_sensor[:2, 3]
-        known_yaw = np.isfinite(boxes.yaw)
-        return _Observed(
-            boxes,
-            probability,
-            sensor.position_covariance(boxes.label, boxes.position[:, :2], probability, place),
-            sensor.velocity_covariance(boxes.label, probability)
-            if sensor.use_velocity
-            else np.full((len(boxes), 2, 2), np.nan),
-            sensor.deviations(boxes.label, "height"),
-            np.where(known_yaw, sensor.deviations(boxes.label, "yaw"), UNKNOWN_YAW_NOISE),
-        )
-
-    def _associate(self, observed: _Observed, delay: float) -> Matching:
+    def _associate(self, observed: Observed, delay: float) -> Matching:
         """Class by class, the assignment of least cost on the joint filter's covariance, as of `delay` s ago."""
         columns = self._columns
         tracks, detections, distances = [], [], []
         if len(columns.id) and len(observed):
-            position, P = self._positions_before(delay)
+            position, P = self._state.positions_before(columns.id, columns.label, delay)
             measured = observed.boxes.position[:, :2] - self._origin
             for label in np.unique(columns.label):
                 t = np.flatnonzero(columns.label == label)
@@ -219,7 +168,7 @@ class Tracker:
                 if len(z) == 0:
                     continue
                 settings = self.class_settings(str(label))
-                d2, log_det = mahalanobis(position[t], P[t], measured[z], observed.R[z])
+                d2, log_det = mahalanobis(position[t], P[t], measured[z], observed.R[z, :2, :2])
                 apart = np.hypot(*np.moveaxis(measured[z][None] - position[t][:, None], -1, 0))
                 possible = (d2 < gate(settings.gate)) & (apart < settings.max_distance)
                 row, column = assign(d2 + log_det, possible, gate(settings.gate) + log_det.max(initial=0.0))
@@ -230,34 +179,11 @@ class Tracker:
             return Matching(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
         return Matching(np.concatenate(tracks), np.concatenate(detections), np.concatenate(distances))
 
-    def _update(self, observed: _Observed, matching: Matching, delay: float) -> None:
+    def _update(self, observed: Observed, matching: Matching, delay: float) -> None:
         columns, boxes = self._columns, observed.boxes
-        z = boxes.position[:, :2] - self._origin
-        fast = np.isfinite(np.concatenate([boxes.velocity, observed.R_velocity[:, 0]], axis=1)).all(axis=1)
-        for node_type, rows in self._by_type(columns.label[matching.track]):
-            for with_velocity in (True, False):
-                chosen = rows[fast[matching.detection[rows]] == with_velocity]
-                if len(chosen) == 0:
-                    continue
-                t, d = matching.track[chosen], matching.detection[chosen]
-                names = POSITION + VELOCITY if with_velocity else POSITION
-                H = node_type.selector(names)
-                R = observed.R[d]
-                value = z[d]
-                if with_velocity:
-                    R = np.concatenate(
-                        [
-                            np.concatenate([R, np.zeros((len(d), 2, 2))], axis=2),
-                            np.concatenate([np.zeros((len(d), 2, 2)), observed.R_velocity[d]], axis=2),
-                        ],
-                        axis=1,
-                    )
-                    value = np.concatenate([value, boxes.velocity[d]], axis=1)
-                if delay > 0:
-                    H, R = _moved_to_present(node_type, H, R, delay)
-                self._kinematics_now = None
-                self._estimator.update(Measurements(columns.id[t], value, H, R))
         t, d = matching.track, matching.detection
+        z = np.concatenate([boxes.position[d, :2] - self._origin, boxes.velocity[d]], axis=1)
+        self._state.update(columns.id[t], columns.label[t], z, observed.R[d], observed.with_velocity[d], delay)
         p = observed.probability[d]
         self._box.update(
             t, boxes.size[d], p, boxes.position[d, 2], observed.z_noise[d], boxes.yaw[d], observed.yaw_noise[d]
@@ -266,7 +192,7 @@ class Tracker:
             self._box.face_motion(self._kinematics()[1])
 
     def _believe(
-        self, observed: _Observed, matching: Matching, sensor: Sensor, frame: Frame, elapsed: float, delay: float
+        self, observed: Observed, matching: Matching, sensor: Sensor, frame: Frame, elapsed: float, delay: float
     ) -> None:
         """Existence: fewer odds for a miss where a detection was to be expected, more for a match by its score.
 
@@ -295,7 +221,7 @@ class Tracker:
         columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
 
-    def _bear(self, observed: _Observed, matching: Matching, delay: float) -> None:
+    def _bear(self, observed: Observed, matching: Matching, delay: float) -> None:
         """New tracks from detections that no track explains; those of `delay` s ago have moved on since."""
         free = np.ones(len(observed), dtype=bool)
         free[matching.detection] = False
@@ -305,24 +231,14 @@ class Tracker:
         boxes, p = observed.boxes.select(born), observed.probability[born]
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
-        measured = np.isfinite(np.concatenate([boxes.velocity, observed.R_velocity[born, 0]], axis=1)).all(axis=1)
-        P_velocity = np.where(
-            measured[:, None, None], observed.R_velocity[born], self._birth_velocity_covariance(boxes)
+        measured, R = observed.with_velocity[born], observed.R[born]
+        start = Kinematics(
+            boxes.position[:, :2] - self._origin,
+            np.where(measured[:, None], boxes.velocity, 0.0),
+            R[:, :2, :2],
+            np.where(measured[:, None, None], R[:, 2:, 2:], self._birth_velocity_covariance(boxes)),
         )
-        velocity = np.where(measured[:, None], boxes.velocity, 0.0)
-        for node_type, rows in self._by_type(boxes.label):
-            mean = np.zeros((len(rows), node_type.dim))
-            P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
-            at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
-            mean[:, at_p] = boxes.position[rows, :2] - self._origin
-            mean[:, at_v] = velocity[rows]
-            P[:, at_p[:, None], at_p] = observed.R[born[rows]]
-            P[:, at_v[:, None], at_v] = P_velocity[rows]
-            if delay > 0:
-                F, Q = _own_motion(node_type, delay)
-                mean, P = mean @ F.T, F @ P @ F.T + Q
-            self._kinematics_now = None
-            self._estimator.add(ids[rows], mean, P)
+        self._state.add(ids, boxes.label, start, delay)
         seen, now = np.full(len(born), self._time - delay), np.full(len(born), self._time)
         self._columns = self._columns.extended(
             _Columns(ids, boxes.label, p.copy(), p.copy(), seen, now, p >= self.settings.existence.confirm)
@@ -351,8 +267,7 @@ class Tracker:
         dead |= self._time - columns.last_in_view > self.settings.max_out_of_view
         dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
         if dead.any():
-            self._kinematics_now = None
-            self._estimator.marginalise(columns.id[dead])
+            self._state.remove(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
 
     def _report(self, timestamp: float) -> Tracks:
@@ -376,51 +291,8 @@ class Tracker:
 
     # views on the state
 
-    def _type(self, label: str) -> NodeType:
-        motion = self.class_settings(label).motion
-        if motion not in self._types:
-            self._types[motion] = NodeType(type(motion).__name__, motion)
-        return self._types[motion]
-
-    def _by_type(self, label: StrArray) -> list[tuple[NodeType, IntArray]]:
-        """Rows of equal node type, with the type."""
-        classes, index = np.unique(label, return_inverse=True)
-        types = [self._type(str(c)) for c in classes]
-        distinct = list(dict.fromkeys(map(id, types)))
-        number = np.array([distinct.index(id(t)) for t in types], dtype=np.int64)[index]
-        by_id = {id(t): t for t in types}
-        return [(by_id[key], np.flatnonzero(number == k)) for k, key in enumerate(distinct)]
-
-    def _kinematics(self) -> _Kinematics:
-        """Of all tracks, local: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2)."""
-        if self._kinematics_now is None:
-            self._kinematics_now = self._read_kinematics()
-        return self._kinematics_now
-
-    def _read_kinematics(self) -> _Kinematics:
-        columns = self._columns
-        n = len(columns.id)
-        position, velocity = np.zeros((n, 2)), np.zeros((n, 2))
-        P, P_velocity = np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
-        for node_type, rows in self._by_type(columns.label):
-            mean, covariance = self._estimator.mean(columns.id[rows]), self._estimator.covariance(columns.id[rows])
-            at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
-            position[rows], velocity[rows] = mean[:, at_p], mean[:, at_v]
-            P[rows], P_velocity[rows] = covariance[:, at_p[:, None], at_p], covariance[:, at_v[:, None], at_v]
-        return _Kinematics(position, velocity, P, P_velocity)
-
-    def _positions_before(self, delay: float) -> tuple[FloatArray, FloatArray]:
-        """Of all tracks, local: positions (n, 2) `delay` s ago and their covariances (n, 2, 2)."""
-        if delay == 0:
-            position, _, P, _ = self._kinematics()
-            return position, P
-        columns = self._columns
-        position, P = np.zeros((len(columns.id), 2)), np.zeros((len(columns.id), 2, 2))
-        for node_type, rows in self._by_type(columns.label):
-            H, R = _moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
-            position[rows] = self._estimator.mean(columns.id[rows]) @ H.T
-            P[rows] = H @ self._estimator.covariance(columns.id[rows]) @ H.T + R
-        return position, P
+    def _kinematics(self) -> Kinematics:
+        return self._state.kinematics(self._columns.id, self._columns.label)
 
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them."""
@@ -430,7 +302,7 @@ class Tracker:
         return NodeTable(
             columns.id,
             columns.label,
-            tuple(self._type(str(c)) for c in columns.label),
+            tuple(self._state.type_of(str(c)) for c in columns.label),
             position,
             velocity,
             heading,
@@ -440,9 +312,7 @@ class Tracker:
 
     def _of_class(self, name: str, label: StrArray) -> FloatArray:
         """(n,) a class setting for each label."""
-        classes, index = np.unique(label, return_inverse=True)
-        values = np.array([getattr(self.class_settings(str(c)), name) for c in classes], dtype=np.float64)
-        return values[index] if len(label) else np.empty(0)
+        return class_values(self.settings.classes, name, label)
 
 
 def _origin(frame: Frame) -> FloatArray:
@@ -455,16 +325,3 @@ def _origin(frame: Frame) -> FloatArray:
     if len(frame):
         return np.round(frame.detections.boxes.position[0, :2])
     return np.zeros(2)
-
-
-def _moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
-    """A measurement `delay` s old as one of the present state, x(t - delay) = exp(-A delay) x(t) + noise."""
-    F, Q = _own_motion(node_type, delay)
-    H_past = H @ np.linalg.inv(F)
-    return H_past, R + H_past @ Q @ H_past.T
-
-
-def _own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
-    """F (d, d) and Q (d, d) of a node on its own over `dt` s."""
-    transition = discretise(SceneGraph.of([0], node_type), dt)
-    return transition.F[0].values[0], transition.Q[0].values[0]

@@ -1,0 +1,171 @@
+"""The joint kinematic state of all tracks: an estimator, seen through the classes and components of the tracker.
+
+Positions are local: the scene's origin is taken off before anything comes here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.discretisation import discretise
+from saga_fg.estimators import Estimator, FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.interactions import POSITION, VELOCITY
+from saga_fg.node import Motion, NodeType
+from saga_fg.scene_graph import SceneGraph
+from saga_fg.tracking.settings import EstimatorName
+
+
+class Kinematics(NamedTuple):
+    """Of n tracks: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2)."""
+
+    position: FloatArray
+    velocity: FloatArray
+    P: FloatArray
+    P_velocity: FloatArray
+
+
+def new_estimator(name: EstimatorName, lag: float) -> Estimator:
+    """A fresh estimator; `lag` (s) is the fixed-lag smoother's."""
+    if name == "isam2":
+        return IncrementalFilter()
+    return FixedLagSmoother(lag) if name == "fixed-lag" else JointKalmanFilter()
+
+
+class JointTrackState:
+    """Tracks by id and label over one estimator. `motion` gives the own motion of a class."""
+
+    def __init__(self, estimator: Estimator, motion: Callable[[str], Motion]) -> None:
+        self._estimator = estimator
+        self._motion = motion
+        self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
+        self._born: dict[int, float] = {}  # on the estimator's clock
+        self._kinematics: Kinematics | None = None  # until the state changes
+
+    def type_of(self, label: str) -> NodeType:
+        """The node type of a class."""
+        motion = self._motion(label)
+        if motion not in self._types:
+            self._types[motion] = NodeType(type(motion).__name__, motion)
+        return self._types[motion]
+
+    def add(self, ids: IntArray, label: StrArray, now: Kinematics, delay: float = 0.0) -> None:
+        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1."""
+        for node_type, rows in self._by_type(label):
+            mean = np.zeros((len(rows), node_type.dim))
+            P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
+            at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
+            mean[:, at_p], mean[:, at_v] = now.position[rows], now.velocity[rows]
+            P[:, at_p[:, None], at_p], P[:, at_v[:, None], at_v] = now.P[rows], now.P_velocity[rows]
+            if delay > 0:
+                F, Q = _own_motion(node_type, delay)
+                mean, P = mean @ F.T, F @ P @ F.T + Q
+            self._changed().add(ids[rows], mean, P)
+        self._born.update(dict.fromkeys(ids.tolist(), self._estimator.time))
+
+    def remove(self, ids: IntArray) -> None:
+        """Marginalise tracks: what they told of their neighbours stays."""
+        self._changed().marginalise(ids)
+        for track in ids.tolist():
+            del self._born[track]
+
+    def predict(self, graph: SceneGraph, dt: float) -> None:
+        """Move all tracks by `dt` s under the graph's dynamics."""
+        self._changed().predict(discretise(graph, dt))
+
+    def update(
+        self, ids: IntArray, label: StrArray, z: FloatArray, R: FloatArray, with_velocity: BoolArray, delay: float
+    ) -> None:
+        """Take in one measurement each of some tracks, made `delay` s ago.
+
+        z (k, 4) position and velocity, R (k, 4, 4); velocity counts where `with_velocity` (k,). A smoother puts a late
+        measurement where it belongs; a filter, one of a track born since, moves it to the present along own motion.
+        """
+        for node_type, of_type in self._by_type(label):
+            for velocity in (True, False):
+                rows = of_type[with_velocity[of_type] == velocity]
+                if len(rows) == 0:
+                    continue
+                k = 4 if velocity else 2
+                H = node_type.selector(POSITION + VELOCITY if velocity else POSITION)
+                self._measure(node_type, ids[rows], z[rows, :k], H, R[rows, :k, :k], delay)
+
+    def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
+        """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
+        if self._kinematics is None or len(self._kinematics.P) != len(ids):
+            self._kinematics = self._read(ids, label)
+        return self._kinematics
+
+    def positions_before(self, ids: IntArray, label: StrArray, delay: float) -> tuple[FloatArray, FloatArray]:
+        """Positions (n, 2) `delay` s ago, by own motion, and their covariances (n, 2, 2)."""
+        if delay == 0:
+            now = self.kinematics(ids, label)
+            return now.position, now.P
+        position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
+        for node_type, rows in self._by_type(label):
+            H, R = _moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
+            position[rows] = self._estimator.mean(ids[rows]) @ H.T
+            P[rows] = H @ self._estimator.covariance(ids[rows]) @ H.T + R
+        return position, P
+
+    def snapshot(self) -> Any:
+        """The state as a value."""
+        return self._estimator.snapshot(), dict(self._born)
+
+    def restore(self, snapshot: Any) -> None:
+        """Continue from a snapshot."""
+        state, self._born = snapshot
+        self._changed().restore(state)
+
+    def _measure(
+        self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
+    ) -> None:
+        estimator = self._changed()
+        if delay > 0 and isinstance(estimator, FixedLagSmoother):
+            then = estimator.time - delay
+            there = np.array([self._born[track] <= then for track in ids.tolist()]) & (then >= estimator.start)
+            if there.any():
+                estimator.update(Measurements(ids[there], z[there], H, R[there]), time=then)
+            ids, z, R = ids[~there], z[~there], R[~there]
+        if delay > 0:
+            H, R = _moved_to_present(node_type, H, R, delay)
+        estimator.update(Measurements(ids, z, H, R))
+
+    def _changed(self) -> Estimator:
+        self._kinematics = None
+        return self._estimator
+
+    def _by_type(self, label: StrArray) -> list[tuple[NodeType, IntArray]]:
+        """Rows of equal node type, with the type."""
+        classes, index = np.unique(label, return_inverse=True)
+        types = [self.type_of(str(c)) for c in classes]
+        distinct = list({id(t): t for t in types}.values())
+        number = np.array([next(k for k, d in enumerate(distinct) if d is t) for t in types], dtype=np.int64)[index]
+        return [(node_type, np.flatnonzero(number == k)) for k, node_type in enumerate(distinct)]
+
+    def _read(self, ids: IntArray, label: StrArray) -> Kinematics:
+        n = len(ids)
+        result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
+        for node_type, rows in self._by_type(label):
+            mean, covariance = self._estimator.mean(ids[rows]), self._estimator.covariance(ids[rows])
+            at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
+            result.position[rows], result.velocity[rows] = mean[:, at_p], mean[:, at_v]
+            result.P[rows] = covariance[:, at_p[:, None], at_p]
+            result.P_velocity[rows] = covariance[:, at_v[:, None], at_v]
+        return result
+
+
+def _moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
+    """A measurement `delay` s old as one of the present state, x(t - delay) = exp(-A delay) x(t) + noise."""
+    F, Q = _own_motion(node_type, delay)
+    H_past = H @ np.linalg.inv(F)
+    return H_past, R + H_past @ Q @ H_past.T
+
+
+def _own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
+    """F (d, d) and Q (d, d) of a node on its own over `dt` s."""
+    transition = discretise(SceneGraph.of([0], node_type), dt)
+    return transition.F[0].values[0], transition.Q[0].values[0]
