@@ -12,7 +12,7 @@ from pipelines.configuration import load_settings, read_settings
 from pipelines.tracking import OnlineTracker
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.settings import settings_group
-from saga_fg.tracking import GreedySettings, GreedyTracker, Tracker, TrackerSettings
+from saga_fg.tracking import EstimatorName, GreedySettings, GreedyTracker, Tracker, TrackerSettings
 
 Method = Literal["saga", "kf", "centerpoint"]
 Family = Literal["nuscenes", "kitti", "simulated", "file"]
@@ -27,6 +27,12 @@ class TrackConfig:
     sensors: Mapping[str, Sensor] = settings_group(
         lambda: {DEFAULT: Sensor()}, "models of the sensors by name; the entry named default serves all others"
     )
+
+    def with_estimator(self, estimator: EstimatorName | None, lag: float | None) -> TrackConfig:
+        """The same with another estimator and window (s); None leaves what is there."""
+        tracker = self.tracker
+        tracker = replace(tracker, estimator=estimator or tracker.estimator, lag=tracker.lag if lag is None else lag)
+        return replace(self, tracker=tracker)
 
     def new_tracker(self, method: Method) -> OnlineTracker:
         """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre)."""

@@ -11,6 +11,7 @@ from pipelines.cli.options import Config, Verbose, names, sensor_files
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import Summary
 from saga_fg.errors import InputError
+from saga_fg.tracking import EstimatorName
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -20,6 +21,19 @@ MethodOption = Annotated[
         "--method",
         help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
     ),
+]
+
+EstimatorOption = Annotated[
+    EstimatorName | None,
+    typer.Option(
+        "--estimator",
+        help="kalman: joint filter; isam2: the same as a factor graph; fixed-lag: smoother of the last seconds. All "
+        "give the same tracks, but a late frame goes where it belongs with fixed-lag alone.  [default: as configured]",
+    ),
+]
+LagOption = Annotated[
+    float | None,
+    typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
 ]
 
 
@@ -42,6 +56,8 @@ def nuscenes(
     ] = None,
     scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
     method: MethodOption = "saga",
+    estimator: EstimatorOption = None,
+    lag: LagOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -56,6 +72,8 @@ def nuscenes(
       saga-fg track nuscenes --dataroot data/nuscenes --scenes scene-0103 \\
           --detections lidar=a.json --detections camera=b.json \\
           --method kf --output tracks.json
+      saga-fg track nuscenes --dataroot data/nuscenes --scenes scene-0103 \\
+          --detections lidar=a.json --estimator fixed-lag --lag 3 --output tracks.json
     """
     from data_tools.nuscenes import NuScenes, split_scenes, write_tracking_results
     from pipelines.config import load_config
@@ -63,7 +81,7 @@ def nuscenes(
 
     if (split is None) == (scenes is None):
         raise InputError("expected either --split NAME or --scenes A,B")
-    settings = load_config("nuscenes", config)
+    settings = load_config("nuscenes", config).with_estimator(estimator, lag)
     chosen = split_scenes(dataroot, version, split) if split is not None else names("--scenes", scenes or "")
     dataset = NuScenes(dataroot, version, sensor_files(detections), chosen)
     summary = Summary(output)
@@ -84,6 +102,8 @@ def kitti(
         str | None, typer.Option("--sequences", help="Sequences with commas between them; all if left out.")
     ] = None,
     method: MethodOption = "saga",
+    estimator: EstimatorOption = None,
+    lag: LagOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -98,7 +118,7 @@ def kitti(
     from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
-    settings = load_config("kitti", config)
+    settings = load_config("kitti", config).with_estimator(estimator, lag)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
     summary = Summary(output)
     with progress_bar(len(dataset.scenes)) as progress:
@@ -115,6 +135,8 @@ def file(
         str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
     ] = None,
     method: MethodOption = "saga",
+    estimator: EstimatorOption = None,
+    lag: LagOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -132,7 +154,7 @@ def file(
     from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
-    settings = load_config("file", config)
+    settings = load_config("file", config).with_estimator(estimator, lag)
     dataset = read_detections(detections)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
     summary = Summary(output)

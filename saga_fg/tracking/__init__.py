@@ -1,7 +1,15 @@
 """Trackers: frames of detections in, tracks out."""
 
 from saga_fg.tracking.greedy import GreedyTracker
-from saga_fg.tracking.settings import ClassSettings, ExistenceSettings, GreedySettings, TrackerSettings
+from saga_fg.tracking.settings import ClassSettings, EstimatorName, ExistenceSettings, GreedySettings, TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 
-__all__ = ["ClassSettings", "ExistenceSettings", "GreedySettings", "GreedyTracker", "Tracker", "TrackerSettings"]
+__all__ = [
+    "ClassSettings",
+    "EstimatorName",
+    "ExistenceSettings",
+    "GreedySettings",
+    "GreedyTracker",
+    "Tracker",
+    "TrackerSettings",
+]
