@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
 from saga_fg.node import ConstantAcceleration, ConstantVelocity
 from saga_fg.sensor import DEFAULT
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
 
@@ -98,6 +98,7 @@ class TrackerSettings:
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting")
         require_positive(self, "max_out_of_view", infinite=True)
+        require_one_of(self, "estimator", get_args(EstimatorName))
 
 
 @dataclass(frozen=True)
