@@ -4,6 +4,7 @@ from saga_fg.estimators.batch import BatchSmoother
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.graduated import GraduatedNonConvexity
+from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.kalman import JointKalmanFilter
 from saga_fg.estimators.motion import NodeMotion
 from saga_fg.estimators.protocol import Estimator, Measurements
@@ -20,6 +21,7 @@ __all__ = [
     "GaussNewtonSettings",
     "Gaussian",
     "GraduatedNonConvexity",
+    "IncrementalFilter",
     "JointKalmanFilter",
     "Measurements",
     "NodeMotion",

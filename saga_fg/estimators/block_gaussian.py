@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
 
@@ -67,28 +67,23 @@ class BlockGaussian:
         partition, layout = self.partition, self.layout
         if partition.count == len(layout):
             return self
-        if self._tied().all():
-            return self
         node_of = np.repeat(np.arange(len(layout)), layout.dims)
         a, b = [], []
         for places, P in zip(partition.groups, self.blocks, strict=True):
             sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            k, i, j = np.nonzero(np.abs(P) > _UNCORRELATED * sigma[:, :, None] * sigma[:, None, :])
-            a.append(node_of[places[k, i]])
-            b.append(node_of[places[k, j]])
+            tied = np.abs(P) > _UNCORRELATED * sigma[:, :, None] * sigma[:, None, :]
+            node, (c, s) = node_of[places], places.shape
+            d = int(layout.dims[node[0, 0]])
+            if s % d == 0 and (layout.dims[node] == d).all():  # node by node where all are of one size
+                tied = np.asarray(tied.reshape(c, s // d, d, s // d, d).any(axis=(2, 4)))
+                node = node[:, ::d]
+            k, i, j = np.nonzero(tied)
+            a.append(node[k, i])
+            b.append(node[k, j])
         i, j = np.concatenate(a), np.concatenate(b)
         pairs = scipy.sparse.coo_array((np.ones(len(i), dtype=bool), (i, j)), shape=(len(layout), len(layout)))
         count, label = connected_components(pairs, directed=False)
         return self if count == partition.count else self.over(Partition(layout, label.astype(np.int64)))
-
-    def _tied(self) -> BoolArray:
-        """(n,) whether a node is correlated with the first of its component: a quick look."""
-        layout, d = self.layout, int(self.layout.dims.min())
-        tied = np.zeros(layout.size, dtype=bool)
-        for places, P in zip(self.partition.groups, self.blocks, strict=True):
-            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            tied[places] = (np.abs(P[:, :d]) > _UNCORRELATED * sigma[:, :d, None] * sigma[:, None, :]).any(axis=1)
-        return np.asarray(np.logical_or.reduceat(tied, layout.offsets[:-1]))
 
     def covariances(self, rows: IntArray) -> FloatArray:
         """(k, d, d) of the nodes at `rows`, whose states have equal size d."""

@@ -10,7 +10,9 @@ H P = R K^T, so that the measured rows are as exact as in Joseph's form.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -54,7 +56,8 @@ def correct(
         every = len(active) == len(partition.groups[number])
         P = blocks[number] if every else blocks[number][active]
         places = partition.groups[number] if every else partition.groups[number][active]
-        gain, P = _corrected(P, mean, places, component, at, z[members], H[members], R[members])
+        stacked = _stacked(P, mean, places, component, at, z[members], H[members], R[members])
+        gain, P = _corrected(P, places, stacked)
         gains.append(gain)
         mean[places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
         if not every:
@@ -67,7 +70,56 @@ def correct(
     return replace(x, mean=mean, blocks=tuple(blocks)), tuple(gains), log_likelihood
 
 
-def _corrected(
+def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> float:
+    """Log-likelihood of the innovation, as `correct` gives it, without correcting anything."""
+    likelihood = -0.5 * z.size * math.log(2 * math.pi)
+    for stacked in _stacks(x, x.mean, rows, z, H, R):
+        L = _innovation_root(stacked)
+        whitened = solve_lower(L, stacked.innovation)
+        log_det = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum()
+        likelihood -= 0.5 * float(np.vdot(whitened, whitened) + log_det)
+    return likelihood
+
+
+def posterior_likelihood(
+    x: BlockGaussian, prior_mean: FloatArray, rows: IntArray, z: FloatArray, H: FloatArray, log_det: float
+) -> float:
+    """Log-likelihood of the innovation from the posterior `x` and the mean before it, (D,).
+
+    z and H are whitened, R = 1, and log_det what that took. With v = z - H m the inverse of the innovation's covariance
+    is then T = 1 - H P H^T.
+    """
+    likelihood = -0.5 * (z.size * math.log(2 * math.pi) + log_det)
+    R = np.broadcast_to(np.eye(H.shape[1]), (len(rows), H.shape[1], H.shape[1]))
+    for stacked in _stacks(x, prior_mean, rows, z, H, R):
+        v, T = stacked.innovation, stacked.R - stacked.H_P @ np.swapaxes(stacked.H, 1, 2)
+        likelihood -= 0.5 * float(np.vdot(v, T @ v) - np.linalg.slogdet(T)[1].sum())
+    return likelihood
+
+
+class _Stacked(NamedTuple):
+    """Measurements of c components of equal size s, a values each (rows of zeros fill up).
+
+    H_P, H (c, a, s); R (c, a, a); innovation (c, a, 1)
+    """
+
+    H_P: FloatArray
+    H: FloatArray
+    R: FloatArray
+    innovation: FloatArray
+
+
+def _stacks(
+    x: BlockGaussian, mean: FloatArray, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
+) -> Iterator[_Stacked]:
+    """For each group of components; innovations from the joint state `mean`."""
+    for number, members, at in x.partition.members(rows, H.shape[2]):
+        active, component = np.unique(x.partition.row[rows[members]], return_inverse=True)
+        P, places = x.blocks[number][active], x.partition.groups[number][active]
+        yield _stacked(P, mean, places, component, at, z[members], H[members], R[members])
+
+
+def _stacked(
     P: FloatArray,
     mean: FloatArray,
     places: IntArray,
@@ -76,13 +128,13 @@ def _corrected(
     z: FloatArray,
     H: FloatArray,
     R: FloatArray,
-) -> tuple[Gain, FloatArray]:
-    """Gain and posterior covariance of c components P (c, s, s).
+) -> _Stacked:
+    """Of c components P (c, s, s) at `places` of the joint state.
 
     component (m,): the one that a measurement is of; at (m, d): the entries of its state that H sees.
     """
     (c, s, _), k = P.shape, H.shape[1]
-    slot = _rank(component)  # of a measurement among those of its component
+    slot = rank(component)  # of a measurement among those of its component
     most = int(slot.max()) + 1
     a = most * k
     row = slot[:, None] * k + np.arange(k)
@@ -96,21 +148,32 @@ def _corrected(
         empty[component[:, None], row] = False
         i, j = np.nonzero(empty)
         R_all[i, j, j] = 1.0
-    S = H_P @ np.swapaxes(H_all, 1, 2) + R_all
+    return _Stacked(H_P, H_all, R_all, innovation)
+
+
+def _innovation_root(stacked: _Stacked) -> FloatArray:
+    """L (c, a, a) of S = H P H^T + R = L L^T."""
+    S = stacked.H_P @ np.swapaxes(stacked.H, 1, 2) + stacked.R
     try:
-        L = np.asarray(np.linalg.cholesky((S + np.swapaxes(S, 1, 2)) / 2), dtype=np.float64)
+        return np.asarray(np.linalg.cholesky((S + np.swapaxes(S, 1, 2)) / 2), dtype=np.float64)
     except np.linalg.LinAlgError:
         raise InputError(
             f"measurements: their noise is lost in the rounding of what is predicted, variances up to {S.max():.3g}"
         ) from None
-    solved = solve_lower(L, np.concatenate([H_P, innovation], axis=2))
-    gain = Gain(places, H_all, L, solved[:, :, :-1], solved[:, :, -1])
+
+
+def _corrected(P: FloatArray, places: IntArray, stacked: _Stacked) -> tuple[Gain, FloatArray]:
+    """Gain and posterior covariance of c components P (c, s, s) at `places` of the joint state."""
+    L = _innovation_root(stacked)
+    solved = solve_lower(L, np.concatenate([stacked.H_P, stacked.innovation], axis=2))
+    gain = Gain(places, stacked.H, L, solved[:, :, :-1], solved[:, :, -1])
     posterior = P - np.swapaxes(gain.W, 1, 2) @ gain.W
     after, before = (np.diagonal(array, axis1=1, axis2=2) for array in (posterior, P))
     lost = (after < _CANCELLATION * before).any(axis=1)
     if lost.any():
         K_T = solve_lower(L[lost], gain.W[lost], transposed=True)
-        refined = posterior[lost] + np.swapaxes(K_T, 1, 2) @ (R_all[lost] @ K_T - H_all[lost] @ posterior[lost])
+        H, R = stacked.H[lost], stacked.R[lost]
+        refined = posterior[lost] + np.swapaxes(K_T, 1, 2) @ (R @ K_T - H @ posterior[lost])
         posterior[lost] = (refined + np.swapaxes(refined, 1, 2)) / 2
     return gain, posterior
 
@@ -127,7 +190,7 @@ def solve_lower(L: FloatArray, B: FloatArray, transposed: bool = False) -> Float
     return solved
 
 
-def _rank(label: IntArray) -> IntArray:
+def rank(label: IntArray) -> IntArray:
     """Running number of each entry among those of equal label."""
     order = np.argsort(label, kind="stable")
     ordered = label[order]

@@ -7,13 +7,13 @@ A component grows by the interactions that enter it; all of one size are predict
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
@@ -46,6 +46,24 @@ class Dynamics:
         b[layout.places(rows)] = transition.b
         return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
 
+    def only(self, rows: IntArray) -> Dynamics:
+        """Without the dynamics of all nodes but those at `rows`; itself if these are all."""
+        if len(rows) == len(self.layout):
+            return self
+        kept = np.zeros(len(self.layout), dtype=bool)
+        kept[rows] = True
+        return replace(self, F=_where(kept, self.F), Q=_where(kept, self.Q))
+
+    def restricted(self, rows: IntArray) -> Dynamics:
+        """Over the nodes at `rows` alone, ascending, who do not listen to others; itself if these are all."""
+        if len(rows) == len(self.layout):
+            return self
+        some = self.only(rows)
+        where = np.full(len(self.layout), -1)
+        where[rows] = np.arange(len(rows))
+        layout = Layout(self.layout.nodes[rows], self.layout.dims[rows])
+        return Dynamics(layout, _renamed(some.F, where), self.b[self.layout.places(rows)], _renamed(some.Q, where))
+
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
         """F (D, D), sparse."""
@@ -58,6 +76,11 @@ class Dynamics:
         target = np.concatenate([blocks.target for blocks in self.F])
         source = np.concatenate([blocks.source for blocks in self.F])
         return partition.joined(target, source)
+
+    def separated(self, x: BlockGaussian) -> BlockGaussian:
+        """`x` with components taken apart that have fallen apart, where no interaction of this interval ties them."""
+        tied = self.joined(Partition.apart(x.layout))
+        return x if tied.count == self.joined(x.partition).count else x.decoupled()
 
     def propagated(self, partition: Partition, blocks: BlockDiagonal) -> BlockDiagonal:
         """F X F^T of a block-diagonal symmetric X, over a partition whose components F does not leave."""
@@ -128,6 +151,14 @@ def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
     if not (np.isfinite(mean).all() and all(np.isfinite(block).all() for block in blocks)):
         raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
     return BlockGaussian(partition, mean, blocks)
+
+
+def _where(kept: BoolArray, groups: tuple[Blocks, ...]) -> tuple[Blocks, ...]:
+    """The blocks whose targets are kept."""
+    chosen = ((blocks, kept[blocks.target]) for blocks in groups)
+    return tuple(
+        Blocks(blocks.target[mine], blocks.source[mine], blocks.values[mine]) for blocks, mine in chosen if mine.any()
+    )
 
 
 def _renamed(groups: tuple[Blocks, ...], rows: IntArray) -> tuple[Blocks, ...]:

@@ -95,12 +95,12 @@ class Pass:
         self, gone: Sequence[int], motion: Motion | Standstill, mean: FloatArray | None = None
     ) -> tuple[Pass, BlockGaussian]:
         """With the dynamics to the next moment, linearised at the joint state `mean`; and the prior they lead to."""
-        x = self.staying(gone).decoupled()
+        x = self.staying(gone)
         at = x.mean
         if mean is not None:
             at = mean if len(mean) == len(at) else mean[self.layout.places(self.layout.rows(x.layout.nodes))]
         dynamics = motion.dynamics(x.layout, at)
-        return replace(self, dynamics=dynamics), predict(x, dynamics)
+        return replace(self, dynamics=dynamics), predict(dynamics.separated(x), dynamics)
 
 
 def arrival(prior: BlockGaussian) -> Pass:

@@ -57,6 +57,23 @@ class LinearRows(NamedTuple):
     R: FloatArray
 
 
+class WhitenedRows(NamedTuple):
+    """The same in units of its noise, R = 1; log_det: the sum of the logarithms of the determinants of R."""
+
+    rows: IntArray
+    z: FloatArray
+    H: FloatArray
+    log_det: float
+
+
+def whitened(seen: LinearRows) -> WhitenedRows:
+    """W z and W H, W R W^T = 1."""
+    L = np.linalg.cholesky(seen.R)
+    white = np.linalg.solve(L, np.concatenate([seen.H, seen.z[:, :, None]], axis=2))
+    log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+    return WhitenedRows(seen.rows, white[:, :, -1], white[:, :, :-1], log_det)
+
+
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """Measurements as an estimator records them.

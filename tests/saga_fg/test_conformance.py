@@ -27,11 +27,12 @@ from random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
 
 from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import JointKalmanFilter, Measurements
+from saga_fg.estimators import IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.transition import Blocks
 
 ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
+    pytest.param("saga_fg.estimators:IncrementalFilter()", id="isam2"),
     pytest.param("saga_fg.estimators:FixedLagSmoother(0.0)", id="fixed-lag-0"),
     pytest.param("saga_fg.estimators:FixedLagSmoother(1.0)", id="fixed-lag"),
     pytest.param("saga_fg.estimators:BatchSmoother()", id="batch"),
@@ -340,14 +341,18 @@ def test_the_order_in_which_nodes_are_told_does_not_matter(make, seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_rate_zero_is_independent_filters_exactly(make, seed):
-    """Together or each alone: the same digits, and no correlation between any two."""
+    """Together or each alone: the same digits, and no correlation between any two.
+
+    iSAM2 solves when it is told something, so that others change how often; its digits are the same to rounding.
+    """
     rng = np.random.default_rng(seed)
     program = random_program(rng, moments=6, max_rate=0.0)
     together, _ = run(program, make())
+    rounding = 1e-11 if isinstance(together, IncrementalFilter) else 0.0
     for node in together.nodes.tolist():
         alone, _ = run([part for part in (only(operation, node) for operation in program) if part], make())
-        assert np.array_equal(alone.mean([node]), together.mean([node]))
-        assert np.array_equal(alone.covariance([node]), together.covariance([node]))
+        assert np.allclose(alone.mean([node]), together.mean([node]), rtol=rounding, atol=rounding)
+        assert np.allclose(alone.covariance([node]), together.covariance([node]), rtol=rounding, atol=rounding)
     P = together.joint_covariance(together.nodes)
     blocks = np.zeros_like(P)
     start = 0

@@ -1,0 +1,248 @@
+r"""The variables of the iSAM2 filter, and the linear factors on them.
+
+A variable is a *cell*: the stacked state of a few nodes that are correlated anyway. One cell a component, or cells of a
+few nodes where a component is large: elimination then works on blocks that are worth a call to the linear algebra. Its
+unit is the standard deviation and its zero is the estimate at which it began,
+
+    x = origin + scale y,
+
+so that information matrices have entries of order one and estimates are small numbers. In it, with W W^T = noise^-1,
+
+    interaction  || W ( x' - F x - b ) ||^2     one factor a cell, over all cells it listens to
+    detection    || W ( z - H x ) ||^2          one factor a cell
+    prior        || W ( x - origin ) ||^2       one factor a component
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+import scipy.linalg
+
+from factors.gaussian import native_factor
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.correction import rank
+from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.partition import Partition
+from saga_fg.estimators.sighting import WhitenedRows
+
+_WHOLE = 64  # size of a component up to which it is one cell
+_PART = 24  # size of the cells of a larger one
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """partition: the cells of the nodes; keys (c,) of their variables; origin, scale (D,): see the module."""
+
+    partition: Partition
+    keys: IntArray
+    origin: FloatArray
+    scale: FloatArray
+
+    @staticmethod
+    def over(components: Partition, first_key: int, origin: FloatArray, scale: FloatArray) -> Cells:
+        """New variables for the nodes of `components`, with keys from `first_key` on."""
+        partition = _divided(components)
+        return Cells(partition, first_key + np.arange(partition.count), origin, scale)
+
+    def extended(self, layout: Layout, means: FloatArray, scale: FloatArray, first_key: int) -> Cells:
+        """With the further nodes of `layout`, each a cell of its own."""
+        partition = self.partition.extended(layout)
+        keys = np.concatenate([self.keys, first_key + np.arange(partition.count - len(self.keys))])
+        return Cells(partition, keys, np.concatenate([self.origin, means]), np.concatenate([self.scale, scale]))
+
+    @cached_property
+    def sizes(self) -> IntArray:
+        """(c,) size of each cell's state."""
+        sizes = np.bincount(self.partition.label, weights=self.partition.layout.dims, minlength=len(self.keys))
+        return sizes.astype(np.int64)
+
+    @cached_property
+    def places(self) -> list[IntArray]:
+        """For each cell, where its state is in the joint state."""
+        partition = self.partition
+        places: list[IntArray] = [np.empty(0, dtype=np.int64)] * len(self.keys)
+        for node in np.unique(partition.label, return_index=True)[1].tolist():
+            places[partition.label[node]] = partition.groups[partition.group[node]][partition.row[node]]
+        return places
+
+    def dims(self) -> dict[int, int]:
+        """Size of each variable, by key."""
+        return dict(zip(self.keys.tolist(), self.sizes.tolist(), strict=True))
+
+    def mean(self, delta: gtsam.VectorValues) -> FloatArray:
+        """(D,) the joint state at the solution `delta`."""
+        y = np.empty(len(self.origin))
+        if len(self.keys):
+            y[np.concatenate(self.places)] = delta.vector(self.keys.tolist())
+        return self.origin + self.scale * y
+
+    def priors(self, x: BlockGaussian, rows: IntArray) -> list[gtsam.JacobianFactor]:
+        """One factor a component of `x`, which cells do not straddle; its nodes stand at `rows` here."""
+        here = self.partition.layout.places(rows)
+        factors = []
+        for places, P in zip(x.partition.groups, x.blocks, strict=True):
+            W = np.linalg.inv(np.linalg.cholesky(P))
+            for component, whitener in zip(here[places], W, strict=True):
+                order, cells = self._cells_of(component)
+                augmented = np.zeros((len(component), len(component) + 1), order="F")
+                augmented[:, :-1] = whitener[:, order] * self.scale[component[order]]
+                factors.append(native_factor(self.keys[cells].tolist(), self.sizes[cells].tolist(), augmented))
+        return factors
+
+    def births(self, rows: IntArray, covariances: FloatArray) -> list[gtsam.JacobianFactor]:
+        """One factor for each of the nodes at `rows`, cells of their own that begin at their mean: (k, d, d)."""
+        k, d, _ = covariances.shape
+        span = self.partition.layout.offsets[rows][:, None] + np.arange(d)
+        augmented = np.zeros((k, d + 1, d))  # transposed
+        W = np.linalg.inv(np.linalg.cholesky(covariances)) * self.scale[span][:, None, :]
+        augmented[:, :-1] = np.swapaxes(W, 1, 2)
+        keys = self.keys[self.partition.label[rows]].tolist()
+        return [native_factor([key], [d], matrix.T) for key, matrix in zip(keys, augmented, strict=True)]
+
+    def detections(self, seen: WhitenedRows) -> list[gtsam.JacobianFactor]:
+        """One factor a cell for the measurements of its nodes."""
+        rows, z, H = seen.rows, seen.z, seen.H
+        partition, (_, k, d) = self.partition, H.shape
+        span = partition.layout.offsets[rows][:, None] + np.arange(d)
+        A = H * self.scale[span][:, None, :]
+        rhs = z - (H @ self.origin[span][:, :, None])[:, :, 0]
+        number, cell, counts = np.unique(partition.label[rows], return_inverse=True, return_counts=True)
+        size = self.sizes[number]
+        base = np.concatenate([[0], np.cumsum((size + 1) * counts * k)])
+        flat = np.zeros(base[-1])  # every factor's matrix, transposed, one after the other
+        row = rank(cell)[:, None] * k + np.arange(k)
+        at = base[cell][:, None, None] + row[:, None, :]
+        width = (counts * k)[cell][:, None, None]
+        flat[at + (partition.offset[rows][:, None] + np.arange(d))[:, :, None] * width] = np.swapaxes(A, 1, 2)
+        flat[at + size[cell][:, None, None] * width] = rhs[:, None, :]
+        return [
+            native_factor([key], [s], flat[begin:end].reshape(s + 1, -1).T)
+            for key, s, begin, end in zip(
+                self.keys[number].tolist(), size.tolist(), base[:-1].tolist(), base[1:].tolist(), strict=True
+            )
+        ]
+
+    def interactions(self, before: Cells, rows: IntArray, dynamics: Dynamics) -> list[gtsam.JacobianFactor]:
+        """One factor a cell whose nodes have dynamics, over the cells `before`, in which all nodes stand at `rows`."""
+        layout, new, old = self.partition.layout, self.partition, before.partition
+        if not dynamics.F:
+            return []
+        target = np.concatenate([blocks.target for blocks in dynamics.F])
+        source = rows[np.concatenate([blocks.source for blocks in dynamics.F])]
+        pairs, pair = np.unique(new.label[target] * len(before.keys) + old.label[source], return_inverse=True)
+        listener, heard = np.divmod(pairs, len(before.keys))  # cells, sorted by listener
+        width = before.sizes[heard]
+        first = np.searchsorted(listener, np.arange(len(self.keys) + 1))
+        ends = np.concatenate([[0], np.cumsum(width)])
+        column = self.sizes[listener] + ends[:-1] - ends[first[listener]]  # where each pair's block begins
+        columns = self.sizes + ends[first[1:]] - ends[first[:-1]]
+        base = np.concatenate([[0], np.cumsum((columns + 1) * self.sizes)])
+        flat = np.zeros(base[-1])  # every factor's matrix, transposed, one after the other
+
+        def put(values: FloatArray, node: IntArray, column: IntArray) -> None:
+            """Write values (m, d_i, d_j) to the rows of node rows `node` and from `column` on."""
+            cell = new.label[node]
+            _, d_i, d_j = values.shape
+            at = base[cell][:, None, None] + (column[:, None, None] + np.arange(d_j)) * self.sizes[cell][:, None, None]
+            flat[at + (new.offset[node][:, None, None] + np.arange(d_i)[:, None])] = values
+
+        W = {d: np.zeros((len(layout), d, d)) for d in np.unique(layout.dims).tolist()}
+        left_over = dynamics.matrix @ before.origin[before.partition.layout.places(rows)] + dynamics.b - self.origin
+        for noise in dynamics.Q:
+            node, d = noise.target, noise.values.shape[1]
+            W[d][node] = np.linalg.inv(np.linalg.cholesky(noise.values))
+            span = layout.offsets[node][:, None] + np.arange(d)
+            put(W[d][node] * self.scale[span][:, None, :], node, new.offset[node])
+            put(W[d][node] @ left_over[span][:, :, None], node, columns[new.label[node]])
+        done = 0
+        for blocks in dynamics.F:
+            m, d_i, d_j = blocks.values.shape
+            mine, i = slice(done, done + m), blocks.target
+            j, done = source[mine], done + m
+            span = old.layout.offsets[j][:, None] + np.arange(d_j)
+            values = -(W[d_i][i] @ blocks.values) * before.scale[span][:, None, :]
+            put(values, i, column[pair[mine]] + old.offset[j])
+        factors = []
+        for cell in np.unique(listener).tolist():
+            heard_here = heard[first[cell] : first[cell + 1]]
+            matrix = flat[base[cell] : base[cell + 1]].reshape(-1, self.sizes[cell]).T
+            keys = [int(self.keys[cell]), *before.keys[heard_here].tolist()]
+            factors.append(native_factor(keys, [int(self.sizes[cell]), *before.sizes[heard_here].tolist()], matrix))
+        return factors
+
+    def marginals(self, isam: gtsam.ISAM2, components: Partition) -> tuple[FloatArray, ...]:
+        """Covariances of the components, which cells do not straddle.
+
+        A component of one cell is a root of the Bayes tree. That of several is too, but GTSAM would eliminate it again
+        to hand it over; the sum of its factors, which are those of one moment, is the same information.
+        """
+        blocks = []
+        factors = isam.getFactorsUnsafe()
+        first = np.unique(components.label, return_index=True)[1]  # a node of each component
+        count = np.bincount(components.label[np.unique(self.partition.label, return_index=True)[1]])
+        for number, places in enumerate(components.groups):
+            nodes = np.empty(len(places), dtype=np.int64)
+            here = first[components.group[first] == number]
+            nodes[components.row[here]] = here
+            order = np.broadcast_to(np.arange(places.shape[1]), places.shape).copy()
+            roots = np.empty((*places.shape, places.shape[1]))  # upper triangular in the order of the cells
+            single = count[components.label[nodes]] == 1
+            for component in np.flatnonzero(single).tolist():
+                conditional = isam.marginalFactor(int(self.keys[self.partition.label[nodes[component]]]))
+                roots[component] = conditional.R()  # a view into what must stay alive
+            for component in np.flatnonzero(~single).tolist():
+                order[component], cells = self._cells_of(places[component])
+                information = _information(factors, self.keys[cells].tolist())
+                roots[component] = np.linalg.cholesky(information).T
+            half = _inverted(roots) * np.take_along_axis(self.scale[places], order, axis=1)[:, :, None]
+            P = half @ np.swapaxes(half, 1, 2)
+            if not single.all():
+                ordered, which = P, np.arange(len(places))[:, None, None]
+                P = np.empty_like(ordered)
+                P[which, order[:, :, None], order[:, None, :]] = ordered
+            if not np.isfinite(P).all():
+                raise RuntimeError("the Bayes tree holds numbers that are not finite")
+            blocks.append(P)
+        return tuple(blocks)
+
+    def _cells_of(self, places: IntArray) -> tuple[IntArray, IntArray]:
+        """The cells of a component at `places` of the joint state, and the order of its entries cell by cell."""
+        layout = self.partition.layout
+        node = np.searchsorted(layout.offsets, places, side="right") - 1
+        cell = self.partition.label[node]
+        return np.argsort(cell, kind="stable"), np.unique(cell)
+
+
+def _information(factors: gtsam.NonlinearFactorGraph, keys: list[int]) -> FloatArray:
+    """Information matrix of the variables `keys`, in this order, from all factors on them."""
+    wanted = set(keys)
+    linear = gtsam.GaussianFactorGraph()
+    for i in range(factors.size()):
+        factor = factors.at(i) if factors.exists(i) else None
+        if isinstance(factor, gtsam.LinearContainerFactor) and wanted.issuperset(factor.keys()):
+            linear.push_back(factor.factor())
+    information, _ = linear.hessian(gtsam.Ordering(keys))
+    return np.asarray(information)
+
+
+def _inverted(roots: FloatArray) -> FloatArray:
+    """Inverses of upper triangular matrices (c, s, s)."""
+    if roots.shape[1] < _WHOLE:
+        return np.asarray(np.linalg.inv(roots), dtype=np.float64)
+    return np.stack([scipy.linalg.lapack.dtrtri(root)[0] for root in roots])
+
+
+def _divided(components: Partition) -> Partition:
+    """Cells: the components, large ones cut into parts of nodes in their order."""
+    layout, label = components.layout, components.label
+    size = np.bincount(label, weights=layout.dims, minlength=components.count).astype(np.int64)
+    if (size <= _WHOLE).all():
+        return components
+    part = np.where(size[label] > _WHOLE, (components.offset + layout.dims - 1) // _PART, 0)
+    return Partition(layout, np.unique(label * (part.max() + 1) + part, return_inverse=True)[1].astype(np.int64))
