@@ -1,6 +1,7 @@
 """Estimators behind one protocol, and the textbook reference they must agree with."""
 
 from saga_fg.estimators.batch import BatchSmoother
+from saga_fg.estimators.bounded import BoundedKalmanFilter
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.graduated import GraduatedNonConvexity
@@ -15,6 +16,7 @@ from saga_fg.estimators.smoothed import Smoothed
 
 __all__ = [
     "BatchSmoother",
+    "BoundedKalmanFilter",
     "Estimator",
     "FactorGraph",
     "FixedLagSmoother",

@@ -47,7 +47,9 @@ class Layout:
         """Places in the joint state of rows of any sizes, stacked."""
         if len(rows) == 0:
             return np.empty(0, dtype=np.int64)
-        return np.concatenate([np.arange(self.offsets[row], self.offsets[row + 1]) for row in rows])
+        dims = self.dims[rows]
+        ends = np.cumsum(dims)
+        return np.asarray(np.repeat(self.offsets[rows] - (ends - dims), dims) + np.arange(ends[-1]))
 
     def extended(self, nodes: ArrayLike, dim: int) -> Layout:
         """With further nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
