@@ -66,7 +66,7 @@ class BayesTree:
         dynamics: of those whose new state is told by interaction factors; in_moments: the prediction of the others.
         """
         components = prediction.components
-        cells = Cells.over(components, self._next_key, prediction.mean, prediction.scale)
+        cells = Cells.over(components, self._next_key, prediction.mean, prediction.scale, dynamics)
         others = components.layout.rows(in_moments.layout.nodes)
         factors = (*cells.interactions(self.cells, rows, dynamics), *cells.priors(in_moments, others))
         return BayesTree(

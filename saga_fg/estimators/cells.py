@@ -21,6 +21,8 @@ from functools import cached_property
 import gtsam
 import numpy as np
 import scipy.linalg
+import scipy.sparse
+import scipy.sparse.csgraph
 
 from factors.gaussian import native_factor
 from saga_fg.arrays import FloatArray, IntArray
@@ -45,9 +47,14 @@ class Cells:
     scale: FloatArray
 
     @staticmethod
-    def over(components: Partition, first_key: int, origin: FloatArray, scale: FloatArray) -> Cells:
-        """New variables for the nodes of `components`, with keys from `first_key` on."""
-        partition = _divided(components)
+    def over(
+        components: Partition, first_key: int, origin: FloatArray, scale: FloatArray, dynamics: Dynamics | None = None
+    ) -> Cells:
+        """New variables for the nodes of `components`, with keys from `first_key` on.
+
+        Large components are cut so that nodes next to each other in the graph of `dynamics` share a cell.
+        """
+        partition = _divided(components, dynamics)
         return Cells(partition, first_key + np.arange(partition.count), origin, scale)
 
     def extended(self, layout: Layout, means: FloatArray, scale: FloatArray, first_key: int) -> Cells:
@@ -238,11 +245,27 @@ def _inverted(roots: FloatArray) -> FloatArray:
     return np.stack([scipy.linalg.lapack.dtrtri(root)[0] for root in roots])
 
 
-def _divided(components: Partition) -> Partition:
-    """Cells: the components, large ones cut into parts of nodes in their order."""
+def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:
+    """Cells: the components, large ones cut into parts of nodes that are close in the graph."""
     layout, label = components.layout, components.label
     size = np.bincount(label, weights=layout.dims, minlength=components.count).astype(np.int64)
     if (size <= _WHOLE).all():
         return components
-    part = np.where(size[label] > _WHOLE, (components.offset + layout.dims - 1) // _PART, 0)
+    order = _neighbours_first(layout, dynamics)
+    order = order[np.argsort(label[order], kind="stable")]  # component by component
+    ends = np.cumsum(layout.dims[order])
+    within = np.empty(len(layout), dtype=np.int64)  # where a node's state ends in its component
+    within[order] = ends - (np.cumsum(size) - size)[label[order]]
+    part = np.where(size[label] > _WHOLE, (within - 1) // _PART, 0)
     return Partition(layout, np.unique(label * (part.max() + 1) + part, return_inverse=True)[1].astype(np.int64))
+
+
+def _neighbours_first(layout: Layout, dynamics: Dynamics | None) -> IntArray:
+    """Rows of the nodes in an order in which those that interact are close (reverse Cuthill-McKee)."""
+    if dynamics is None:
+        return np.arange(len(layout))
+    target = np.concatenate([blocks.target for blocks in dynamics.F])
+    source = np.concatenate([blocks.source for blocks in dynamics.F])
+    entries = (np.ones(2 * len(target)), (np.concatenate([target, source]), np.concatenate([source, target])))
+    graph = scipy.sparse.csr_array(entries, shape=(len(layout), len(layout)))
+    return np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), dtype=np.int64)
