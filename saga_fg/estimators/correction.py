@@ -22,7 +22,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 
 _CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
-_BATCHED_BELOW = 100  # size from which a triangular system is worth a call of its own
+_BATCHED_BELOW = 10  # size from which a triangular system is worth a call of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +167,8 @@ def _corrected(P: FloatArray, places: IntArray, stacked: _Stacked) -> tuple[Gain
     L = _innovation_root(stacked)
     solved = solve_lower(L, np.concatenate([stacked.H_P, stacked.innovation], axis=2))
     gain = Gain(places, stacked.H, L, solved[:, :, :-1], solved[:, :, -1])
-    posterior = P - np.swapaxes(gain.W, 1, 2) @ gain.W
+    posterior = np.swapaxes(gain.W, 1, 2) @ gain.W
+    np.subtract(P, posterior, out=posterior)
     after, before = (np.diagonal(array, axis1=1, axis2=2) for array in (posterior, P))
     lost = (after < _CANCELLATION * before).any(axis=1)
     if lost.any():
@@ -182,11 +183,9 @@ def solve_lower(L: FloatArray, B: FloatArray, transposed: bool = False) -> Float
     """X of L X = B, or of L^T X = B, for a stack of lower triangular L (c, a, a) and B (c, a, b)."""
     if L.shape[1] < _BATCHED_BELOW:
         return np.asarray(np.linalg.solve(np.swapaxes(L, 1, 2) if transposed else L, B), dtype=np.float64)
-    solved = np.empty_like(B)
-    for component in range(len(L)):
-        solved[component] = scipy.linalg.solve_triangular(
-            L[component], B[component], trans="T" if transposed else "N", lower=True, check_finite=False
-        )
+    solved = np.array(B, order="C")
+    for factor, X in zip(L, solved, strict=True):  # X^T L^T = B^T, as columns are contiguous to BLAS
+        X[:] = scipy.linalg.blas.dtrsm(1.0, factor.T, X.T, side=1, lower=0, trans_a=int(transposed), overwrite_b=1).T
     return solved
 
 
