@@ -10,12 +10,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 
 bench_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
+
+
+bench_app.command()(estimators)
 
 
 @bench_app.callback()

@@ -72,9 +72,9 @@ def working(what: str) -> AbstractContextManager[object]:
 
 
 @contextmanager
-def progress_bar(scenes: int | None = None) -> Iterator[ProgressCallback]:
+def progress_bar(scenes: int | None = None, unit: str = "frames") -> Iterator[ProgressCallback]:
     """A progress callback that draws a bar on stderr, and draws nothing where stderr is not a terminal."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
     console = error_console()
     with Progress(
         *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal

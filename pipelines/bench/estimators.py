@@ -1,0 +1,300 @@
+"""Every estimator against its baseline: the textbook on dense matrices, or GTSAM's own fixed-lag smoother.
+
+Filters read all means and all per-node covariances after every frame; the fixed-lag smoothers all means of their window
+and (ours only) the newest covariances; the batch smoothers all means and all per-node covariances of a recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from pipelines.bench.contenders import Contender, Filter, GtsamWindow, Ours, OurWindow, Textbook, dense
+from pipelines.bench.estimator_figures import Criterion, Row, Soak, criteria, exponents
+from pipelines.bench.flocks import Flock, Kind, flock
+from pipelines.bench.measuring import environment, one_thread, resident_memory, size_of, timed
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+from saga_fg.estimators import (
+    BatchSmoother,
+    BoundedKalmanFilter,
+    Gaussian,
+    IncrementalFilter,
+    JointKalmanFilter,
+    kalman_predict,
+    kalman_update,
+    rts_smooth,
+)
+from saga_fg.settings import setting
+
+KINDS: tuple[Kind, ...] = ("connected", "components")
+LAG = 5  # frames
+WARM_UP = 3  # frames that are not counted
+DENSE = INCREMENTAL = 300  # more nodes in one graph are hopeless for the textbook and for iSAM2
+_COVARIANCES = 50  # more nodes take GTSAM's smoother seconds to tell its covariances
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class EstimatorBenchSettings:
+    """How much is measured."""
+
+    sizes: tuple[int, ...] = setting((10, 50, 100, 300, 1000), "numbers of nodes")
+    frames: int = setting(20, "frames of each case that are counted, at most")
+    seconds: float = setting(30.0, "no more frames after so many seconds of a case")
+    batch_frames: int = setting(200, "frames of the recording that the batch smoothers solve; 0 for none")
+    batch_nodes: int = setting(100, "nodes of that recording")
+    soak_frames: int = setting(10_000, "frames of the endurance run; 0 for none")
+    soak_nodes: int = setting(100, "nodes of the endurance run")
+    seed: int = setting(0, "seed of the flocks")
+    everything: bool = setting(False, "measure the hopeless cases too")
+
+    def __post_init__(self) -> None:
+        if not self.sizes or min(self.sizes) < 2:
+            raise InputError(f"sizes: expected at least 2 nodes each, got {self.sizes}")
+        if self.frames < 1 or self.batch_frames < 0 or self.soak_frames < 0 or self.seconds <= 0:
+            raise InputError("frames, seconds: expected positive numbers")
+
+
+@dataclass(frozen=True)
+class EstimatorBench:
+    """All that was measured; exponents: of the cost over the number of nodes, by contender and graph."""
+
+    rows: tuple[Row, ...]
+    soaks: tuple[Soak, ...]
+    exponents: dict[str, float]
+    criteria: tuple[Criterion, ...]
+    settings: EstimatorBenchSettings
+    environment: Mapping[str, str] = field(default_factory=environment)
+
+
+def bench_estimators(settings: EstimatorBenchSettings, progress: Progress | None = None) -> EstimatorBench:
+    """Measure everything, one case after the other."""
+    rows: list[Row] = []
+    soaks: list[Soak] = []
+    cases = [*_filter_cases(settings), *_lag_cases(settings), *_batch_cases(settings), *_soak_cases(settings)]
+    with one_thread():
+        for done, (name, case) in enumerate(cases):
+            if progress is not None:
+                progress(name, done, len(cases))
+            for measured in case():
+                if isinstance(measured, Soak):
+                    soaks.append(measured)
+                else:
+                    rows.append(measured)
+    return EstimatorBench(tuple(rows), tuple(soaks), exponents(rows), criteria(rows, soaks), settings)
+
+
+Case = tuple[str, Callable[[], Sequence[Row | Soak]]]
+
+
+def _filter_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
+    for n in settings.sizes:
+        for kind in KINDS:
+            yield f"filters, {kind}, {n} nodes", partial(_filters, kind, n, settings)
+
+
+def _filters(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Row]:
+    frames = settings.frames + WARM_UP
+    scene = flock(kind, n, frames, settings.seed)
+    contenders: dict[str, Filter] = {}
+    if n <= DENSE or settings.everything:
+        contenders["textbook"] = Textbook(scene)
+    contenders["kalman"] = Ours(JointKalmanFilter(), scene)
+    if kind == "connected":
+        contenders["kalman, bounded"] = Ours(BoundedKalmanFilter(), scene)
+    if kind == "components" or n <= INCREMENTAL or settings.everything:
+        contenders["isam2"] = Ours(IncrementalFilter(), scene)
+    race = _race(contenders, scene, settings)
+    reference = contenders.get("textbook", contenders["kalman"])
+    baseline = race.milliseconds.get("textbook", math.nan)
+    return [
+        Row(
+            "filter",
+            kind,
+            n,
+            name,
+            race.milliseconds[name],
+            race.milliseconds[name] / baseline,
+            *_errors(contender.read(), reference.read()),
+            race.anees[name],
+            size_of(contender.estimator.snapshot()) if isinstance(contender, Ours) else math.nan,
+        )
+        for name, contender in contenders.items()
+    ]
+
+
+def _lag_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
+    for n in settings.sizes:
+        for kind in KINDS:
+            if kind == "components" or n <= 100 or settings.everything:
+                yield f"fixed lag, {kind}, {n} nodes", partial(_windows, kind, n, settings)
+
+
+def _windows(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Row]:
+    scene = flock(kind, n, settings.frames + WARM_UP + LAG, settings.seed)
+    ours, gtsams = OurWindow(LAG, scene), GtsamWindow(LAG, scene)
+    race = _race({"fixed-lag": ours, "gtsam": gtsams}, scene, settings, warm_up=WARM_UP + LAG)
+    _, covariances = ours.read()
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).ravel()
+    window = [np.abs((a - b) / sigma) for a, b in zip(ours.window, gtsams.window, strict=True)]
+    theirs = gtsams.covariances() if n <= _COVARIANCES else None
+    baseline = race.milliseconds["gtsam"]
+    mine = Row(
+        "fixed lag",
+        kind,
+        n,
+        "fixed-lag",
+        race.milliseconds["fixed-lag"],
+        race.milliseconds["fixed-lag"] / baseline,
+        float(np.max(window)),
+        float(np.mean(window)),
+        math.nan if theirs is None else _relative(covariances, theirs),
+        race.anees["fixed-lag"],
+        size_of(ours.estimator.snapshot()),
+    )
+    return [Row("fixed lag", kind, n, "GTSAM's", baseline, 1.0), mine]
+
+
+def _batch_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
+    for kind in KINDS if settings.batch_frames else ():
+        yield f"batch, {kind}, {settings.batch_nodes} nodes", partial(_batches, kind, settings)
+
+
+def _batches(kind: Kind, settings: EstimatorBenchSettings) -> list[Row]:
+    n = settings.batch_nodes
+    scene = flock(kind, n, settings.batch_frames, settings.seed)
+    ours: list[tuple[FloatArray, FloatArray]] = []
+    textbook: list[Gaussian] = []
+    matrices = [dense(frame) for frame in scene.frames]
+    baseline = timed(lambda: textbook.extend(_textbook_smoother(scene, matrices)))
+    milliseconds = timed(lambda: ours.extend(_batch_smoother(scene)))
+    at = np.arange(4 * n).reshape(-1, 4)
+    errors = []
+    for (mean, covariances), reference in zip(ours, textbook, strict=True):
+        blocks = reference.covariance[at[:, :, None], at[:, None, :]]
+        errors.append(_errors((mean.reshape(-1, 4), covariances), (reference.mean.reshape(-1, 4), blocks)))
+    largest, average, covariance = np.array(errors).T
+    return [
+        Row("batch", kind, n, "textbook", baseline, 1.0),
+        Row(
+            "batch",
+            kind,
+            n,
+            "batch",
+            milliseconds,
+            milliseconds / baseline,
+            float(largest.max()),
+            float(average.mean()),
+            float(covariance.max()),
+        ),
+    ]
+
+
+def _batch_smoother(scene: Flock) -> list[tuple[FloatArray, FloatArray]]:
+    smoother = BatchSmoother(likelihoods=False)
+    smoother.add(scene.nodes, scene.means, scene.covariances)
+    for frame in scene.frames:
+        smoother.predict(frame.transition)
+        smoother.update(frame.measurements)
+    return [(moment.state, moment.covariance(scene.nodes)) for moment in smoother.smoothed()]
+
+
+def _textbook_smoother(scene: Flock, matrices: Sequence[tuple[FloatArray, ...]]) -> list[Gaussian]:
+    x = Gaussian(scene.means.ravel(), _block_diagonal(scene.covariances))
+    filtered, predicted, transitions = [x], [], []
+    for F, b, Q, z, H, R in matrices:
+        prior = kalman_predict(x, F, b, Q)
+        x, _ = kalman_update(prior, z, H, R)
+        filtered.append(x)
+        predicted.append(prior)
+        transitions.append(F)
+    return rts_smooth(filtered, predicted, transitions)
+
+
+def _soak_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
+    for kind in KINDS if settings.soak_frames else ():
+        n = settings.soak_nodes if kind == "components" else max(2, settings.soak_nodes // 5)
+        yield f"endurance, {kind}, {n} nodes", partial(_soak, kind, n, settings)
+
+
+def _soak(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Soak]:
+    """The same frames over and over; a tenth of them is the start, and a tenth the end."""
+    scene = flock(kind, n, 50, settings.seed)
+    contender = Ours(IncrementalFilter(), scene)
+    part = max(1, settings.soak_frames // 10)
+    times, memory = np.empty(settings.soak_frames), []
+    for k in range(settings.soak_frames):
+        contender.prepare(scene.frames[k % len(scene.frames)])
+        times[k] = timed(contender.step)
+        if k in (part - 1, settings.soak_frames - 1):
+            memory.append(resident_memory())
+    start, end = float(np.median(times[:part])), float(np.median(times[-part:]))
+    return [Soak("isam2", kind, n, settings.soak_frames, (start, end), (memory[0], memory[-1]))]
+
+
+@dataclass(frozen=True)
+class _Race:
+    """Median milliseconds a frame, and ANEES, of each contender."""
+
+    milliseconds: dict[str, float]
+    anees: dict[str, float]
+
+
+def _race(
+    contenders: Mapping[str, Contender], scene: Flock, settings: EstimatorBenchSettings, warm_up: int = WARM_UP
+) -> _Race:
+    """All contenders, frame by frame in turn; the first frames are not counted."""
+    times: dict[str, list[float]] = {name: [] for name in contenders}
+    errors: dict[str, list[float]] = {name: [] for name in contenders}
+    spent = 0.0
+    for k, frame in enumerate(scene.frames):
+        for name, contender in contenders.items():
+            contender.prepare(frame)
+            taken = timed(contender.step)
+            spent += taken / 1e3
+            if k < warm_up:
+                continue
+            times[name].append(taken)
+            if isinstance(contender, Ours | Textbook):
+                errors[name].append(_anees(frame.truth, *contender.read()))
+        if k >= warm_up and spent > settings.seconds:
+            break
+    return _Race(
+        {name: float(np.median(taken)) for name, taken in times.items()},
+        {name: float(np.mean(each)) if each else math.nan for name, each in errors.items()},
+    )
+
+
+def _anees(truth: FloatArray, means: FloatArray, covariances: FloatArray) -> float:
+    """Mean over nodes of e^T P^-1 e / d."""
+    error = (truth - means)[:, :, None]
+    square = np.swapaxes(error, 1, 2) @ np.linalg.solve(covariances, error)
+    return float(square.mean() / truth.shape[1])
+
+
+def _errors(
+    read: tuple[FloatArray, FloatArray], reference: tuple[FloatArray, FloatArray]
+) -> tuple[float, float, float]:
+    """Largest and average difference of the means, in standard deviations; largest of the covariances, relative."""
+    sigma = np.sqrt(np.diagonal(reference[1], axis1=1, axis2=2))
+    difference = np.abs((read[0] - reference[0]) / sigma)
+    return float(difference.max()), float(difference.mean()), _relative(read[1], reference[1])
+
+
+def _relative(blocks: FloatArray, reference: FloatArray) -> float:
+    """Largest relative difference of one of the matrices."""
+    difference = np.linalg.norm(blocks - reference, axis=(1, 2))
+    return float((difference / np.linalg.norm(reference, axis=(1, 2))).max())
+
+
+def _block_diagonal(blocks: FloatArray) -> FloatArray:
+    n, d, _ = blocks.shape
+    whole = np.zeros((n, d, n, d))
+    whole[np.arange(n), :, np.arange(n)] = blocks
+    return whole.reshape(n * d, n * d)

@@ -1,0 +1,72 @@
+"""How time and memory are measured: side by side, in one run, on one thread.
+
+Times are CPU times of the thread, so that whatever else the machine does counts little; contenders take turns frame by
+frame, so that what is left of it hits all of them alike. Figures are medians, and ratios of medians.
+"""
+
+from __future__ import annotations
+
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_info, threadpool_limits
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Linear algebra on one thread: problems of this size only get slower on more."""
+    with threadpool_limits(1):
+        yield
+
+
+def timed(run: Callable[[], Any]) -> float:
+    """Milliseconds of CPU time that a call takes."""
+    begin = time.thread_time()
+    run()
+    return 1e3 * (time.thread_time() - begin)
+
+
+def resident_memory() -> float:
+    """Of this process, MB."""
+    status = Path("/proc/self/statm")
+    if status.exists():
+        return int(status.read_text().split()[1]) * resource.getpagesize() / 1e6
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # where there is no better: the most it ever was
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def size_of(value: Any) -> float:
+    """MB of all arrays that a value holds, each counted once."""
+    seen: set[int] = set()
+
+    def count(part: Any) -> int:
+        if id(part) in seen:
+            return 0
+        seen.add(id(part))
+        if isinstance(part, np.ndarray):
+            return 0 if part.base is not None and id(part.base) in seen else part.nbytes
+        if isinstance(part, dict):
+            return sum(map(count, part.values()))
+        if isinstance(part, list | tuple):
+            return sum(map(count, part))
+        if is_dataclass(part):
+            return sum(count(getattr(part, field.name)) for field in fields(part))
+        return 0
+
+    return count(value) / 1e6
+
+
+def environment() -> dict[str, str]:
+    """What the figures depend on."""
+    blas = sorted({f"{pool['internal_api']} {pool['version']}" for pool in threadpool_info()})
+    packages = {name: version(name) for name in ("saga-fg", "gtsam", "numpy", "scipy")}
+    return {"python": platform.python_version(), "machine": platform.machine(), "blas": ", ".join(blas), **packages}

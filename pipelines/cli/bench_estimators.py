@@ -1,0 +1,117 @@
+"""`saga-fg bench estimators`: cost and exactness of every estimator, beside its baseline."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.cli.options import Verbose, names
+from pipelines.cli.reporting import progress_bar
+
+if TYPE_CHECKING:
+    from pipelines.bench.estimators import EstimatorBench
+
+
+def estimators(
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Numbers of nodes, with commas between.")
+    ] = "10,50,100,300,1000",
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of each case that are counted.")] = 20,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="No more frames of a case after that.")] = 30.0,
+    batch_frames: Annotated[
+        int, typer.Option("--batch-frames", min=0, help="Length of the batch smoothers' recording; 0: none.")
+    ] = 200,
+    batch_nodes: Annotated[int, typer.Option("--batch-nodes", min=2, help="Nodes of that recording.")] = 100,
+    soak_frames: Annotated[
+        int, typer.Option("--soak-frames", min=0, help="Frames of the endurance run; 0: none.")
+    ] = 10_000,
+    soak_nodes: Annotated[int, typer.Option("--soak-nodes", min=2, help="Nodes of the endurance run.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated flocks.")] = 0,
+    everything: Annotated[bool, typer.Option("--all", help="Measure the hopeless cases too: hours.")] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
+    ] = None,
+    verbose: Verbose = False,
+) -> None:
+    """What the estimators cost and how exact they are.
+
+    Filters are compared with the textbook's on dense matrices, fixed-lag smoothers with GTSAM's, batch smoothers with
+    Rauch, Tung and Striebel's. All run in turn on one thread; times are medians of CPU time.
+
+    \b
+    Examples:
+      saga-fg bench estimators
+      saga-fg bench estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
+    """
+    from data_tools.atomic_files import write_text
+    from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
+    from saga_fg.errors import InputError
+
+    try:
+        numbers = tuple(int(size) for size in names("--sizes", sizes))
+    except ValueError:
+        raise InputError(f"--sizes: expected whole numbers with commas between them, got {sizes!r}") from None
+    settings = EstimatorBenchSettings(
+        numbers, frames, seconds, batch_frames, batch_nodes, soak_frames, soak_nodes, seed, everything
+    )
+    with progress_bar(unit="cases") as progress:
+        result = bench_estimators(settings, progress)
+    _print(result)
+    if json_file is not None:
+        write_text(json_file, json.dumps(_figures(result), indent=1) + "\n")
+
+
+def _print(result: EstimatorBench) -> None:
+    console = Console()
+    console = Console(width=max(console.width, 110))  # narrower, the table is no longer one
+    columns = ("case", "graph", "nodes", "estimator", "ms", "ratio", "largest error", "covariance", "ANEES", "MB")
+    table = Table(*columns, title="cost, and error in standard deviations", title_justify="left")
+    for row in result.rows:
+        cells = [f"{row.milliseconds:.3g}", _number(row.ratio), _number(row.largest_error, ".1e")]
+        cells += [_number(row.covariance_error, ".1e"), _number(row.anees, ".3f"), _number(row.memory)]
+        table.add_row(row.case, row.graph, str(row.nodes), row.contender, *cells)
+    console.print(table)
+    for name, exponent in result.exponents.items():
+        typer.echo(f"cost of {name}: grows as nodes^{exponent:.2f}")
+    for soak in result.soaks:
+        ms, memory = soak.milliseconds, soak.memory
+        typer.echo(
+            f"{soak.contender}, {soak.graph}, {soak.nodes} nodes, {soak.frames} frames: {ms[0]:.3g} ms and "
+            f"{memory[0]:.0f} MB at the start, {ms[1]:.3g} ms and {memory[1]:.0f} MB at the end"
+        )
+    table = Table("figure", "measured", "to reach", "", title="figures to reach", title_justify="left")
+    words = {True: "reached", False: "missed", None: "not measured"}
+    for criterion in result.criteria:
+        table.add_row(criterion.name, _number(criterion.value), f"<= {criterion.limit}", words[criterion.reached])
+    console.print(table)
+    typer.echo(", ".join(f"{name} {value}" for name, value in result.environment.items()))
+
+
+def _number(value: float, form: str = ".3g") -> str:
+    return "" if math.isnan(value) else format(value, form)
+
+
+def _figures(result: EstimatorBench) -> dict[str, Any]:
+    """As JSON has them: null for what was not measured."""
+    figures = asdict(result)
+    figures["criteria"] = [asdict(criterion) | {"reached": criterion.reached} for criterion in result.criteria]
+    figures["settings"] = asdict(result.settings)
+    cleaned: dict[str, Any] = _without_nan(figures)
+    return cleaned
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {key: _without_nan(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return value
