@@ -1,8 +1,8 @@
-"""Ground truth as annotators would give it.
+"""Which objects are part of the ground truth, and when.
 
-Annotators who see a whole recording label an object from the first moment they see it to the last, also where it is
-hidden in between, unless it stays hidden for long. So an object is annotated at the keyframes at which some sensor
-sees enough of it, and where it is hidden for a while between two of these, always within the annotation range.
+An object within the annotation range is annotated while some sensor sees enough of it, and for as long afterwards as a
+tracker may be asked to remember it, whether it comes into view again or not. It counts as visible where such a view
+lasts; after a mere glimpse nobody can be expected to know how it moves.
 """
 
 from __future__ import annotations
@@ -20,27 +20,36 @@ def annotate(
     world: World, time: FloatArray, world_T_ego: FloatArray, settings: SimulatorSettings
 ) -> tuple[Annotations, ...]:
     """Ground truth at the keyframes `time` (K,), s, with the poses of the vehicle (K, 4, 4)."""
-    moments = [world.objects.at(moment)[0] for moment in time]
-    visible = np.zeros((len(time), len(world.objects)), dtype=np.bool_)
-    near = np.zeros_like(visible)
+    moments, present = zip(*(world.objects.at(moment) for moment in time), strict=True)
+    near, visible = np.zeros((2, len(time), len(world.objects)), dtype=np.bool_)
     for k, (moment, pose, boxes) in enumerate(zip(time, world_T_ego, moments, strict=True)):
-        near[k] = np.linalg.norm(boxes.position[:, :2] - pose[:2, 3], axis=1) <= settings.annotation_range
+        distance = np.linalg.norm(boxes.position[:, :2] - pose[:2, 3], axis=1)
+        near[k] = present[k] & (distance <= settings.annotation_range)
         for sensor in settings.sensors.values():
             _, reached, share = world.seen_from(viewpoint(sensor, pose), moment, sensor.max_range)
             seen = np.zeros(len(boxes), dtype=np.bool_)
             seen[reached] = share >= settings.visible_share
             visible[k] |= seen & in_view(sensor, pose, boxes.position)
     visible &= near
-    annotated = near & bridged(time, visible, settings.longest_gap)
+    annotated = near & remembered(time, visible, settings.memory)
+    visible = lasting(visible, round(settings.shortest_view * settings.keyframe_rate))
     return tuple(
         Annotations(world.objects.id[rows], boxes.select(rows), visible[k, rows])
         for k, (boxes, rows) in enumerate(zip(moments, annotated, strict=True))
     )
 
 
-def bridged(time: FloatArray, visible: BoolArray, longest: float) -> BoolArray:
-    """Where objects (K, N) are visible, or hidden between two sightings at most `longest` s apart; time (K,), s."""
-    seen = np.where(visible, time[:, None], np.nan)
-    before = np.fmax.accumulate(seen, axis=0)
-    after = np.fmin.accumulate(seen[::-1], axis=0)[::-1]
-    return np.asarray(after - before <= longest + 1e-9)
+def lasting(visible: BoolArray, shortest: int) -> BoolArray:
+    """`visible` (K, N) without the runs along the first axis of less than `shortest` moments."""
+    length = np.zeros(visible.shape, dtype=np.int64)  # of each run, up to here and then altogether
+    for k in range(len(visible)):
+        length[k] = np.where(visible[k], (length[k - 1] if k else 0) + 1, 0)
+    for k in range(len(visible) - 2, -1, -1):
+        length[k] = np.where(visible[k] & visible[k + 1], length[k + 1], length[k])
+    return np.asarray(visible & (length >= shortest))
+
+
+def remembered(time: FloatArray, visible: BoolArray, memory: float) -> BoolArray:
+    """Where objects (K, N) are visible or were so at most `memory` s ago; time (K,), s."""
+    seen = np.where(visible, time[:, None], -np.inf)
+    return np.asarray(time[:, None] - np.maximum.accumulate(seen, axis=0) <= memory + 1e-9)

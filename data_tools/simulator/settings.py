@@ -90,7 +90,7 @@ class TrafficSettings:
 class PedestrianSettings:
     """People on the pavements, alone and in groups."""
 
-    groups: tuple[int, int] = setting((4, 10), "fewest and most groups within reach of the ego vehicle")
+    groups: tuple[int, int] = setting((3, 8), "fewest and most groups within reach of the ego vehicle")
     group_size: tuple[int, int] = setting((1, 4), "fewest and most people in a group")
     walking_speed: Range = setting((1.0, 1.7), "speed at which a group likes to walk, m/s")
     pause_interval: float = setting(20.0, "mean time between a group's stops, s")
@@ -102,7 +102,7 @@ class PedestrianSettings:
 class SurroundingSettings:
     """What stands beside the road and hides what moves on it."""
 
-    parking_probability: float = setting(0.5, "share of roadsides with a strip of parked cars")
+    parking_probability: float = setting(0.35, "share of roadsides with a strip of parked cars")
     parking_occupancy: float = setting(0.5, "share of parking places taken")
     hedge_length: Range = setting((4.0, 14.0), "length of an unbroken piece of hedge, m")
     hedge_gap: Range = setting((5.0, 18.0), "gap between pieces of hedge, m")
@@ -126,7 +126,7 @@ class SensorSettings:
     offset: float = setting(0.0, "time of the first frame after the start of the scene, s")
     field_of_view: float = setting(2 * math.pi, "horizontal field of view, centred straight ahead, rad")
     position: tuple[float, float, float] = setting((0.94, 0.0, 1.84), "mounting place on the vehicle (x, y, z), m")
-    max_range: float = setting(75.0, "nothing is detected beyond, m")
+    max_range: float = setting(60.0, "nothing is detected beyond, m")
     range_noise: tuple[float, float] = setting((0.10, 0.002), "range error: standard deviation at 0 m, and per m")
     bearing_noise: tuple[float, float] = setting((0.08, 0.002), "sideways error: deviation at 0 m, m, and per m (rad)")
     height_noise: float = setting(0.08, "standard deviation of the elevation, m")
@@ -137,8 +137,8 @@ class SensorSettings:
     )
     detection_probability: float = setting(0.97, "chance to detect a clearly visible object close by")
     hidden_share: float = setting(0.15, "visible share up to which an object is never detected")
-    clear_share: float = setting(0.5, "visible share from which occlusion does not matter")
-    reach: float = setting(70.0, "range at which the chance to detect an object has halved, m")
+    clear_share: float = setting(0.35, "visible share from which occlusion does not matter")
+    reach: float = setting(60.0, "range at which the chance to detect an object has halved, m")
     fading: float = setting(6.0, "how gradually it falls there, m")
     clutter_rate: float = setting(2.0, "mean number of false detections a frame")
     true_logit: float = setting(2.0, "mean logit of the score of a clearly visible object close by")
@@ -169,7 +169,7 @@ def camera() -> SensorSettings:
         offset=0.031,
         field_of_view=math.radians(120),
         position=(1.7, 0.0, 1.5),
-        max_range=60.0,
+        max_range=50.0,
         range_noise=(0.2, 0.03),
         bearing_noise=(0.08, 0.004),
         height_noise=0.15,
@@ -177,8 +177,8 @@ def camera() -> SensorSettings:
         yaw_noise=0.15,
         velocity_noise=1.0,
         detection_probability=0.88,
-        reach=50.0,
-        fading=8.0,
+        reach=45.0,
+        fading=6.0,
         clutter_rate=3.0,
         true_logit=1.2,
         clutter_logit=-1.2,
@@ -194,9 +194,10 @@ class SimulatorSettings:
     keyframe_rate: float = setting(10.0, "moments a second at which ground truth is given and tracks are wanted, 1/s")
     step: float = setting(0.05, "integration step, s")
     warm_up: float = setting(15.0, "time simulated before the scene starts, s")
-    annotation_range: float = setting(70.0, "distance from the ego vehicle within which objects are annotated, m")
+    annotation_range: float = setting(60.0, "distance from the ego vehicle within which objects are annotated, m")
     visible_share: float = setting(0.25, "an object counts as visible when a sensor sees at least this share of it")
-    longest_gap: float = setting(5.0, "an object hidden for longer is not annotated meanwhile, s")
+    shortest_view: float = setting(1.0, "and for at least this long; a mere glimpse does not count, s")
+    memory: float = setting(4.0, "a hidden object is annotated for this long after it was last visible, s")
     road: RoadSettings = settings_group(RoadSettings, "the road")
     drivers: DriverSettings = settings_group(DriverSettings, "how people drive")
     traffic: TrafficSettings = settings_group(TrafficSettings, "what is on the road")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, camera, lidar, simulate_scene
-from data_tools.simulator.annotation import bridged
+from data_tools.simulator.annotation import lasting, remembered
 from data_tools.simulator.world import build_world
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.errors import InputError
@@ -113,24 +113,27 @@ def test_objects_stand_on_the_ground_and_have_real_sizes() -> None:
         assert (moment.boxes.size[moment.boxes.label == "bus", 0] > 9).all()
 
 
-def test_hidden_objects_are_seen_before_and_after_and_not_too_long_hidden() -> None:
-    hidden = 0
+def test_hidden_objects_were_in_view_not_long_ago() -> None:
+    glimpses_count = replace(SimulatorSettings(), shortest_view=0.0, sensors={"lidar": lidar()})
+    hidden = lasting_views = 0
     for seed in range(3):
-        here = long_scene(seed)
+        here = simulate_scene(glimpses_count, seed)
+        last_seen: dict[str, float] = {}
         assert here.ground_truth is not None
-        sightings: dict[str, list[int]] = {}
-        for k, moment in enumerate(here.ground_truth):
-            for name in moment.id[moment.visible].tolist():
-                sightings.setdefault(name, []).append(k)
-        for k, moment in enumerate(here.ground_truth):
-            for name in moment.id[~moment.visible].tolist():
-                before = max(j for j in sightings[name] if j < k)
-                after = min(j for j in sightings[name] if j > k)
-                assert after - before <= 50
-                hidden += 1
+        for k, (time, moment) in enumerate(zip(here.timestamps.tolist(), here.ground_truth, strict=True)):
+            last_seen.update(dict.fromkeys(moment.id[moment.visible].tolist(), time))
+            assert all(time - last_seen[name] <= 4.0 + 1e-5 for name in moment.id.tolist())
+            hidden += int((~moment.visible).sum())
             distance = np.linalg.norm(moment.boxes.position[:, :2] - here.world_T_ego[k, :2, 3], axis=1)
-            assert (distance <= 70.0).all()
+            assert (distance <= 60.0).all()
+        stricter = long_scene(seed).ground_truth
+        assert stricter is not None
+        for a, b in zip(here.ground_truth, stricter, strict=True):
+            assert a.id.tolist() == b.id.tolist()
+            assert not (b.visible & ~a.visible).any()
+            lasting_views += int(b.visible.sum())
     assert hidden > 300
+    assert lasting_views > 5000
 
 
 def test_hidden_objects_are_not_detected() -> None:
@@ -149,12 +152,23 @@ def test_hidden_objects_are_not_detected() -> None:
     assert hits[False][0] / hits[False][1] < 0.25
 
 
-def test_gaps_are_bridged_between_sightings_only() -> None:
-    time = np.arange(7.0)
-    visible = np.array([[0, 1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
-    expected = np.array([[0, 1, 1, 1, 1, 0, 0], [1, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
-    assert np.array_equal(bridged(time, visible, 3.0), expected)
-    assert np.array_equal(bridged(time, visible, 6.0)[:, 1], np.ones(7, dtype=np.bool_))
+def test_objects_are_remembered_for_a_while() -> None:
+    time = np.arange(7.0) / 2
+    visible = np.array([[0, 1, 0, 0, 0, 0, 1], [1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
+    expected = np.array([[0, 1, 1, 1, 0, 0, 1], [1, 1, 1, 1, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
+    assert np.array_equal(remembered(time, visible, 1.0), expected)
+    assert np.array_equal(remembered(time, visible, 0.0), visible)
+    assert remembered(time, visible, 9.0)[:, 0].tolist() == [False] + 6 * [True]
+
+
+def test_glimpses_are_no_sightings() -> None:
+    visible = np.array([[1, 0, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 1, 0]], dtype=np.bool_).T
+    two = np.array([[0, 0, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 0, 0]], dtype=np.bool_).T
+    three = np.array([[0, 0, 0, 0, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 0, 0]], dtype=np.bool_).T
+    assert np.array_equal(lasting(visible, 1), visible)
+    assert np.array_equal(lasting(visible, 2), two)
+    assert np.array_equal(lasting(visible, 3), three)
+    assert not lasting(visible, 9).any()
 
 
 def test_the_dataset_makes_its_scenes_on_demand() -> None:

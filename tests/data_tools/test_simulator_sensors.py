@@ -66,14 +66,14 @@ def test_errors_along_and_across_the_line_of_sight(sensor: SensorSettings, dista
         assert within(velocity_error.std(), sensor.velocity_noise, sensor.velocity_noise / math.sqrt(12000))
 
 
-@pytest.mark.parametrize(("share", "distance"), [(1.0, 10.0), (0.3, 10.0), (0.1, 10.0), (1.0, 70.0)])
+@pytest.mark.parametrize(("share", "distance"), [(1.0, 10.0), (0.25, 10.0), (0.1, 10.0), (1.0, 59.0)])
 def test_the_rate_of_misses(share: float, distance: float) -> None:
     sensor = replace(CENTRED, clutter_rate=0.0)
     angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
     boxes = cars(distance * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     count = sum(map(len, detections(sensor, boxes, share)))
-    ramp = min(max((share - 0.15) / 0.35, 0.0), 1.0)
-    p = 0.97 * ramp / (1 + math.exp((distance - 70.0) / 6.0))
+    ramp = min(max((share - 0.15) / 0.2, 0.0), 1.0)
+    p = 0.97 * ramp / (1 + math.exp((distance - 60.0) / 6.0))
     assert detection_probability(sensor, np.array([distance]), np.array([share]))[0] == pytest.approx(p)
     assert within(count / 10_000, p, math.sqrt(p * (1 - p) / 10_000) + 1e-12)
 
@@ -107,7 +107,7 @@ def test_nothing_is_seen_outside_the_field_of_view() -> None:
 def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> None:
     boxes = cars(np.array([[15.0, 0.0], [30.0, 5.0]]))
     true = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes)])
-    hidden = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes, 0.35)])
+    hidden = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes, 0.3)])
     false = np.concatenate([d.score for d in detections(sensor, Boxes.empty(), frames=400)])
     assert ((true > 0) & (true < 1)).all()
     assert true.mean() > hidden.mean() > false.mean()
