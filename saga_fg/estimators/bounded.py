@@ -25,10 +25,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.correction import correct
+from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.cover import Bounds, Cover
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
@@ -112,20 +112,12 @@ class BoundedKalmanFilter:
         order = np.lexsort((which, turn, cover.cluster[copies]))
         which, copies, turn = which[order], copies[order], turn[order]
         state, gains, _ = correct(self._state, copies, m.z[which], m.H[which], m.R[which])
-        log_likelihood = -0.5 * m.z.size * math.log(2 * math.pi)
-        partition, k = cover.partition, m.z.shape[1]
-        numbers = np.unique(partition.group[copies])
-        for number, gain in zip(numbers, gains, strict=True):
-            mine = partition.group[copies] == number
-            label = cover.cluster[copies[mine]]
-            _, component = np.unique(label, return_inverse=True)
-            slot = np.arange(len(label)) - np.searchsorted(label, label)
-            home = turn[mine] == 0
-            at = slot[home][:, None] * k + np.arange(k)
-            whitened = gain.whitened[component[home][:, None], at]
-            pivots = gain.L[component[home][:, None], at, at]
-            log_likelihood -= 0.5 * float(np.vdot(whitened, whitened)) + float(np.log(pivots).sum())
         self._state = state
+        numbers = cover.partition.group[copies]
+        log_likelihood = -0.5 * m.z.size * math.log(2 * math.pi)
+        for number, gain in zip(np.unique(numbers), gains, strict=True):
+            mine = numbers == number
+            log_likelihood += _conditional(gain, cover.cluster[copies[mine]], turn[mine] == 0)
         return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -214,6 +206,16 @@ class BoundedKalmanFilter:
                 block[at] = scale @ block[at]
                 block[:, at] = block[:, at] @ scale.T
         return BlockGaussian(partition, joint.mean, tuple(blocks))
+
+
+def _conditional(gain: Gain, cluster: IntArray, home: BoolArray) -> float:
+    """Log-density, but for its constant, of the measurements `home` (m,) given those before them in their cluster."""
+    _, component = np.unique(cluster, return_inverse=True)
+    slot = rank(cluster)
+    k = gain.whitened.shape[1] // (int(slot.max()) + 1)
+    at = slot[home][:, None] * k + np.arange(k)
+    row = component[home][:, None]
+    return -0.5 * float((gain.whitened[row, at] ** 2).sum()) - float(np.log(gain.L[row, at, at]).sum())
 
 
 def _single(dims: IntArray, label: IntArray) -> Partition:

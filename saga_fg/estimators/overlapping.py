@@ -84,7 +84,9 @@ def propagated(x: BlockGaussian, cover: Cover, dynamics: Dynamics, F: scipy.spar
         own = inner[first:last, first:last]
         half = (own @ P.reshape(last - first, -1)).reshape(P.shape)
         whole = (own @ np.swapaxes(half, 1, 2).reshape(last - first, -1)).reshape(P.shape)
-        blocks.append((whole + np.swapaxes(whole, 1, 2)) / 2)
+        whole = whole + np.swapaxes(whole, 1, 2)
+        whole /= 2
+        blocks.append(whole)
     for d in np.unique(layout.dims).tolist():
         copies = np.flatnonzero(partition.layout.dims == d)
         for number, members, at in partition.members(copies, d):

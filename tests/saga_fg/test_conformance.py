@@ -32,6 +32,7 @@ from saga_fg.transition import Blocks
 
 ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
+    pytest.param("saga_fg.estimators:BoundedKalmanFilter(core=1000)", id="kalman-bounded"),  # by more than there is
     pytest.param("saga_fg.estimators:IncrementalFilter()", id="isam2"),
     pytest.param("saga_fg.estimators:FixedLagSmoother(0.0)", id="fixed-lag-0"),
     pytest.param("saga_fg.estimators:FixedLagSmoother(1.0)", id="fixed-lag"),

@@ -1,0 +1,157 @@
+"""What the bound of `BoundedKalmanFilter` costs in accuracy and saves in time, against the exact filter.
+
+A flock in the plane, every node listening to its four nearest neighbours, which are chosen anew at every frame; data
+are drawn from the model. `mixing` is the share of its velocity that a node takes over from its neighbours in a frame:
+0.2 is weak, 0.35 moderate, 0.5 strong coupling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipelines.bench.flocks import CAR, DT, MISSED, NOISE, Flock, Frame
+from pipelines.bench.measuring import one_thread, timed
+from saga_fg import Edges, SceneGraph
+from saga_fg.arrays import FloatArray
+from saga_fg.discretisation import discretise
+from saga_fg.estimators import BoundedKalmanFilter, Estimator, JointKalmanFilter, Measurements
+from saga_fg.settings import require_between, setting
+
+NEIGHBOURS = 4
+SPACING = 10.0  # m
+SPEED = 2.0  # with which the flock mixes, m/s
+
+
+@dataclass(frozen=True)
+class BoundedBenchSettings:
+    """How much is measured."""
+
+    nodes: int = setting(1000, "nodes of the flock")
+    frames: int = setting(10, "frames that are counted")
+    warm_up: int = setting(5, "frames before them")
+    hops: tuple[int, ...] = setting((1, 2, 3), "bounds to compare")
+    mixing: float = setting(0.35, "share of its velocity that a node takes over from its neighbours in a frame")
+    seed: int = setting(0, "seed of the flock")
+
+    def __post_init__(self) -> None:
+        require_between(self, NEIGHBOURS + 1, 10**6, "nodes")
+        require_between(self, 1, 10**6, "frames")
+        require_between(self, 0, 10**6, "warm_up")
+        require_between(self, 0, 0.99, "mixing")
+
+
+@dataclass(frozen=True)
+class BoundedRow:
+    """One bound.
+
+    milliseconds  median a frame, and ratio to that of the exact filter
+    mean_error    of the means against the exact ones, mean over nodes, components and frames, standard deviations;
+                  worst_error: the largest
+    anees         mean of e^T P^-1 e / d against the truth, and anees_ratio to that of the exact filter
+    likelihood_error  largest difference of a frame's log-likelihood, per measured value
+    nodes_per_cluster guests included
+    """
+
+    hops: int
+    milliseconds: float
+    ratio: float
+    mean_error: float
+    worst_error: float
+    anees: float
+    anees_ratio: float
+    likelihood_error: float
+    nodes_per_cluster: float
+
+
+def bench_bounded(settings: BoundedBenchSettings) -> tuple[BoundedRow, ...]:
+    """A row for each bound; the exact filter and the bounded ones take turns frame by frame."""
+    scene = planar_flock(settings)
+    exact = _Taken(JointKalmanFilter(), scene)
+    bounded = {hops: _Taken(BoundedKalmanFilter(hops=hops), scene) for hops in settings.hops}
+    with one_thread():
+        for k, frame in enumerate(scene.frames):
+            counted = k >= settings.warm_up
+            exact.take(frame, counted)
+            for taken in bounded.values():
+                taken.take(frame, counted, exact)
+    return tuple(_row(hops, taken, exact) for hops, taken in bounded.items())
+
+
+class _Taken:
+    """A filter that takes frames in, and what was measured of it."""
+
+    def __init__(self, estimator: Estimator, scene: Flock) -> None:
+        self.estimator, self._nodes = estimator, scene.nodes
+        estimator.add(scene.nodes, scene.means, scene.covariances)
+        self.times: list[float] = []
+        self.errors: list[FloatArray] = []
+        self.squares: list[float] = []
+        self.likelihoods: list[float] = []
+
+    def take(self, frame: Frame, counted: bool, exact: _Taken | None = None) -> None:
+        milliseconds = timed(lambda: self._step(frame))
+        if not counted:
+            return
+        self.times.append(milliseconds)
+        error = (frame.truth - self.means)[:, :, None]
+        square = np.swapaxes(error, 1, 2) @ np.linalg.solve(self.covariances, error)
+        self.squares.append(float(square.mean() / error.shape[1]))
+        if exact is not None:
+            sigma = np.sqrt(np.diagonal(exact.covariances, axis1=1, axis2=2))
+            self.errors.append(np.abs(self.means - exact.means) / sigma)
+            self.likelihoods.append((self.likelihood - exact.likelihood) / frame.measurements.z.size)
+
+    def _step(self, frame: Frame) -> None:
+        self.estimator.predict(frame.transition)
+        self.likelihood = self.estimator.update(frame.measurements)
+        self.means, self.covariances = self.estimator.mean(self._nodes), self.estimator.covariance(self._nodes)
+
+
+def _row(hops: int, taken: _Taken, exact: _Taken) -> BoundedRow:
+    assert isinstance(taken.estimator, BoundedKalmanFilter)
+    milliseconds, anees = float(np.median(taken.times)), float(np.mean(taken.squares))
+    errors = np.array(taken.errors)
+    return BoundedRow(
+        hops,
+        milliseconds,
+        float(np.median(np.array(taken.times) / np.array(exact.times))),
+        float(errors.mean()),
+        float(errors.max()),
+        anees,
+        anees / float(np.mean(exact.squares)),
+        float(np.abs(taken.likelihoods).max()),
+        float(np.mean([len(cluster) for cluster in taken.estimator.clusters])),
+    )
+
+
+def planar_flock(settings: BoundedBenchSettings) -> Flock:
+    """The flock; who interacts follows from points that drift whatever the truth does, as edges are inputs."""
+    rng = np.random.default_rng(settings.seed)
+    n = settings.nodes
+    points = rng.uniform(0, SPACING * np.sqrt(n), (n, 2))
+    drift = SPEED * rng.normal(size=(n, 2))
+    P = np.diag([0.25, 0.25, 1.0, 1.0])
+    truth = np.concatenate([points, drift], axis=1)
+    means = truth + rng.normal(size=(n, 4)) * np.sqrt(np.diag(P))
+    total = -np.log(1 - settings.mixing) / DT
+    target = np.repeat(np.arange(n), NEIGHBOURS)
+    A = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (len(target), 1, 1))
+    record = []
+    for _ in range(settings.warm_up + settings.frames):
+        points = points + drift * DT
+        _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
+        source = np.asarray(nearest)[:, 1:].ravel()
+        rate = rng.uniform(0.5, 1.5, len(target)) * total / NEIGHBOURS
+        edges = Edges("shared velocity", target, source, rate, -A, A, np.zeros((len(target), 4)))
+        transition = discretise(SceneGraph.of(np.arange(n), CAR, [edges]), DT)
+        truth = (transition.F_matrix @ truth.ravel() + transition.b).reshape(n, 4)
+        for blocks in transition.Q:
+            root = np.linalg.cholesky(blocks.values)
+            truth[blocks.target] += (root @ rng.normal(size=(len(blocks.target), 4, 1)))[:, :, 0]
+        seen = np.flatnonzero(rng.random(n) >= MISSED)
+        z = truth[seen, :2] + NOISE * rng.normal(size=(len(seen), 2))
+        record.append(Frame(transition, Measurements(seen, z, np.eye(2, 4), NOISE**2 * np.eye(2)), truth))
+    return Flock("connected", np.arange(n), means, np.tile(P, (n, 1, 1)), tuple(record))
