@@ -1,23 +1,31 @@
 """The batch smoother: a whole recording, every state given everything measured.
 
-All factors since the start are solved at once, with the means and covariances of every node at every moment. Robust
-losses are solved by iteratively reweighted least squares, or by graduated non-convexity, which finds outliers without
-a good start (`saga_fg.estimators.graduated`).
+All factors since the start are solved at once, with the means and covariances of every node at every moment, in
+whichever order of elimination takes least time (`saga_fg.estimators.elimination_order`). Robust losses are solved by
+iteratively reweighted least squares, or by graduated non-convexity, which finds outliers without a good start
+(`saga_fg.estimators.graduated`).
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import Robust
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
+from saga_fg.estimators.backward import MarginalCovariances
+from saga_fg.estimators.elimination import NoSolution, marginal_covariances, solved_tree, tree_covariances
+from saga_fg.estimators.elimination_order import Order, cheapest_order
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.graduated import GraduatedNonConvexity
+from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion, NodeMotion
 from saga_fg.estimators.protocol import Measurements
@@ -37,12 +45,25 @@ class BatchSmoother:
     settings     of Gauss-Newton, for what is nonlinear or robust
     likelihoods  whether `update` returns the likelihood of what it takes in; without, nothing is computed before an
                  estimate is asked for, and `update` returns NaN
+    order        of elimination: "time", "colamd", "metis", or "auto" for the cheapest (that of time where something is
+                 nonlinear). Where sparse elimination has not the digits, and for joint covariances, it is that of time
 
     `mean`, `covariance` and their like speak of the newest moment, `smoothed` of all moments.
     """
 
-    def __init__(self, settings: GaussNewtonSettings | None = None, likelihoods: bool = True) -> None:
-        self._recording = Recording(settings, lazy=not likelihoods)
+    def __init__(
+        self,
+        settings: GaussNewtonSettings | None = None,
+        likelihoods: bool = True,
+        order: Literal["auto"] | Order = "auto",
+    ) -> None:
+        if order not in ("auto", *get_args(Order)):
+            raise InputError(f"order: expected one of auto, {', '.join(get_args(Order))}, got {order!r}")
+        self._settings = settings or GaussNewtonSettings()
+        self._recording = Recording(self._settings, lazy=not likelihoods)
+        self._wanted = order
+        self._order: Order | None = None  # of the recording as it is
+        self._sparse: _Sparse | None = None  # its solution, where that is not in the order of time
         self._graduated = True  # whether the weights of graduated non-convexity are those of the whole recording
 
     @property
@@ -56,10 +77,12 @@ class BatchSmoother:
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         self._recording.add(nodes, means, covariances)
+        self._changed()
 
     def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
         """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
         self._recording.move(Motion(transition, tuple(nonlinear)))
+        self._changed()
 
     def update(
         self,
@@ -75,6 +98,7 @@ class BatchSmoother:
         """
         likelihood = self._recording.see(Sighting(measurements, robust), time)
         self._graduated &= not isinstance(robust, GraduatedNonConvexity)
+        self._changed()
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -92,6 +116,19 @@ class BatchSmoother:
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         return self._newest().joint_covariance(nodes)
 
+    @property
+    def order(self) -> Order:
+        """The order of elimination in which this recording is solved."""
+        if self._order is None:
+            recording = self._recording
+            if self._wanted != "auto":
+                self._order = self._wanted
+            elif recording.linear:
+                self._order = cheapest_order(recording.moments, recording.layouts)
+            else:  # the filter finds a better start than the dynamics alone
+                self._order = "time"
+        return self._order
+
     def smoothed(self, covariances: bool = True, joint: bool = False) -> tuple[Smoothed, ...]:
         """Every moment, oldest first.
 
@@ -99,21 +136,34 @@ class BatchSmoother:
         nodes too, which takes more memory.
         """
         self._graduate()
-        return smoothed_moments(self._recording, covariances, joint)
+        recording, sparse = self._recording, None if joint else self._solution()
+        if sparse is None:
+            return smoothed_moments(recording, covariances, joint)
+        try:
+            P = sparse.covariances(recording.layouts) if covariances else None
+        except NoSolution as reason:
+            self._give_up(reason)
+            return smoothed_moments(recording, covariances, joint)
+        return tuple(
+            Smoothed(moment.time, layout, mean, None if P is None else P[k])
+            for k, (moment, layout, mean) in enumerate(
+                zip(recording.moments, recording.layouts, sparse.means, strict=True)
+            )
+        )
 
     def weights(self) -> list[list[FloatArray]]:
         """For each moment, for each of its updates, (m,) how much each measurement counts: 1 fully, 0 not at all."""
         self._graduate()
-        moments, layouts, means = self._recording.moments, self._recording.layouts, self._recording.means()
+        moments, layouts = self._recording.moments, self._recording.layouts
         return [
             [sighting.counted(layout, mean) for sighting in moment.sightings]
-            for moment, layout, mean in zip(moments, layouts, means, strict=True)
+            for moment, layout, mean in zip(moments, layouts, self._means(), strict=True)
         ]
 
     def graph(self) -> FactorGraph:
         """The recording as a GTSAM graph; outliers found by graduated non-convexity count by their weights."""
         self._graduate()
-        return self._recording.graph()
+        return self._recording.graph(self._means())
 
     def snapshot(self) -> tuple[RecordingState, bool]:
         """The whole state, as a value."""
@@ -123,6 +173,7 @@ class BatchSmoother:
         """Continue from a snapshot, bit-identically."""
         recording, self._graduated = state
         self._recording.restore(recording)
+        self._changed()
 
     def _newest(self) -> Newest:
         self._graduate()
@@ -154,10 +205,10 @@ class BatchSmoother:
 
     def _distances(self, loss: GraduatedNonConvexity) -> FloatArray:
         """Of all residuals under this loss, standard deviations."""
-        moments, layouts, means = self._recording.moments, self._recording.layouts, self._recording.means()
+        moments, layouts = self._recording.moments, self._recording.layouts
         parts = [
             sighting.distances(layout, mean)
-            for moment, layout, mean in zip(moments, layouts, means, strict=True)
+            for moment, layout, mean in zip(moments, layouts, self._means(), strict=True)
             for sighting in moment.sightings
             if sighting.robust == loss
         ]
@@ -177,6 +228,56 @@ class BatchSmoother:
                 sightings.append(sighting)
             moments.append(replace(moment, sightings=tuple(sightings)))
         self._recording.reweigh(moments)
+        self._sparse = None
+
+    def _means(self) -> Sequence[FloatArray]:
+        """Joint mean of every moment."""
+        sparse = self._solution()
+        return self._recording.means() if sparse is None else sparse.means
+
+    def _solution(self) -> _Sparse | None:
+        """The solution in a sparse order, None where that of time is better or the only one."""
+        if self.order != "time" and self._sparse is None:
+            equivalent = self._recording.graph(self._recording.rough_means())
+            try:
+                limit, linear = self._settings.max_iterations, self._recording.linear
+                values, tree = solved_tree(equivalent, self.order, limit, linear)
+                self._sparse = _Sparse.of(equivalent, values, tree)
+            except NoSolution as reason:
+                self._give_up(reason)
+        return self._sparse
+
+    def _give_up(self, reason: NoSolution) -> None:
+        """Sparse elimination does not do for this recording."""
+        log.info("eliminated in the order of time: %s", reason)
+        self._order, self._sparse = "time", None
+
+    def _changed(self) -> None:
+        self._order = self._sparse = None
+
+
+@dataclass(eq=False)
+class _Sparse:
+    """Means of every moment, and the tree from which covariances can be had."""
+
+    means: list[FloatArray]
+    equivalent: FactorGraph
+    tree: gtsam.GaussianBayesTree
+    known: list[MarginalCovariances] | None = None
+
+    @staticmethod
+    def of(equivalent: FactorGraph, values: gtsam.Values, tree: gtsam.GaussianBayesTree) -> _Sparse:
+        means = [
+            np.concatenate([np.empty(0), *(values.atVector(key) for key in keys.values())]) for keys in equivalent.keys
+        ]
+        return _Sparse(means, equivalent, tree)
+
+    def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
+        """Of all single states, by moment."""
+        if self.known is None:
+            blocks = tree_covariances(self.tree, self.equivalent.values.dims())
+            self.known = marginal_covariances(blocks, self.equivalent.keys, layouts)
+        return self.known
 
 
 def _sightings(moments: Sequence[Moment]) -> Iterable[Sighting]:

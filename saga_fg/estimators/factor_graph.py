@@ -25,6 +25,7 @@ from factors import (
     detection_factor,
     gaussian_factors,
     interaction_factor,
+    interaction_factors,
     joint_prior_factor,
     nonlinear_graph,
     prior_factors,
@@ -37,6 +38,7 @@ from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion, NodeMotion, Standstill
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.sighting import Sighting
+from saga_fg.transition import Blocks
 
 _SINGULAR = 1e-13  # share of the largest variance below which a direction has none
 
@@ -154,24 +156,46 @@ def _motion_factors(
     """Factors of an interval, native ones and those of nodes that move nonlinearly."""
     dynamics = motion.dynamics(layout, mean)
     special = {m.node: m for m in motion.nonlinear} if isinstance(motion, Motion) else {}
-    sources: list[list[tuple[int, FloatArray]]] = [[] for _ in range(len(layout))]
-    for blocks in dynamics.F:
-        for i, j, F in zip(blocks.target.tolist(), blocks.source.tolist(), blocks.values, strict=True):
-            sources[i].append((j, F))
+    now = np.array([keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
+    then = np.array([next_keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
     noise: dict[int, FloatArray] = {}
+    regular = np.zeros(len(layout), dtype=bool)  # native factors need noise in all directions
     for blocks in dynamics.Q:
         noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
-    native, nonlinear = [], []
-    for row, node in enumerate(layout.nodes.tolist()):
-        d = int(layout.dims[row])
+        variances = np.linalg.eigvalsh(blocks.values)
+        regular[blocks.target] = variances[:, 0] > _SINGULAR * variances[:, -1]
+    regular[layout.rows(list(special))] = False
+    kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
+    for blocks in dynamics.F:
+        kinds[np.unique(blocks.target)] += 1
+    together = regular & (kinds == 1)
+    native: list[gtsam.JacobianFactor] = []
+    for blocks in dynamics.F:
+        mine = np.flatnonzero(together[blocks.target])
+        mine = mine[np.argsort(blocks.target[mine], kind="stable")]
+        rows, first = np.unique(blocks.target[mine], return_index=True)
+        if len(rows):
+            b = dynamics.b[layout.spans(rows)]
+            Q = np.stack([noise[row] for row in rows.tolist()])
+            names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
+            native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
+    nonlinear = []
+    for row in np.flatnonzero(~together).tolist():
+        d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
         if node in special:
             nonlinear.append(_nonlinear_motion(special[node], keys, next_keys, layout, motion.dt, Q))
             continue
-        names = [keys[int(layout.nodes[j])] for j, _ in sources[row]]
-        offset = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
-        native.append(_interaction_factor(next_keys[node], names, [F for _, F in sources[row]], offset, Q))
+        heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
+        b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
+        native.append(_interaction_factor(int(then[row]), [key for key, _ in heard], [F for _, F in heard], b, Q))
     return native, nonlinear
+
+
+def _of_row(blocks: Blocks, row: int) -> list[tuple[int, FloatArray]]:
+    """Source rows and blocks of one node."""
+    mine = np.flatnonzero(blocks.target == row)
+    return list(zip(blocks.source[mine].tolist(), blocks.values[mine], strict=True))
 
 
 def _nonlinear_motion(

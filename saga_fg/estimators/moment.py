@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct
@@ -101,6 +103,21 @@ class Pass:
             at = mean if len(mean) == len(at) else mean[self.layout.places(self.layout.rows(x.layout.nodes))]
         dynamics = motion.dynamics(x.layout, at)
         return replace(self, dynamics=dynamics), predict(dynamics.separated(x), dynamics)
+
+
+def reckoned(prior: BlockGaussian, moments: Sequence[Moment], layouts: Sequence[Layout]) -> list[FloatArray]:
+    """Joint means of every moment by the dynamics alone, whatever was seen."""
+    means, mean = [], prior.mean
+    for moment, layout in zip(moments, layouts, strict=True):
+        mean = np.concatenate([mean, *(birth.means.ravel() for birth in moment.births)])
+        means.append(mean)
+        if moment.motion is not None:
+            gone = layout.rows(moment.gone)
+            stay = layout.without(gone) if len(gone) else layout
+            before = mean[layout.places(layout.rows(stay.nodes))]
+            dynamics = moment.motion.dynamics(stay, before)
+            mean = np.asarray(dynamics.matrix @ before + dynamics.b)
+    return means
 
 
 def arrival(prior: BlockGaussian) -> Pass:

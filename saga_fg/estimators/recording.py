@@ -25,8 +25,9 @@ from saga_fg.estimators.backward import (
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.factor_graph import FactorGraph, recording_graph
+from saga_fg.estimators.fixed_point import FixedPoint
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.moment import Birth, Moment, Pass, arrival, passed
+from saga_fg.estimators.moment import Birth, Moment, Pass, arrival, passed, reckoned
 from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.sighting import Sighting
 from saga_fg.settings import setting
@@ -40,8 +41,8 @@ _SAME_TIME = 1e-9  # s
 class GaussNewtonSettings:
     """When the linearisation of what is nonlinear or robust is good enough."""
 
-    max_iterations: int = setting(50, "linearisations of everything recorded at most")
-    tolerance: float = setting(1e-10, "largest step of a mean, in standard deviations, at which it has converged")
+    max_iterations: int = setting(100, "linearisations of everything recorded at most")
+    tolerance: float = setting(1e-9, "largest step of a mean, in standard deviations, at which it has converged")
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
@@ -105,6 +106,11 @@ class Recording:
     @property
     def moments(self) -> Sequence[Moment]:
         return self._moments
+
+    @property
+    def linear(self) -> bool:
+        """Whether nothing is nonlinear or robust."""
+        return not self._nonlinear
 
     @property
     def layouts(self) -> Sequence[Layout]:
@@ -217,13 +223,20 @@ class Recording:
             self._marginals = [MarginalCovariances.of(whole) for whole in smoothed_covariances(self._passes)][::-1]
         return self._marginals
 
-    def graph(self) -> FactorGraph:
-        """The equivalent factor graph, with the smoothed means as values."""
-        return recording_graph(self._prior, self._moments, self._layouts, self.means())
+    def graph(self, means: Sequence[FloatArray] | None = None) -> FactorGraph:
+        """The equivalent factor graph, with the smoothed means, or others, as values."""
+        return recording_graph(self._prior, self._moments, self._layouts, self.means() if means is None else means)
+
+    def rough_means(self) -> list[FloatArray]:
+        """Joint mean of every moment from which a solution can be found: the filter's, if it takes a good start."""
+        if not self._nonlinear:
+            return reckoned(self._prior, self._moments, self._layouts)
+        self._passes = _completed(self._passes, self._prior, self._moments)
+        return [state.filtered.mean for state in self._passes]
 
     def reweigh(self, moments: Sequence[Moment]) -> None:
         """Put moments in place that differ in the weights of their sightings only."""
-        passes = passed(self._prior, list(moments), self.means() if self._nonlinear else None)
+        passes = [] if self._lazy else passed(self._prior, list(moments), self.means() if self._nonlinear else None)
         self._moments, self._passes = list(moments), passes
         self._converged = not self._nonlinear
         self._changed()
@@ -233,18 +246,18 @@ class Recording:
         self._passes = _completed(self._passes, self._prior, self._moments)
         if self._converged:
             return
-        means, before, share, step = smoothed_means(self._passes), math.inf, 1.0, math.inf
-        for iteration in range(self._settings.max_iterations):
+        means, step, iteration = smoothed_means(self._passes), math.inf, FixedPoint()
+        ends = np.cumsum([len(mean) for mean in means])[:-1]
+        for count in range(self._settings.max_iterations):
             passes = passed(self._prior, self._moments, means)
             solved = smoothed_means(passes)
-            step = _largest_step(means, solved, passes)
-            log.debug("iteration %d: largest step %.3g standard deviations", iteration + 1, step)
+            sigma = np.sqrt(np.concatenate([state.filtered.variances() for state in passes]))
+            before, after = np.concatenate(means), np.concatenate(solved)
+            step = float(np.max(np.abs(after - before) / sigma, initial=0.0))
+            log.debug("iteration %d: largest step %.3g standard deviations", count + 1, step)
             if step <= self._settings.tolerance:
                 break
-            if step >= before:  # it does not settle: shorter steps
-                share /= 2
-            before = step
-            means = [old + share * (new - old) for new, old in zip(solved, means, strict=True)]
+            means = np.split(iteration.next(before, after, sigma), ends)
         else:
             log.warning("no convergence in %d iterations; last step %.2g sigma", self._settings.max_iterations, step)
         self._passes, self._converged = passes, True
@@ -303,12 +316,3 @@ def _completed(passes: list[Pass], prior: BlockGaussian, moments: list[Moment]) 
         assert motion is not None
         done[-1], prior = done[-1].moved(moments[k - 1].gone, motion)
     return done + passed(prior, moments[k:])
-
-
-def _largest_step(before: list[FloatArray], after: list[FloatArray], passes: list[Pass]) -> float:
-    """In standard deviations of the filter."""
-    steps = (
-        float(np.max(np.abs(new - old) / np.sqrt(state.filtered.variances()), initial=0.0))
-        for new, old, state in zip(after, before, passes, strict=True)
-    )
-    return max(steps, default=0.0)
