@@ -81,6 +81,7 @@ class Following:
     gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
     lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
+    parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
     def __post_init__(self) -> None:
@@ -101,6 +102,8 @@ class Following:
         exponent = (
             (ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (turn / self.heading_scale) ** 2
         )
+        if nodes.has_moved is not None and not self.parked:
+            led &= nodes.has_moved[target]
         rate = np.where(led, self.rate * np.exp(-exponent / 2), 0.0)
         nearest = _nearest_leader(target, np.where(led, ahead + 10 * np.abs(lateral), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])

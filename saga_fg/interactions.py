@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.node import NodeType
 from saga_fg.settings import require_between, require_one_of, require_positive, setting
 
@@ -32,7 +32,9 @@ class NodeTable:
     """The nodes as rules and interactions see them: estimates at the start of an interval, in world coordinates.
 
     id (n,); label (n,) classes; types n node types; position (n, 2) m; velocity (n, 2) m/s; heading (n,) rad;
-    length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2
+    length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2;
+    has_moved (n,) whether a node was ever clearly in motion, which tells a parked car from one that waits in a queue;
+    None if nobody knows
     """
 
     id: IntArray
@@ -43,6 +45,7 @@ class NodeTable:
     heading: FloatArray
     length: FloatArray
     velocity_variance: FloatArray
+    has_moved: BoolArray | None = None
 
     def __len__(self) -> int:
         return len(self.id)

@@ -23,7 +23,7 @@ from saga_fg.interactions import NodeTable
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.track import Tracks
-from saga_fg.tracking.box_filter import BoxFilter
+from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.observation import Observed, observe
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
@@ -44,6 +44,7 @@ class _Columns:
     last_seen: FloatArray
     last_in_view: FloatArray
     confirmed: BoolArray
+    has_moved: BoolArray
 
     def select(self, rows: IntArray | BoolArray) -> _Columns:
         return _Columns(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -83,7 +84,14 @@ class Tracker:
         self._next_id = 1
         none = np.empty(0)
         self._columns = _Columns(
-            np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, none, none, none, none.astype(bool)
+            np.empty(0, dtype=np.int64),
+            np.empty(0, dtype="<U1"),
+            none,
+            none,
+            none,
+            none,
+            none.astype(bool),
+            none.astype(bool),
         )
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
 
@@ -189,7 +197,11 @@ class Tracker:
             t, boxes.size[d], p, boxes.position[d, 2], observed.z_noise[d], boxes.yaw[d], observed.yaw_noise[d]
         )
         if len(columns.id):
-            self._box.face_motion(self._kinematics()[1])
+            now = self._kinematics()
+            self._box.face_motion(now.velocity)
+            speed = np.hypot(*now.velocity.T)
+            sigma = np.sqrt(np.trace(now.P_velocity, axis1=1, axis2=2) / 2)
+            columns.has_moved[t] |= ((speed > MOVING) & (speed > 3 * sigma))[t]
 
     def _believe(
         self, observed: Observed, matching: Matching, sensor: Sensor, frame: Frame, elapsed: float, delay: float
@@ -241,7 +253,16 @@ class Tracker:
         self._state.add(ids, boxes.label, start, delay)
         seen, now = np.full(len(born), self._time - delay), np.full(len(born), self._time)
         self._columns = self._columns.extended(
-            _Columns(ids, boxes.label, p.copy(), p.copy(), seen, now, p >= self.settings.existence.confirm)
+            _Columns(
+                ids,
+                boxes.label,
+                p.copy(),
+                p.copy(),
+                seen,
+                now,
+                p >= self.settings.existence.confirm,
+                np.zeros(len(born), bool),
+            )
         )
         self._box = self._box.extended(
             BoxFilter.born(
@@ -308,6 +329,7 @@ class Tracker:
             heading,
             np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
             np.trace(P_velocity, axis1=1, axis2=2) / 2,
+            columns.has_moved,
         )
 
     def _of_class(self, name: str, label: StrArray) -> FloatArray:
