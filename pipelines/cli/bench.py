@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +41,7 @@ def occlusion(
     """What the graph is worth where objects hide, on simulated traffic.
 
     Both methods have the process noise that is most likely on the fitting scenes, and differ in the edges alone. An
-    object is hidden when no sensor sees it; a lost one counts with an error of 5 m.
+    object is hidden when no sensor sees it, and occluded if it is seen again.
 
     \b
     Examples:
@@ -57,27 +58,29 @@ def occlusion(
         raise InputError(f"--fit-seed {fit_seed}: expected other scenes to fit on than to compare on")
     with progress_bar() as progress:
         result = run(load_config("simulated", config), seeds, fit_seeds, progress=progress)
-    table = Table(title=f"hidden objects in {scenes} simulated scenes", title_justify="left")
-    for column in ("method", "RMSE, m", "mean, m", "median, m", "in view: RMSE, m", "MOTA", "ID switches"):
+    table = Table(title=f"{scenes} simulated scenes; RMSE in m, lost objects count with 5 m", title_justify="left")
+    for column in ("method", "hidden", "occluded", "in view", "hidden: median", "MOTA", "ID switches"):
         table.add_column(column, justify="left" if column == "method" else "right")
-    for method, m in result.metrics.items():
-        errors = (m.carried.rmse, m.carried.mean, m.carried.median, m.position.rmse, m.mota)
+    for method, m in result.hidden.items():
+        carried = m.carried
+        errors = (carried.rmse, result.occluded[method].carried.rmse, m.position.rmse, carried.median, m.mota)
         table.add_row(method, *(f"{x:.3f}" for x in errors), str(m.switches))
     Console().print(table)
     noise = ", ".join(f"{label} {q:.3g}" for label, q in result.acceleration_noise.items())
     typer.echo(f"acceleration noise fitted on {fit_scenes} other scenes, m^2/s^3: {noise}")
-    change = result.change
-    typer.echo(
-        f"RMSE of hidden objects, saga against kf: {100 * change.estimate:+.1f} % "
-        f"({100 * change.confidence:.0f} % interval {100 * change.low:+.1f} to {100 * change.high:+.1f} %)"
-    )
+    for name, change in (("hidden", result.hidden_change), ("occluded", result.occluded_change)):
+        typer.echo(
+            f"RMSE of {name} objects, saga against kf: {100 * change.estimate:+.1f} % "
+            f"({100 * change.confidence:.0f} % interval {100 * change.low:+.1f} to {100 * change.high:+.1f} %)"
+        )
     if json_file is not None:
         figures = {
             "seeds": result.seeds,
             "fit_seeds": result.fit_seeds,
             "acceleration_noise": result.acceleration_noise,
-            "hidden_rmse": {method: m.carried.rmse for method, m in result.metrics.items()},
-            "hidden_median": {method: m.carried.median for method, m in result.metrics.items()},
-            "change": {"estimate": change.estimate, "low": change.low, "high": change.high},
+            "occluded_rmse": {method: m.carried.rmse for method, m in result.occluded.items()},
+            "occluded_change": asdict(result.occluded_change),
+            "hidden_rmse": {method: m.carried.rmse for method, m in result.hidden.items()},
+            "hidden_change": asdict(result.hidden_change),
         }
         write_text(json_file, json.dumps(figures, indent=1) + "\n")
