@@ -143,8 +143,8 @@ class Cover:
         a = np.concatenate([self.home[rows], self.cluster])
         b = np.concatenate([self.home[columns], self.home[self.node]])
         ties = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
-        joint = connected_components(ties, directed=False)[1][self.home]
-        first = np.full(count, n + count)
+        joint: IntArray = connected_components(ties, directed=False)[1][self.home]
+        first: IntArray = np.full(count, n + count)
         np.minimum.at(first, joint, self.home)
         return first[joint]
 
