@@ -28,15 +28,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     The temporary file is opened at once, so a folder one cannot write to is noticed before any work is done.
     Raises `InputError` if the folder is missing or not writable, if `path` is not a regular file, or the disk full.
     """
-    final = _final(path)
-    if final.exists() and not final.is_file():
-        kind = "a folder" if final.is_dir() else "no regular file"
-        raise InputError(f"{path}: expected the name of a file to write, this is {kind}")
-    temporary = _temporary(final)
-    try:
-        file = temporary.open("xb")
-    except OSError as error:
-        raise _not_writable(final, error) from error
+    final, temporary, file = _opened(path)
     try:
         with _disk_full(final), file:
             yield file
@@ -87,6 +79,27 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def write_text(path: str | Path, content: str) -> None:
     """Write a whole UTF-8 text file atomically. Raises `InputError` as `atomic_file` does."""
     write_bytes(path, content.encode("utf-8"))
+
+
+def check_writable(path: str | Path) -> None:
+    """Raise the `InputError` that `atomic_file` would raise: before long work, not after it."""
+    _, temporary, file = _opened(path)
+    file.close()
+    temporary.unlink()
+
+
+def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:
+    """The file to write, its temporary stand-in, and that opened."""
+    final = _final(path)
+    if final.exists() and not final.is_file():
+        kind = "a folder" if final.is_dir() else "no regular file"
+        raise InputError(f"{path}: expected the name of a file to write, this is {kind}")
+    temporary = _temporary(final)
+    try:
+        file = temporary.open("xb")
+    except OSError as error:
+        raise _not_writable(final, error) from error
+    return final, temporary, file
 
 
 def _final(path: str | Path) -> Path:

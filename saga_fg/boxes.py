@@ -13,6 +13,9 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, checked, c
 from saga_fg.errors import InputError
 from saga_fg.geometry import transform_points, wrap_angle
 
+MAX_POSITION = 1e9  # m; beyond, distances have no digits left
+MAX_SPEED = 1e6  # m/s
+
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
@@ -40,6 +43,12 @@ class Boxes:
         if (size <= 0).any():
             row = int(np.argwhere(size <= 0)[0][0])
             raise InputError(f"size[{row}]: expected positive length, width, height in m, got {size[row].tolist()}")
+        for name, given, limit in (("position", self.position, MAX_POSITION), ("velocity", self.velocity, MAX_SPEED)):
+            columns = 3 if name == "position" else 2
+            values = checked(name, given, (n, columns), "finite" if name == "position" else "finite-or-nan")
+            if (np.abs(values) > limit).any():
+                row = int(np.argwhere(np.abs(values) > limit)[0][0])
+                raise InputError(f"{name}[{row}]: expected numbers within {limit:g}, got {values[row].tolist()}")
         yaw = wrap_angle(checked("yaw", self.yaw, (n,), "finite-or-nan"))
         yaw.flags.writeable = False
         for name, array in (

@@ -48,7 +48,7 @@ def occlusion(
       saga-fg bench occlusion
       saga-fg bench occlusion --scenes 20 --seed 100 --json figures.json
     """
-    from data_tools.atomic_files import write_text
+    from data_tools.atomic_files import check_writable, write_text
     from pipelines.bench.occlusion import occlusion as run
     from pipelines.config import load_config
     from saga_fg.errors import InputError
@@ -56,6 +56,8 @@ def occlusion(
     fit_seeds, seeds = range(fit_seed, fit_seed + fit_scenes), range(seed, seed + scenes)
     if set(fit_seeds) & set(seeds):
         raise InputError(f"--fit-seed {fit_seed}: expected other scenes to fit on than to compare on")
+    if json_file is not None:
+        check_writable(json_file)
     with progress_bar() as progress:
         result = run(load_config("simulated", config), seeds, fit_seeds, progress=progress)
     table = Table(title=f"{scenes} simulated scenes; RMSE in m, lost objects count with 5 m", title_justify="left")
@@ -84,3 +86,27 @@ def occlusion(
             "hidden_change": asdict(result.hidden_change),
         }
         write_text(json_file, json.dumps(figures, indent=1) + "\n")
+
+
+@bench_app.command()
+def bounded(
+    nodes: Annotated[int, typer.Option("--nodes", min=10, help="Nodes of one connected graph.")] = 1000,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames that are counted.")] = 10,
+    mixing: Annotated[float, typer.Option("--mixing", help="Share of velocity taken over in a frame.")] = 0.35,
+    verbose: Verbose = False,
+) -> None:
+    """The bounded filter against the exact one: time, error and consistency for bounds of 1, 2 and 3 hops.
+
+    \b
+    Example:
+      saga-fg bench bounded --nodes 300 --frames 5
+    """
+    from pipelines.bench.bounded import BoundedBenchSettings, bench_bounded
+
+    table = Table(title=f"bounded filter, {nodes} connected nodes", title_justify="left")
+    for column in ("hops", "ms", "time / exact", "mean error, sigma", "worst, sigma", "ANEES / exact"):
+        table.add_column(column, justify="right")
+    for row in bench_bounded(BoundedBenchSettings(nodes=nodes, frames=frames, mixing=mixing)):
+        figures = (row.milliseconds, row.ratio, row.mean_error, row.worst_error, row.anees_ratio)
+        table.add_row(str(row.hops), *(f"{x:.3g}" for x in figures))
+    Console().print(table)

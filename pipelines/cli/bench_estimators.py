@@ -50,7 +50,7 @@ def estimators(
       saga-fg bench estimators
       saga-fg bench estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
     """
-    from data_tools.atomic_files import write_text
+    from data_tools.atomic_files import check_writable, write_text
     from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
     from saga_fg.errors import InputError
 
@@ -61,6 +61,8 @@ def estimators(
     settings = EstimatorBenchSettings(
         numbers, frames, seconds, batch_frames, batch_nodes, soak_frames, soak_nodes, seed, everything
     )
+    if json_file is not None:
+        check_writable(json_file)
     with progress_bar(unit="cases") as progress:
         result = bench_estimators(settings, progress)
     _print(result)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, names, sensor_files
+from pipelines.cli.options import Config, Verbose, apart, estimator_fits, names, sensor_files
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import Summary
 from saga_fg.errors import InputError
@@ -81,9 +81,13 @@ def nuscenes(
 
     if (split is None) == (scenes is None):
         raise InputError("expected either --split NAME or --scenes A,B")
-    settings = load_config("nuscenes", config).with_estimator(estimator, lag)
+    settings = load_config("nuscenes", config)
+    estimator_fits(method, estimator, lag, settings.tracker.estimator)
+    settings = settings.with_estimator(estimator, lag)
     chosen = split_scenes(dataroot, version, split) if split is not None else names("--scenes", scenes or "")
-    dataset = NuScenes(dataroot, version, sensor_files(detections), chosen)
+    files = sensor_files(detections)
+    apart(output, *files.values())
+    dataset = NuScenes(dataroot, version, files, chosen)
     summary = Summary(output)
     with progress_bar(len(chosen)) as progress:
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
@@ -118,7 +122,9 @@ def kitti(
     from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
-    settings = load_config("kitti", config).with_estimator(estimator, lag)
+    settings = load_config("kitti", config)
+    estimator_fits(method, estimator, lag, settings.tracker.estimator)
+    settings = settings.with_estimator(estimator, lag)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
     summary = Summary(output)
     with progress_bar(len(dataset.scenes)) as progress:
@@ -154,7 +160,10 @@ def file(
     from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
-    settings = load_config("file", config).with_estimator(estimator, lag)
+    settings = load_config("file", config)
+    estimator_fits(method, estimator, lag, settings.tracker.estimator)
+    settings = settings.with_estimator(estimator, lag)
+    apart(output, detections)
     dataset = read_detections(detections)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
     summary = Summary(output)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.atomic_files import atomic_directory, atomic_file, write_bytes, write_text
+from data_tools.atomic_files import atomic_directory, atomic_file, check_writable, write_bytes, write_text
 from saga_fg.errors import InputError
 
 
@@ -150,3 +150,11 @@ def test_directory_path_that_is_a_file(tmp_path: Path) -> None:
 def test_other_os_errors_pass(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "out"):
         (tmp_path / "elsewhere").read_text()
+
+
+def test_a_path_is_checked_before_long_work(tmp_path: Path) -> None:
+    check_writable(tmp_path / "new.json")
+    assert list(tmp_path.iterdir()) == []
+    for path in (tmp_path, tmp_path / "missing" / "new.json"):
+        with pytest.raises(InputError, match=path.name):
+            check_writable(path)

@@ -1,0 +1,51 @@
+"""Options of `saga-fg track` that contradict each other or would destroy the input are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pipelines.cli.main import app
+
+ROWS = "timestamp,x,y\n0.0,1.0,2.0\n0.1,1.5,2.0\n"
+
+
+def run(*arguments: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["track", "file", *arguments])
+    return result.exit_code, result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--method", "centerpoint", "--estimator", "isam2"), "has no estimator"),
+        (("--lag", "1"), "goes with --estimator fixed-lag"),
+        (("--estimator", "kalman", "--lag", "1"), "goes with --estimator fixed-lag"),
+    ],
+)
+def test_an_option_without_effect_is_refused(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+    detections, output = tmp_path / "detections.csv", tmp_path / "tracks.csv"
+    detections.write_text(ROWS)
+    code, text = run(str(detections), "--output", str(output), *arguments)
+    assert code == 2
+    assert message in text
+    assert not output.exists()
+
+
+def test_the_output_may_not_be_the_input(tmp_path: Path) -> None:
+    detections = tmp_path / "detections.csv"
+    detections.write_text(ROWS)
+    code, text = run(str(detections), "--output", str(detections))
+    assert code == 2
+    assert "another file" in text
+    assert detections.read_text() == ROWS
+
+
+def test_a_place_without_digits_is_refused(tmp_path: Path) -> None:
+    detections = tmp_path / "detections.csv"
+    detections.write_text("timestamp,x,y\n0.0,1e200,2.0\n0.0,0.0,1.0\n")
+    code, text = run(str(detections), "--output", str(tmp_path / "tracks.csv"))
+    assert code == 2
+    assert "within 1e+09" in text
