@@ -44,7 +44,7 @@ def smoothed_means(passes: Sequence[Pass]) -> list[FloatArray]:
         if after is None or dynamics is None:
             means.append(x.mean)
         else:
-            back: FloatArray = np.asarray(dynamics.matrix.T @ after)
+            back = dynamics.moved_back(after)
             if len(back) == len(r):
                 r = back
             else:

@@ -105,6 +105,10 @@ def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray)
     """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
     d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
     result = np.empty((len(rows), d, d))
+    if partition.size and len(partition.groups) == 1:
+        slot = partition.slot[rows]
+        own: FloatArray = partition.by_nodes(blocks[0])[partition.row[rows], slot, slot]
+        return own
     for number, members, at in partition.members(rows, d):
         row = partition.row[rows[members]]
         result[members] = blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]]

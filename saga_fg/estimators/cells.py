@@ -160,7 +160,7 @@ class Cells:
             flat[at + (new.offset[node][:, None, None] + np.arange(d_i)[:, None])] = values
 
         W = {d: np.zeros((len(layout), d, d)) for d in np.unique(layout.dims).tolist()}
-        left_over = dynamics.matrix @ before.origin[before.partition.layout.places(rows)] + dynamics.b - self.origin
+        left_over = dynamics.moved(before.origin[before.partition.layout.places(rows)]) + dynamics.b - self.origin
         for noise in dynamics.Q:
             node, d = noise.target, noise.values.shape[1]
             W[d][node] = np.linalg.inv(np.linalg.cholesky(noise.values))

@@ -52,8 +52,11 @@ def correct(
     gains = []
     log_likelihood = -0.5 * z.size * math.log(2 * math.pi)
     for number, members, at in partition.members(rows, H.shape[2]):
-        active, component = np.unique(partition.row[rows[members]], return_inverse=True)
+        component = partition.row[rows[members]]
+        active = np.flatnonzero(np.bincount(component, minlength=len(partition.groups[number])))
         every = len(active) == len(partition.groups[number])
+        if not every:
+            component = np.searchsorted(active, component)
         P = blocks[number] if every else blocks[number][active]
         places = partition.groups[number] if every else partition.groups[number][active]
         stacked = _stacked(P, mean, places, component, at, z[members], H[members], R[members])
@@ -133,29 +136,32 @@ def _stacked(
 
     component (m,): the one that a measurement is of; at (m, d): the entries of its state that H sees.
     """
-    (c, s, _), k = P.shape, H.shape[1]
+    (c, s, _), (k, d) = P.shape, H.shape[1:]
     slot = rank(component)  # of a measurement among those of its component
     most = int(slot.max()) + 1
-    a = most * k
-    row = slot[:, None] * k + np.arange(k)
-    H_P, H_all, R_all, innovation = np.zeros((c, a, s)), np.zeros((c, a, s)), np.zeros((c, a, a)), np.zeros((c, a, 1))
-    H_P[component[:, None], row] = H @ P[component[:, None], at]
-    H_all[component[:, None, None], row[:, :, None], at[:, None, :]] = H
-    R_all[component[:, None, None], row[:, :, None], row[:, None, :]] = R
-    innovation[component[:, None], row, 0] = z - (H @ mean[places[component[:, None], at]][:, :, None])[:, :, 0]
+    H_P, H_all, innovation = np.zeros((c, most, k, s)), np.zeros((c, most, k, s)), np.zeros((c, most, k))
+    R_all = np.zeros((c, most, k, most, k))
+    H_P[component, slot] = H @ P[component[:, None], at]
+    if s % d == 0 and not (at[:, 0] % d).any():  # states of equal size: node by node
+        H_all.reshape(c, most, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H
+    else:
+        H_all[component[:, None, None], slot[:, None, None], np.arange(k)[:, None], at[:, None, :]] = H
+    R_all[component, slot, :, slot, :] = R
+    innovation[component, slot] = z - (H @ mean[places[component[:, None], at]][:, :, None])[:, :, 0]
     if len(component) < c * most:
-        empty = np.ones((c, a), dtype=bool)
-        empty[component[:, None], row] = False
+        empty = np.ones((c, most), dtype=bool)
+        empty[component, slot] = False
         i, j = np.nonzero(empty)
-        R_all[i, j, j] = 1.0
-    return _Stacked(H_P, H_all, R_all, innovation)
+        R_all[i, j, :, j, :] = np.eye(k)
+    a = most * k
+    return _Stacked(H_P.reshape(c, a, s), H_all.reshape(c, a, s), R_all.reshape(c, a, a), innovation.reshape(c, a, 1))
 
 
 def _innovation_root(stacked: _Stacked) -> FloatArray:
     """L (c, a, a) of S = H P H^T + R = L L^T."""
     S = stacked.H_P @ np.swapaxes(stacked.H, 1, 2) + stacked.R
     try:
-        return np.asarray(np.linalg.cholesky((S + np.swapaxes(S, 1, 2)) / 2), dtype=np.float64)
+        return np.asarray(np.linalg.cholesky(S), dtype=np.float64)  # reads the lower triangle alone
     except np.linalg.LinAlgError:
         raise InputError(
             f"measurements: their noise is lost in the rounding of what is predicted, variances up to {S.max():.3g}"

@@ -64,6 +64,26 @@ class Dynamics:
         layout = Layout(self.layout.nodes[rows], self.layout.dims[rows])
         return Dynamics(layout, _renamed(some.F, where), self.b[self.layout.places(rows)], _renamed(some.Q, where))
 
+    def moved(self, x: FloatArray) -> FloatArray:
+        """F x of a joint state (D,)."""
+        starts, result = self.layout.offsets[:-1], np.zeros(self.layout.size)
+        for F in self.F:
+            _, d_i, d_j = F.values.shape
+            products = F.values @ x[starts[F.source][:, None] + np.arange(d_j)][:, :, None]
+            at = starts[F.target][:, None] + np.arange(d_i)
+            result += np.bincount(at.ravel(), weights=products.ravel(), minlength=len(result))
+        return result
+
+    def moved_back(self, r: FloatArray) -> FloatArray:
+        """F^T r of a gradient (D,)."""
+        starts, result = self.layout.offsets[:-1], np.zeros(self.layout.size)
+        for F in self.F:
+            _, d_i, d_j = F.values.shape
+            products = r[starts[F.target][:, None] + np.arange(d_i)][:, None] @ F.values
+            at = starts[F.source][:, None] + np.arange(d_j)
+            result += np.bincount(at.ravel(), weights=products.ravel(), minlength=len(result))
+        return result
+
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
         """F (D, D), sparse."""
@@ -82,35 +102,47 @@ class Dynamics:
         tied = self.joined(Partition.apart(x.layout))
         return x if tied.count == self.joined(x.partition).count else x.decoupled()
 
-    def propagated(self, partition: Partition, blocks: BlockDiagonal) -> BlockDiagonal:
-        """F X F^T of a block-diagonal symmetric X, over a partition whose components F does not leave."""
-        return self._congruence(partition, blocks, transposed=False)
+    def propagated(self, x: BlockGaussian) -> tuple[FloatArray, BlockDiagonal]:
+        """F m and the blocks of F P F^T, for components that F does not leave."""
+        mean, blocks = np.empty_like(x.mean), []
+        for number, (places, P) in enumerate(zip(x.partition.groups, x.blocks, strict=True)):
+            if P.shape[1] < _SPARSE_FROM:
+                F = self._dense(x.partition, number)
+                mean[places] = (F @ x.mean[places][:, :, None])[:, :, 0]
+                product = F @ P @ np.swapaxes(F, 1, 2)
+            else:
+                product = np.empty_like(P)
+                for component, factor in enumerate(self._components(x.partition, number)):
+                    mean[places[component]] = factor @ x.mean[places[component]]
+                    product[component] = factor @ np.ascontiguousarray((factor @ P[component]).T)
+            blocks.append(_symmetric(product))
+        return mean, tuple(blocks)
 
     def pulled_back(self, partition: Partition, blocks: BlockDiagonal) -> BlockDiagonal:
         """F^T X F of a block-diagonal symmetric X, over a partition whose components F does not leave."""
-        return self._congruence(partition, blocks, transposed=True)
+        result = []
+        for number, X in enumerate(blocks):
+            if X.shape[1] < _SPARSE_FROM:
+                F = self._dense(partition, number)
+                product = np.swapaxes(F, 1, 2) @ X @ F
+            else:
+                product = np.empty_like(X)
+                for component, factor in enumerate(self._components(partition, number)):
+                    left = factor.T.tocsr()
+                    product[component] = left @ np.ascontiguousarray((left @ X[component]).T)
+            result.append(_symmetric(product))
+        return tuple(result)
 
     def add_noise(self, partition: Partition, blocks: BlockDiagonal) -> None:
         """Add Q to the diagonal blocks of `blocks`, in place."""
         for noise in self.Q:
+            if partition.size and len(partition.groups) == 1:
+                row, slot = partition.row[noise.target], partition.slot[noise.target]
+                partition.by_nodes(blocks[0])[row, slot, slot] += noise.values
+                continue
             for number, members, at in partition.members(noise.target, noise.values.shape[1]):
                 row = partition.row[noise.target[members]]
                 blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]] += noise.values[members]
-
-    def _congruence(self, partition: Partition, blocks: BlockDiagonal, transposed: bool) -> BlockDiagonal:
-        result = []
-        for number, X in enumerate(blocks):
-            product: FloatArray
-            if X.shape[1] < _SPARSE_FROM:
-                F = self._dense(partition, number)
-                product = np.swapaxes(F, 1, 2) @ X @ F if transposed else F @ X @ np.swapaxes(F, 1, 2)
-            else:
-                product = np.empty_like(X)
-                for component, factor in enumerate(self._components(partition, number)):
-                    left = factor.T.tocsr() if transposed else factor
-                    product[component] = left @ np.ascontiguousarray((left @ X[component]).T)
-            result.append((product + np.swapaxes(product, 1, 2)) / 2)
-        return tuple(result)
 
     def _dense(self, partition: Partition, number: int) -> FloatArray:
         """F of each component of a group, (c, s, s)."""
@@ -122,6 +154,10 @@ class Dynamics:
             if len(partition.groups) > 1:
                 members = np.flatnonzero(partition.group[target] == number)
                 target, source, values = target[members], source[members], values[members]
+            if partition.size:
+                nodes = partition.row[target], partition.slot[target], partition.slot[source]
+                partition.by_nodes(F)[nodes] = values
+                continue
             i = partition.offset[target][:, None, None] + np.arange(d_i)[:, None]
             j = partition.offset[source][:, None, None] + np.arange(d_j)
             F[partition.row[target][:, None, None], i, j] = values
@@ -145,12 +181,19 @@ class Dynamics:
 def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
     """The prior after the interval. Raises `InputError` where it is not finite."""
     partition = dynamics.joined(x.partition)
-    mean = np.asarray(dynamics.matrix @ x.mean + dynamics.b)
-    blocks = dynamics.propagated(partition, x.over(partition).blocks)
+    mean, blocks = dynamics.propagated(x.over(partition))
+    mean += dynamics.b
     dynamics.add_noise(partition, blocks)
     if not (np.isfinite(mean).all() and all(np.isfinite(block).all() for block in blocks)):
         raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
     return BlockGaussian(partition, mean, blocks)
+
+
+def _symmetric(product: FloatArray) -> FloatArray:
+    """Without what rounding has done to the symmetry of a stack."""
+    symmetric = product + np.swapaxes(product, 1, 2)
+    symmetric *= 0.5
+    return np.asarray(symmetric)
 
 
 def _where(kept: BoolArray, groups: tuple[Blocks, ...]) -> tuple[Blocks, ...]:
@@ -178,4 +221,6 @@ def _sparse(groups: tuple[Blocks, ...], starts: IntArray, size: int) -> scipy.sp
     if not rows:
         return scipy.sparse.csr_array((size, size))
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return scipy.sparse.csr_array(entries, shape=(size, size))
+    matrix = scipy.sparse.csr_array(entries, shape=(size, size))
+    matrix.eliminate_zeros()  # blocks are mostly zeros: a neighbour's velocity says nothing across the axes
+    return matrix

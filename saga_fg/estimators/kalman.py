@@ -46,10 +46,11 @@ class JointKalmanFilter:
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
 
     def predict(self, transition: Transition) -> None:
-        state = predict(self._state, Dynamics.of(transition, self._state.layout))
+        dynamics = Dynamics.of(transition, self._state.layout)
+        look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
+        self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         self._predictions += 1
         self._time += transition.dt
-        self._state = state.decoupled() if self._predictions % _DECOUPLE_EVERY == 0 else state
 
     def update(self, measurements: Measurements) -> float:
         if len(measurements) == 0:

@@ -31,6 +31,8 @@ class Layout:
         ids = np.asarray(nodes)
         if ids.ndim != 1 or (ids.size and ids.dtype.kind not in "iu"):
             raise InputError(f"nodes: expected a list of integer ids, got {nodes!r}")
+        if len(ids) == len(self.nodes) and (ids == self.nodes).all():
+            return np.arange(len(ids))
         try:
             return np.array([self._row[node] for node in ids.tolist()], dtype=np.int64)
         except KeyError as error:

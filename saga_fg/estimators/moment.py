@@ -116,7 +116,7 @@ def reckoned(prior: BlockGaussian, moments: Sequence[Moment], layouts: Sequence[
             stay = layout.without(gone) if len(gone) else layout
             before = mean[layout.places(layout.rows(stay.nodes))]
             dynamics = moment.motion.dynamics(stay, before)
-            mean = np.asarray(dynamics.matrix @ before + dynamics.b)
+            mean = dynamics.moved(before) + dynamics.b
     return means
 
 

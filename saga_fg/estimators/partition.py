@@ -61,6 +61,29 @@ class Partition:
         return self._tables[3]
 
     @cached_property
+    def size(self) -> int | None:
+        """d where all nodes have states of equal size d, else None."""
+        dims = self.layout.dims
+        return int(dims[0]) if len(dims) and (dims == dims[0]).all() else None
+
+    def by_nodes(self, blocks: FloatArray) -> FloatArray:
+        """A view (c, s/d, s/d, d, d) of blocks (c, s, s): [k, i, j] is that of two nodes. Only with `size`.
+
+        Indexing nodes in it is several times as fast as indexing the entries of their blocks.
+        """
+        d = self.size
+        assert d is not None
+        assert blocks.flags.c_contiguous  # or it would be a copy
+        c, s, _ = blocks.shape
+        return blocks.reshape(c, s // d, d, s // d, d).swapaxes(2, 3)
+
+    @cached_property
+    def slot(self) -> IntArray:
+        """(n,) the place of each node within its component, counted in nodes. Only with `size`."""
+        assert self.size is not None
+        return self.offset // self.size
+
+    @cached_property
     def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]:
         layout, label = self.layout, self.label
         none = np.empty(0, dtype=np.int64)
@@ -88,11 +111,11 @@ class Partition:
 
         Where: (., dim), the places of each state within its component.
         """
-        group = self.group[rows]
         at = self.offset[rows][:, None] + np.arange(dim)
+        if len(self.groups) == 1 and len(rows):
+            return [(0, np.arange(len(rows)), at)]
+        group = self.group[rows]
         numbers = np.unique(group).tolist()
-        if len(numbers) == 1:
-            return [(numbers[0], np.arange(len(rows)), at)]
         members = [np.flatnonzero(group == number) for number in numbers]
         return [(number, mine, at[mine]) for number, mine in zip(numbers, members, strict=True)]
 

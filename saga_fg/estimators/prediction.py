@@ -49,7 +49,7 @@ class Prediction:
         for d, blocks in predicted.items():
             rows = np.flatnonzero(layout.dims == d)
             variances[layout.spans(rows)] = np.diagonal(blocks[rows], axis1=1, axis2=2)
-        mean = np.asarray(dynamics.matrix @ x.mean + dynamics.b)
+        mean = dynamics.moved(x.mean) + dynamics.b
         if not (np.isfinite(mean).all() and np.isfinite(variances).all() and (variances > 0).all()):
             raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
         return Prediction(dynamics.joined(x.partition), mean, np.sqrt(variances), ratio)
