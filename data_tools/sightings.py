@@ -11,7 +11,7 @@ from saga_fg.association import assign
 from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
 from saga_fg.learning import Sightings
-from saga_fg.sensor import DEFAULT, Sensor
+from saga_fg.sensor import Sensor, sensor_model
 
 
 def sightings(
@@ -31,7 +31,7 @@ def sightings(
         if k >= len(scene) or (k == 0 and frame.timestamp < scene.timestamps[0] - 1e-6):
             continue
         labels, ids, place = _truth_at(scene, k, frame.timestamp)
-        sensor = sensors.get(frame.sensor) or sensors.get(DEFAULT) or Sensor()
+        sensor = sensor_model(sensors, frame.sensor)
         boxes = frame.detections.boxes
         origin = np.zeros(2) if frame.world_T_ego is None else frame.world_T_ego[:2, 3]
         p = sensor.probability(frame.detections.score)

@@ -140,3 +140,8 @@ class Sensor:
         middle, half = (view.min_azimuth + view.max_azimuth) / 2, (view.max_azimuth - view.min_azimuth) / 2
         azimuth = np.abs(wrap_angle(np.arctan2(local[:, 1], local[:, 0]) - middle))
         return np.asarray((np.hypot(*local.T) <= view.max_range) & (azimuth <= half + 1e-9))
+
+
+def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:
+    """The model of a sensor: its own, else the one named default, else the plain one."""
+    return sensors.get(name) or sensors.get(DEFAULT) or Sensor()

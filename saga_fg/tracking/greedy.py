@@ -15,7 +15,7 @@ import numpy as np
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.frame import Frame
-from saga_fg.sensor import DEFAULT, Sensor
+from saga_fg.sensor import DEFAULT, Sensor, sensor_model
 from saga_fg.track import Tracks
 from saga_fg.tracking.settings import GreedySettings
 
@@ -61,7 +61,7 @@ class GreedyTracker:
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame; returns the tracks seen in it, in world coordinates."""
-        sensor = self.sensors.get(frame.sensor) or self.sensors.get(DEFAULT) or Sensor()
+        sensor = sensor_model(self.sensors, frame.sensor)
         now = self._time = max(self._time, frame.timestamp + sensor.time_offset)
         detections = frame.detections
         if frame.coordinates != "world":

@@ -21,7 +21,7 @@ from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.interactions import NodeTable
 from saga_fg.scene_graph import SceneGraph
-from saga_fg.sensor import DEFAULT, Sensor
+from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
@@ -140,7 +140,7 @@ class Tracker:
 
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
-        return self.sensors.get(name) or self.sensors.get(DEFAULT) or Sensor()
+        return sensor_model(self.sensors, name)
 
     def class_settings(self, label: str) -> ClassSettings:
         """The settings of a class."""
