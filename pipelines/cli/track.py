@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -12,6 +12,9 @@ from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import Summary
 from saga_fg.errors import InputError
 from saga_fg.tracking import EstimatorName
+
+if TYPE_CHECKING:
+    from pipelines.config import Family, Method, TrackConfig
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -76,14 +79,11 @@ def nuscenes(
           --detections lidar=a.json --estimator fixed-lag --lag 3 --output tracks.json
     """
     from data_tools.nuscenes import NuScenes, split_scenes, write_tracking_results
-    from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
     if (split is None) == (scenes is None):
         raise InputError("expected either --split NAME or --scenes A,B")
-    settings = load_config("nuscenes", config)
-    estimator_fits(method, estimator, lag, settings.tracker.estimator)
-    settings = settings.with_estimator(estimator, lag)
+    settings = _configured("nuscenes", config, method, estimator, lag)
     chosen = split_scenes(dataroot, version, split) if split is not None else names("--scenes", scenes or "")
     files = sensor_files(detections)
     apart(output, *files.values())
@@ -119,12 +119,9 @@ def kitti(
           --sequences 0000,0011 --output results
     """
     from data_tools.kitti import KittiTracking, write_kitti_results
-    from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
-    settings = load_config("kitti", config)
-    estimator_fits(method, estimator, lag, settings.tracker.estimator)
-    settings = settings.with_estimator(estimator, lag)
+    settings = _configured("kitti", config, method, estimator, lag)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
     summary = Summary(output)
     with progress_bar(len(dataset.scenes)) as progress:
@@ -157,12 +154,9 @@ def file(
       saga-fg track file detections.ndjson --method kf --config mine.yaml --output tracks.ndjson
     """
     from data_tools.detection_files import read_detections, write_tracks
-    from pipelines.config import load_config
     from pipelines.tracking import track_dataset
 
-    settings = load_config("file", config)
-    estimator_fits(method, estimator, lag, settings.tracker.estimator)
-    settings = settings.with_estimator(estimator, lag)
+    settings = _configured("file", config, method, estimator, lag)
     apart(output, detections)
     dataset = read_detections(detections)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
@@ -171,3 +165,14 @@ def file(
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), chosen, progress))
         write_tracks(output, ((run.scene, run.tracks) for run in runs))
     summary.show()
+
+
+def _configured(
+    family: Family, config: Path | None, method: Method, estimator: EstimatorName | None, lag: float | None
+) -> TrackConfig:
+    """The settings of a run: the family's, the file's, then the options'."""
+    from pipelines.config import load_config
+
+    settings = load_config(family, config)
+    estimator_fits(method, estimator, lag, settings.tracker.estimator)
+    return settings.with_estimator(estimator, lag)
