@@ -85,8 +85,8 @@ def _print(result: EstimatorBench) -> None:
     for soak in result.soaks:
         ms, memory = soak.milliseconds, soak.memory
         typer.echo(
-            f"{soak.contender}, {soak.graph}, {soak.nodes} nodes, {soak.frames} frames: {ms[0]:.3g} ms and "
-            f"{memory[0]:.0f} MB at the start, {ms[1]:.3g} ms and {memory[1]:.0f} MB at the end"
+            f"{soak.contender}, {soak.graph}, {soak.nodes} nodes, {soak.frames} frames: {ms[1]:.3g} ms a frame at the end, "
+            f"{ms[0]:.3g} ms of a young filter in turn with it; {memory[0]:.0f} MB at the start, {memory[1]:.0f} MB at the end"
         )
     table = Table("figure", "measured", "to reach", "", title="figures to reach", title_justify="left")
     words = {True: "reached", False: "missed", None: "not measured"}

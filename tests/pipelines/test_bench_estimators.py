@@ -137,7 +137,7 @@ def test_criteria_know_what_was_reached_missed_and_not_measured() -> None:
     assert found["isam2 / textbook, connected, 100"] is False
     assert found["kalman, components, 1000 / 300 nodes"] is True
     assert found["batch / textbook, connected"] is None
-    assert found["isam2, components, 10 frames: time, end / start"] is False
+    assert found["isam2, components, 10 frames: time, old / young"] is False
     assert found["isam2, components, 10 frames: memory, end / start"] is True
 
 
