@@ -85,8 +85,9 @@ def _print(result: EstimatorBench) -> None:
     for soak in result.soaks:
         ms, memory = soak.milliseconds, soak.memory
         typer.echo(
-            f"{soak.contender}, {soak.graph}, {soak.nodes} nodes, {soak.frames} frames: {ms[1]:.3g} ms a frame at the end, "
-            f"{ms[0]:.3g} ms of a young filter in turn with it; {memory[0]:.0f} MB at the start, {memory[1]:.0f} MB at the end"
+            f"{soak.contender}, {soak.graph}, {soak.nodes} nodes, {soak.frames} frames: {ms[1]:.3g} ms a frame at the "
+            f"end, {ms[0]:.3g} ms of a young filter in turn with it; {memory[0]:.0f} MB at the start, "
+            f"{memory[1]:.0f} MB at the end"
         )
     table = Table("figure", "measured", "to reach", "", title="figures to reach", title_justify="left")
     words = {True: "reached", False: "missed", None: "not measured"}
