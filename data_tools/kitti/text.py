@@ -62,16 +62,19 @@ def read_lines(path: Path) -> list[str]:
         raise InputError(f"{path}: expected text: {error}") from error
 
 
-def read_table(path: Path, columns: tuple[int, ...], what: str, separator: str | None = None) -> TextTable:
-    """Read lines of values; all must have the same number of values, one of `columns`. Empty lines are left out.
+def read_table(
+    path: Path, columns: tuple[int, ...], what: str, separator: str | None = None, comment: str | None = None
+) -> TextTable:
+    """Read lines of values; all must have the same number of values, one of `columns`.
 
+    Empty lines are left out, as are those that start with `comment`.
     Raises `InputError` naming the first line that has another number.
     """
     rows: list[list[str]] = []
     numbers: list[int] = []
     for number, line in enumerate(read_lines(path), start=1):
         row = line.split(separator)
-        if not row or row == [""]:
+        if not row or row == [""] or (comment is not None and line.lstrip().startswith(comment)):
             continue
         if len(row) not in columns or (rows and len(row) != len(rows[0])):
             expected = len(rows[0]) if rows else " or ".join(map(str, columns))
