@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -50,8 +49,9 @@ def estimators(
       saga-fg bench estimators
       saga-fg bench estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
+    from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 
     try:
@@ -67,7 +67,7 @@ def estimators(
         result = bench_estimators(settings, progress)
     _print(result)
     if json_file is not None:
-        write_text(json_file, json.dumps(_figures(result), indent=1) + "\n")
+        write_figures(json_file, _figures(result))
 
 
 def _print(result: EstimatorBench) -> None:
@@ -102,19 +102,8 @@ def _number(value: float, form: str = ".3g") -> str:
 
 
 def _figures(result: EstimatorBench) -> dict[str, Any]:
-    """As JSON has them: null for what was not measured."""
+    """For programs: with what each criterion came to."""
     figures = asdict(result)
     figures["criteria"] = [asdict(criterion) | {"reached": criterion.reached} for criterion in result.criteria]
     figures["settings"] = asdict(result.settings)
-    cleaned: dict[str, Any] = _without_nan(figures)
-    return cleaned
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(part) for part in value]
-    return value
+    return figures

@@ -10,6 +10,7 @@ import typer
 from pipelines.cli.bench import bench_app
 from pipelines.cli.config import config
 from pipelines.cli.demo import demo
+from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.reporting import ReportingGroup
 from pipelines.cli.simulate import simulate
 from pipelines.cli.track import track_app
@@ -23,6 +24,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(track_app, name="track")
+app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(bench_app, name="bench")
 app.command()(simulate)
 app.command()(demo)

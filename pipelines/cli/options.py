@@ -34,6 +34,15 @@ def sensor_files(values: Sequence[str]) -> dict[str, Path]:
     return files
 
 
+def chosen_scenes(dataroot: Path, version: str, split: str | None, scenes: str | None) -> tuple[str, ...]:
+    """The nuScenes scenes that --split or --scenes, of which one must be given, stand for."""
+    from data_tools.nuscenes import split_scenes
+
+    if (split is None) == (scenes is None):
+        raise InputError("expected either --split NAME or --scenes A,B")
+    return split_scenes(dataroot, version, split) if split is not None else names("--scenes", scenes or "")
+
+
 def apart(output: Path, *inputs: Path) -> None:
     """Raise `InputError` where the output would overwrite what is read."""
     for path in inputs:

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, apart, estimator_fits, names, sensor_files
+from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, estimator_fits, names, sensor_files
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import Summary
-from saga_fg.errors import InputError
 from saga_fg.tracking import EstimatorName
 
 if TYPE_CHECKING:
@@ -78,13 +77,11 @@ def nuscenes(
       saga-fg track nuscenes --dataroot data/nuscenes --scenes scene-0103 \\
           --detections lidar=a.json --estimator fixed-lag --lag 3 --output tracks.json
     """
-    from data_tools.nuscenes import NuScenes, split_scenes, write_tracking_results
+    from data_tools.nuscenes import NuScenes, write_tracking_results
     from pipelines.tracking import track_dataset
 
-    if (split is None) == (scenes is None):
-        raise InputError("expected either --split NAME or --scenes A,B")
+    chosen = chosen_scenes(dataroot, version, split, scenes)
     settings = _configured("nuscenes", config, method, estimator, lag)
-    chosen = split_scenes(dataroot, version, split) if split is not None else names("--scenes", scenes or "")
     files = sensor_files(detections)
     apart(output, *files.values())
     dataset = NuScenes(dataroot, version, files, chosen)

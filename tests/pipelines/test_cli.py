@@ -26,7 +26,9 @@ def saga_fg(*arguments: str | Path) -> Result:
 
 
 @pytest.mark.parametrize(
-    "command", ["track nuscenes", "track kitti", "track file", "simulate", "demo", "config"], ids=lambda c: c
+    "command",
+    ["track nuscenes", "track kitti", "track file", "evaluate nuscenes", "simulate", "demo", "config"],
+    ids=lambda c: c,
 )
 def test_help_shows_a_worked_example(command: str) -> None:
     result = saga_fg(*command.split(), "--help")

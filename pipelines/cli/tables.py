@@ -1,0 +1,30 @@
+"""Tables of figures on the screen, and JSON files of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.figures import FigureTable
+
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
+
+LEAST_WIDTH = 140  # narrower, the tables are no longer ones
+
+
+def show_tables(tables: Iterable[FigureTable]) -> None:
+    """Print the tables on stdout."""
+    console = Console()
+    console = Console(width=max(console.width, LEAST_WIDTH))
+    for table in tables:
+        shown = Table(title=table.title, title_justify="left")
+        for n, column in enumerate(table.columns):
+            shown.add_column(column, justify="right" if n else "left")
+        for row in table.rows:
+            shown.add_row(*row)
+        console.print(shown)
