@@ -16,6 +16,7 @@ from saga_fg.geometry import checked_transform
 
 Coordinates = Literal["world", "ego", "sensor"]
 NAN = float("nan")
+LATEST = 1e11  # s; the year 5138 where the epoch is 1970, and more than any clock in finer units shows today
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class Frame:
     world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world"
     token        the dataset's own name of the record, "" if none
 
-    Raises `InputError` for a timestamp that is not finite, an unknown kind of coordinates, a pose that is not rigid.
+    Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose that is not rigid.
     """
 
     timestamp: float
@@ -118,6 +119,8 @@ class Frame:
             timestamp = NAN
         if not math.isfinite(timestamp):
             raise InputError(f"timestamp: expected a finite number of seconds, got {self.timestamp!r}")
+        if abs(timestamp) > LATEST:
+            raise InputError(f"timestamp: expected seconds, got {timestamp:g}: milli-, micro- or nanoseconds?")
         object.__setattr__(self, "timestamp", timestamp)
         if not isinstance(self.sensor, str) or not self.sensor:
             raise InputError(f"sensor: expected a name, got {self.sensor!r}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -15,6 +16,8 @@ import numpy as np
 
 from data_tools.detection_files.columns import COLUMNS, REQUIRED, RawTable, Values
 from saga_fg.errors import InputError
+
+log = logging.getLogger(__name__)
 
 
 def read_raw_table(path: Path) -> RawTable:
@@ -112,8 +115,9 @@ def _read_npz(path: Path) -> RawTable:
 
 
 def _check_names(path: Path, names: set[str]) -> None:
-    """Columns that are missing, or look misspelt, are errors; other columns one does not know are left alone."""
-    for name in sorted(names - set(COLUMNS)):
+    """Columns that are missing, or look misspelt, are errors; others that have no meaning here get a warning."""
+    unknown = sorted(names - set(COLUMNS))
+    for name in unknown:
         nearest = get_close_matches(name, set(COLUMNS) - names, n=1, cutoff=0.75)
         if nearest:
             raise InputError(f"{path}: unknown column {name!r}; did you mean {nearest[0]!r}?")
@@ -121,3 +125,5 @@ def _check_names(path: Path, names: set[str]) -> None:
         if name not in names:
             there = ", ".join(sorted(names)[:12]) or "none"
             raise InputError(f"{path}: expected a column {name!r}, the columns there are {there}")
+    if unknown:
+        log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(unknown))

@@ -339,3 +339,10 @@ def test_tracks_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"out\.csv: scene drive: expected tracks for 2 moments, got 1"):
         write_tracks(tmp_path / "out.csv", [(scene(), [tracks(0.0)])])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_column_without_a_meaning_is_named_in_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "d.csv"
+    path.write_text("timestamp,x,y,camera_model\n0,1,2,fisheye\n")
+    assert len(read_detections(path).scene("d").frames) == 1
+    assert f"{path}: columns without a meaning here, not read: camera_model" in caplog.text

@@ -94,6 +94,7 @@ def test_as_many_scores_as_boxes():
     [
         ({"timestamp": NAN}, "timestamp: expected a finite number of seconds, got nan"),
         ({"timestamp": np.inf}, "timestamp: expected a finite number of seconds, got inf"),
+        ({"timestamp": 1.7e18}, "timestamp: expected seconds, got 1.7e\\+18: milli-, micro- or nanoseconds?"),
         ({"timestamp": "noon"}, "timestamp: expected a finite number of seconds, got 'noon'"),
         ({"timestamp": None}, "timestamp: expected a finite number of seconds, got None"),
         ({"sensor": ""}, "sensor: expected a name, got ''"),
