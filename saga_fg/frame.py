@@ -102,7 +102,8 @@ class Frame:
     world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world"
     token        the dataset's own name of the record, "" if none
 
-    Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose that is not rigid.
+    Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
+    that is not rigid.
     """
 
     timestamp: float
