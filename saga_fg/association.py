@@ -27,6 +27,18 @@ class Matching:
     distance: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """id (k,) of tracks and the row (k,) of the detection, among all of a frame, that each took in or was born from."""
+
+    id: IntArray
+    detection: IntArray
+
+    @staticmethod
+    def empty() -> Assignment:
+        return Assignment(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+
+
 def mahalanobis(
     position: FloatArray, covariance: FloatArray, measured: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.boxes import Boxes
 from saga_fg.frame import Detections, Frame
 from saga_fg.sensor import Sensor
@@ -20,7 +20,7 @@ UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 @dataclass(frozen=True, eq=False)
 class Observed:
     """m detections: boxes (world), probability (m,), R (m, 4, 4) of position and velocity, standard deviations (m,) of
-    height (m) and heading (rad), and whether the velocity was measured (m,)."""
+    height (m) and heading (rad), whether the velocity was measured (m,), and rows (m,) in the frame's detections."""
 
     boxes: Boxes
     probability: FloatArray
@@ -28,6 +28,7 @@ class Observed:
     with_velocity: BoolArray
     z_noise: FloatArray
     yaw_noise: FloatArray
+    row: IntArray
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -49,7 +50,7 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise = np.where(np.isfinite(boxes.yaw), sensor.deviations(boxes.label, "yaw"), UNKNOWN_YAW_NOISE)
     with_velocity = np.isfinite(boxes.velocity[:, 0] + boxes.velocity[:, 1]) & sensor.use_velocity
-    return Observed(boxes, probability, R, with_velocity, sensor.deviations(boxes.label, "height"), yaw_noise)
+    return Observed(boxes, probability, R, with_velocity, sensor.deviations(boxes.label, "height"), yaw_noise, keep)
 
 
 def _in_world(frame: Frame, sensor: Sensor) -> Detections:

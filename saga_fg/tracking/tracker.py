@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.association import Matching, assign, gate, mahalanobis
+from saga_fg.association import Assignment, Matching, assign, gate, mahalanobis
 from saga_fg.boxes import Boxes
 from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.errors import InputError
@@ -76,6 +76,7 @@ class Tracker:
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.late_frames = 0
         self.graph: SceneGraph | None = None  # of the latest interval
+        self.assignment = Assignment.empty()  # of the latest frame
         self._state = JointTrackState(
             new_estimator(self.settings.estimator, self.settings.lag), lambda label: self.class_settings(label).motion
         )
@@ -104,6 +105,7 @@ class Tracker:
         if len(self._columns.id) == 0:
             self._origin = _origin(frame)
         delay = max(0.0, self._time - timestamp)
+        self.assignment = Assignment.empty()
         if delay > self.max_delay:
             self.late_frames += 1
             log.warning("frame of %s at %.3f s comes %.3f s late and is left out", frame.sensor, timestamp, delay)
@@ -114,7 +116,10 @@ class Tracker:
         matching = self._associate(observed, delay)
         self._update(observed, matching, delay)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
-        self._bear(observed, matching, delay)
+        born = self._bear(observed, matching, delay)
+        rows = np.concatenate([matching.detection, born])
+        ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self._columns.id) - len(born) :]])
+        self.assignment = Assignment(ids, observed.row[rows])
         self._bury()
         return self._report(self._time)
 
@@ -233,13 +238,16 @@ class Tracker:
         columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
 
-    def _bear(self, observed: Observed, matching: Matching, delay: float) -> None:
-        """New tracks from detections that no track explains; those of `delay` s ago have moved on since."""
+    def _bear(self, observed: Observed, matching: Matching, delay: float) -> IntArray:
+        """New tracks, at the end, from the detections returned, which no track explains.
+
+        Those of `delay` s ago have moved on since.
+        """
         free = np.ones(len(observed), dtype=bool)
         free[matching.detection] = False
         born = np.flatnonzero(free & (observed.probability >= self._of_class("birth_score", observed.boxes.label)))
         if len(born) == 0:
-            return
+            return born
         boxes, p = observed.boxes.select(born), observed.probability[born]
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
@@ -269,6 +277,7 @@ class Tracker:
                 boxes.size, p, boxes.position[:, 2], observed.z_noise[born], boxes.yaw, observed.yaw_noise[born]
             )
         )
+        return born
 
     def _birth_velocity_covariance(self, boxes: Boxes) -> FloatArray:
         """(n, 2, 2) of a velocity that nothing is known of but the class and the heading."""

@@ -330,3 +330,18 @@ def test_earlier_reports_do_not_change_afterwards():
         history.append(tracker.step(f))
         copies.append(columns(history[-1]))
     assert [columns(t) for t in history] == copies
+
+
+def test_the_tracker_tells_which_detection_went_where():
+    def told(timestamp, *rows):
+        detections = [Detection("car", (*place, 0.0), score=score) for place, score in rows]
+        tracker.step(Frame(timestamp, "lidar", Detections.of(detections)))
+        return dict(zip(tracker.assignment.detection.tolist(), tracker.assignment.id.tolist(), strict=True))
+
+    tracker = Tracker(settings(birth_score=0.5, min_score=0.1))
+    born = told(0.0, ((0, 0), 0.05), ((9, 0), 0.9), ((0, 9), 0.9))
+    assert born.keys() == {1, 2}  # the first is too weak for anything
+    later = told(0.1, ((0, 9.1), 0.9), ((50, 0), 0.9), ((9.1, 0), 0.9))
+    assert (later[0], later[2]) == (born[2], born[1])
+    assert later[1] not in born.values()
+    assert told(0.2) == {}
