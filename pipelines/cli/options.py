@@ -50,14 +50,6 @@ def apart(output: Path, *inputs: Path) -> None:
             raise InputError(f"--output {output}: expected another file than the detections")
 
 
-def estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:
-    """Raise `InputError` where --estimator or --lag would have no effect."""
-    if method == "centerpoint" and (estimator is not None or lag is not None):
-        raise InputError("--estimator, --lag: the method centerpoint has no estimator")
-    if lag is not None and (estimator or configured) != "fixed-lag":
-        raise InputError(f"--lag {lag:g}: goes with --estimator fixed-lag")
-
-
 def names(option: str, value: str) -> tuple[str, ...]:
     """The entries of a comma-separated option, each once."""
     entries = tuple(dict.fromkeys(entry.strip() for entry in value.split(",") if entry.strip()))

@@ -3,40 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, estimator_fits, names, sensor_files
+from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_files
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import Summary
-from saga_fg.tracking import EstimatorName
-
-if TYPE_CHECKING:
-    from pipelines.config import Family, Method, TrackConfig
+from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
-
-MethodOption = Annotated[
-    Literal["saga", "kf", "centerpoint"],
-    typer.Option(
-        "--method",
-        help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
-    ),
-]
-
-EstimatorOption = Annotated[
-    EstimatorName | None,
-    typer.Option(
-        "--estimator",
-        help="kalman: joint filter; isam2: the same as a factor graph; fixed-lag: smoother of the last seconds. All "
-        "give the same tracks, but a late frame goes where it belongs with fixed-lag alone.  [default: as configured]",
-    ),
-]
-LagOption = Annotated[
-    float | None,
-    typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
-]
 
 
 @track_app.callback()
@@ -81,7 +57,7 @@ def nuscenes(
     from pipelines.tracking import track_dataset
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
-    settings = _configured("nuscenes", config, method, estimator, lag)
+    settings = configured("nuscenes", config, method, estimator, lag)
     files = sensor_files(detections)
     apart(output, *files.values())
     dataset = NuScenes(dataroot, version, files, chosen)
@@ -118,7 +94,7 @@ def kitti(
     from data_tools.kitti import KittiTracking, write_kitti_results
     from pipelines.tracking import track_dataset
 
-    settings = _configured("kitti", config, method, estimator, lag)
+    settings = configured("kitti", config, method, estimator, lag)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
     summary = Summary(output)
     with progress_bar(len(dataset.scenes)) as progress:
@@ -153,7 +129,7 @@ def file(
     from data_tools.detection_files import read_detections, write_tracks
     from pipelines.tracking import track_dataset
 
-    settings = _configured("file", config, method, estimator, lag)
+    settings = configured("file", config, method, estimator, lag)
     apart(output, detections)
     dataset = read_detections(detections)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
@@ -162,14 +138,3 @@ def file(
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), chosen, progress))
         write_tracks(output, ((run.scene, run.tracks) for run in runs))
     summary.show()
-
-
-def _configured(
-    family: Family, config: Path | None, method: Method, estimator: EstimatorName | None, lag: float | None
-) -> TrackConfig:
-    """The settings of a run: the family's, the file's, then the options'."""
-    from pipelines.config import load_config
-
-    settings = load_config(family, config)
-    estimator_fits(method, estimator, lag, settings.tracker.estimator)
-    return settings.with_estimator(estimator, lag)

@@ -1,0 +1,54 @@
+"""The options that say how to track, shared by all commands that do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from saga_fg.errors import InputError
+from saga_fg.tracking import EstimatorName
+
+if TYPE_CHECKING:
+    from pipelines.config import Family, Method, TrackConfig
+
+MethodOption = Annotated[
+    Literal["saga", "kf", "centerpoint"],
+    typer.Option(
+        "--method",
+        help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
+    ),
+]
+
+EstimatorOption = Annotated[
+    EstimatorName | None,
+    typer.Option(
+        "--estimator",
+        help="kalman: joint filter; isam2: the same as a factor graph; fixed-lag: smoother of the last seconds. All "
+        "give the same tracks, but a late frame goes where it belongs with fixed-lag alone.  [default: as configured]",
+    ),
+]
+LagOption = Annotated[
+    float | None,
+    typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
+]
+
+
+def configured(
+    family: Family, config: Path | None, method: Method, estimator: EstimatorName | None, lag: float | None
+) -> TrackConfig:
+    """The settings of a run: the family's, the file's, then the options'."""
+    from pipelines.config import load_config
+
+    settings = load_config(family, config)
+    _estimator_fits(method, estimator, lag, settings.tracker.estimator)
+    return settings.with_estimator(estimator, lag)
+
+
+def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:
+    """Raise `InputError` where --estimator or --lag would have no effect."""
+    if method == "centerpoint" and (estimator is not None or lag is not None):
+        raise InputError("--estimator, --lag: the method centerpoint has no estimator")
+    if lag is not None and (estimator or configured) != "fixed-lag":
+        raise InputError(f"--lag {lag:g}: goes with --estimator fixed-lag")
