@@ -20,8 +20,10 @@ from factors.marginal import marginal_factors, marginal_moments
 from factors.measurement import Components, MeasurementModel, box, position, position_velocity
 from factors.nonlinear import Linearisable, ResidualFactor
 from factors.nonlinear_interaction import NonlinearInteraction
+from factors.odometry import odometry_factors
 from factors.polar import Radar, RangeBearing, RangeRate
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
+from factors.relative_detection import relative_detection_factors
 from factors.robust import Robust
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
@@ -63,9 +65,11 @@ __all__ = [
     "marginal_moments",
     "nonlinear_graph",
     "nonlinear_graph_at",
+    "odometry_factors",
     "position",
     "position_velocity",
     "prior_factor",
     "prior_factors",
+    "relative_detection_factors",
     "solve",
 ]

@@ -3,7 +3,7 @@
     phi_i(x) = exp( -rho( || r_i(x_i1, ..., x_in) ||_{R_i} ) ),      i = 1..N
 
 The same factor as `factors.nonlinear.ResidualFactor`, N times, with one call of the residual function for all: what
-costs tens of microseconds a factor in a loop costs a few. All variables are vectors.
+costs tens of microseconds a factor in a loop costs a few.
 """
 
 from __future__ import annotations
@@ -31,20 +31,22 @@ from factors.validation import (
     format_keys,
     whiteners,
 )
+from factors.variables import PlanarPose, SpatialPose, Variable, Vector
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualFactors:
     """N factors from one residual function over stacked states.
 
-    rows: keys (N, n), distinct within a row; dims: dimension of each of the n variables; residual(*states) -> (N, m)
-    from states (N, d_k), in the order of the columns; covariances: (N, m, m), or one (m, m) for all; jacobians(*states)
-    -> one (N, m, d_k) a column, by central differences when absent; robust, angles, name: as in `ResidualFactor`.
-    Row i of what a function returns must depend on row i of its arguments alone.
+    rows: keys (N, n), distinct within a row; dims: of each of the n variables the dimension if it is a vector, or
+    `PlanarPose()`, `SpatialPose()`; residual(*states) -> (N, m) from states (N, d_k), poses (N, 3, 3) or (N, 4, 4), in
+    the order of the columns; covariances: (N, m, m), or one (m, m) for all; jacobians(*states) -> one (N, m, d_k) a
+    column (d_k: of a pose's delta), by central differences when absent, which needs vectors; robust, angles, name: as
+    in `ResidualFactor`. Row i of what a function returns must depend on row i of its arguments alone.
     """
 
     rows: KeyArray
-    dims: tuple[int, ...]
+    dims: tuple[int | PlanarPose | SpatialPose, ...]
     residual: Callable[..., ArrayLike]
     covariances: FloatArray
     jacobians: Callable[..., Sequence[ArrayLike]] | None = None
@@ -52,12 +54,17 @@ class ResidualFactors:
     angles: tuple[int, ...] = ()
     name: str = "factors"
     _whiteners: FloatArray = field(init=False, repr=False)
+    _variables: tuple[Variable, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         rows = checked_key_rows("rows", self.rows, len(self.dims))
         check_distinct("rows", rows)
-        if any(isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1 for dim in self.dims):
-            raise FactorError(f"dims: expected positive integers, got {self.dims}")
+        poses = [isinstance(dim, PlanarPose | SpatialPose) for dim in self.dims]
+        if any(poses) and self.jacobians is None:
+            raise FactorError("jacobians: expected a function, since there are poses among the variables")
+        numbers = [dim for dim, pose in zip(self.dims, poses, strict=True) if not pose]
+        if any(isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1 for dim in numbers):
+            raise FactorError(f"dims: expected positive integers or types of poses, got {self.dims}")
         stack = checked_covariances("covariances", self.covariances, len(rows), None).copy()
         if not stack.shape[1]:
             raise FactorError("covariances: expected at least one row")
@@ -68,6 +75,8 @@ class ResidualFactors:
         object.__setattr__(self, "dims", tuple(self.dims))
         object.__setattr__(self, "covariances", stack)
         object.__setattr__(self, "_whiteners", W)
+        variables = tuple(dim if isinstance(dim, PlanarPose | SpatialPose) else Vector(dim) for dim in self.dims)
+        object.__setattr__(self, "_variables", variables)
 
     def __str__(self) -> str:
         return f"{len(self.rows)} {self.name}"
@@ -78,7 +87,7 @@ class ResidualFactors:
         return tuple(np.unique(self.rows).tolist())
 
     def states(self, values: gtsam.Values) -> list[FloatArray]:
-        """Return the states of each column, (N, d_k)."""
+        """Return the states of each column, (N, d_k) or (N, 3, 3) or (N, 4, 4)."""
         return [self._column(values, k) for k in range(len(self.dims))]
 
     def errors(self, values: gtsam.Values) -> FloatArray:
@@ -100,17 +109,19 @@ class ResidualFactors:
         return gaussian_graph(whitened_factors(self.rows, W, self._jacobians(states), -residuals))
 
     def _column(self, values: gtsam.Values, k: int) -> FloatArray:
-        dim = self.dims[k]
-        column = np.empty((len(self.rows), dim))
-        for i, key in enumerate(self.rows[:, k].tolist()):
+        variable = self._variables[k]
+        keys, index = np.unique(self.rows[:, k], return_inverse=True)
+        states = []
+        for key in keys.tolist():
             try:
-                state = values.atVector(key)
+                states.append(variable.array(variable.read(values, key)))
             except RuntimeError as error:
                 reason = "another type of variable in" if values.exists(key) else "no"
                 raise FactorError(f"{self}: values has {reason} {format_key(key)}") from error
-            if len(state) != dim:
-                raise FactorError(f"{self}: {format_key(key)}: expected a vector of {dim} entries, got {len(state)}")
-            column[i] = state
+            except FactorError as error:
+                raise FactorError(f"{self}: {error}") from error
+        shape = (0, variable.dim) if isinstance(variable, Vector) else (0, 1, 1)
+        column: FloatArray = np.stack(states)[index] if states else np.empty(shape)
         column.flags.writeable = False
         return column
 
@@ -131,8 +142,8 @@ class ResidualFactors:
         if not isinstance(given, list | tuple) or len(given) != len(self.dims):
             raise FactorError(f"{self}: expected a list of {len(self.dims)} Jacobians, one per variable")
         return [
-            self._checked(f"Jacobian {k}", jacobian, (n, m, dim))
-            for k, (jacobian, dim) in enumerate(zip(given, self.dims, strict=True))
+            self._checked(f"Jacobian {k}", jacobian, (n, m, variable.dim))
+            for k, (jacobian, variable) in enumerate(zip(given, self._variables, strict=True))
         ]
 
     def _called(self, function: Callable[..., Any], states: Sequence[FloatArray]) -> Any:

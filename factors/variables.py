@@ -35,6 +35,9 @@ class Variable(Protocol):
     def size(self, state: Any) -> FloatArray:
         """Return the magnitude (dim,) of each coordinate, which numerical differences choose their steps by."""
 
+    def array(self, state: Any) -> FloatArray:
+        """Return the state as numbers, for functions of many states at once."""
+
 
 @dataclass(frozen=True)
 class Vector:
@@ -62,10 +65,13 @@ class Vector:
     def size(self, state: FloatArray) -> FloatArray:
         return np.abs(state)
 
+    def array(self, state: FloatArray) -> FloatArray:
+        return state
+
 
 @dataclass(frozen=True)
 class PlanarPose:
-    """A `gtsam.Pose2`; delta = (x, y, heading) in the pose's own frame."""
+    """A `gtsam.Pose2`; delta = (x, y, heading) in the pose's own frame; as numbers (3, 3)."""
 
     @property
     def dim(self) -> int:
@@ -83,10 +89,13 @@ class PlanarPose:
     def size(self, state: gtsam.Pose2) -> FloatArray:
         return np.ones(3)
 
+    def array(self, state: gtsam.Pose2) -> FloatArray:
+        return state.matrix()
+
 
 @dataclass(frozen=True)
 class SpatialPose:
-    """A `gtsam.Pose3`; delta = (rotation vector, translation) in the pose's own frame."""
+    """A `gtsam.Pose3`; delta = (rotation vector, translation) in the pose's own frame; as numbers (4, 4)."""
 
     @property
     def dim(self) -> int:
@@ -103,6 +112,9 @@ class SpatialPose:
 
     def size(self, state: gtsam.Pose3) -> FloatArray:
         return np.ones(6)
+
+    def array(self, state: gtsam.Pose3) -> FloatArray:
+        return state.matrix()
 
 
 def read_states(values: gtsam.Values, keys: Sequence[int], variables: Sequence[Variable]) -> list[Any]:

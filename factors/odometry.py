@@ -1,0 +1,98 @@
+"""Odometry between consecutive poses in space, with the slow errors of the device as states of their own.
+
+A device that counts wheels or matches scans reports the increment a_T_b = (R_m, d) over dt seconds. Its length is wrong
+by a scale s and its heading turns with a bias b, both of which wander slowly:
+
+    R_b = R_a Exp(b dt e_z) R_m Exp(noise)        t_b = t_a + R_a ((1 + s) d + noise)        (s, b)' = (s, b) + noise
+
+Residuals, in the frame of the first pose (8 rows):
+
+    r_rotation    = Log( (Exp(b dt e_z) R_m)^T R_a^T R_b )
+    r_translation = R_a^T (t_b - t_a) - (1 + s) d
+    r_error       = (s, b)' - (s, b)
+
+With the errors held at 0 by a prior this is the plain factor between two poses. The bias model is that of a gyroscope
+mounted upright (Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed. 2013,
+section 4.4.1), the scale that of a wheel odometer (section 6.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.errors import FactorError
+from factors.robust import Robust
+from factors.rotations import cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
+from factors.stacked import ResidualFactors
+from factors.validation import FloatArray, checked, checked_covariances
+from factors.variables import SpatialPose
+
+ERROR_DIM = 2  # scale, yaw-rate bias in rad/s
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def odometry_factors(
+    rows: ArrayLike, a_T_b: ArrayLike, dt: ArrayLike, covariances: ArrayLike, robust: Robust | None = None
+) -> ResidualFactors:
+    """Return n factors of odometry with slow errors.
+
+    rows: (n, 4) keys of the pose before, the pose after (`gtsam.Pose3`), the errors before and after (vectors of 2:
+    scale, yaw-rate bias in rad/s); a_T_b: (n, 4, 4) measured increments; dt: (n,) s; covariances: (n, 8, 8), or one for
+    all, of rotation (rad), translation (m) and the errors' change. Raises `FactorError`.
+    """
+    measured = checked("a_T_b", a_T_b, (None, 4, 4))
+    seconds = checked("dt", dt, (len(measured),))
+    if (seconds < 0).any():
+        raise FactorError(f"dt[{int(np.argmax(seconds < 0))}]: expected seconds >= 0, got {seconds.min()}")
+    function = _Odometry(measured[:, :3, :3].copy(), measured[:, :3, 3].copy(), seconds.copy())
+    return ResidualFactors(
+        rows=np.asarray(rows),
+        dims=(SpatialPose(), SpatialPose(), ERROR_DIM, ERROR_DIM),
+        residual=function.residual,
+        covariances=checked_covariances("covariances", covariances, len(measured), 8),
+        jacobians=function.jacobians,
+        robust=robust,
+        name="odometry",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Odometry:
+    """R (n, 3, 3) and d (n, 3) of the increments, dt (n,)."""
+
+    R: FloatArray
+    d: FloatArray
+    dt: FloatArray
+
+    def residual(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+        translation = self._moved(a, b) - (1 + before[:, :1]) * self.d
+        return np.concatenate([rotation_log(self._turned(a, b, before)), translation, after - before], axis=1)
+
+    def jacobians(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> Sequence[FloatArray]:
+        n = len(self.d)
+        Ra, Rb = a[:, :3, :3], b[:, :3, :3]
+        E = self._turned(a, b, before)
+        inverse = inverse_right_jacobian(rotation_log(E))
+        J_a, J_b, J_before, J_after = (np.zeros((n, 8, d)) for d in (6, 6, 2, 2))
+        J_a[:, :3, :3] = -inverse @ Rb.swapaxes(1, 2) @ Ra
+        J_b[:, :3, :3] = inverse
+        axis = E.swapaxes(1, 2) @ self.R.swapaxes(1, 2) @ _UP
+        J_before[:, :3, 1] = -self.dt[:, None] * (inverse @ axis[:, :, None])[:, :, 0]
+        J_a[:, 3:6, :3] = cross_matrix(self._moved(a, b))
+        J_a[:, 3:6, 3:] = -np.eye(3)
+        J_b[:, 3:6, 3:] = Ra.swapaxes(1, 2) @ Rb
+        J_before[:, 3:6, 0] = -self.d
+        J_before[:, 6:] = -np.eye(2)
+        J_after[:, 6:] = np.eye(2)
+        return [J_a, J_b, J_before, J_after]
+
+    def _turned(self, a: FloatArray, b: FloatArray, before: FloatArray) -> FloatArray:
+        expected = rotation_exp((before[:, 1] * self.dt)[:, None] * _UP) @ self.R
+        return np.asarray(expected.swapaxes(1, 2) @ a[:, :3, :3].swapaxes(1, 2) @ b[:, :3, :3])
+
+    def _moved(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.asarray((a[:, :3, :3].swapaxes(1, 2) @ (b[:, :3, 3] - a[:, :3, 3])[:, :, None])[:, :, 0])
