@@ -127,3 +127,13 @@ def _shape(shape: tuple[int | None, ...]) -> str:
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def upper_triangle(P: FloatArray) -> FloatArray:
+    """Symmetric matrices (N, 2, 2) as their entries (N, 3): xx, xy, yy."""
+    return np.stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]], axis=-1)
+
+
+def from_upper_triangle(entries: FloatArray) -> FloatArray:
+    """The symmetric matrices (N, 2, 2) of entries (N, 3): xx, xy, yy."""
+    return entries[:, [0, 1, 1, 2]].reshape(-1, 2, 2)

@@ -36,10 +36,11 @@ NumPy archives (.npz, without pickled objects) have an array for each column, al
     np.savez("detections.npz", timestamp=[0.0, 0.1], x=[10.2, 0.0], y=[3.1, 0.0], empty=[False, True])
 
 Tracks are written with the same columns and, besides, id, cov_xx, cov_xy, cov_yy (covariance of the horizontal
-position, m^2) and coasting (s since the last detection).
+position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coasting (s since the last detection).
 """
 
 from data_tools.detection_files.dataset import DetectionFile, read_detections
+from data_tools.detection_files.track_rows import TrackRows, read_tracks
 from data_tools.detection_files.tracks import write_tracks
 
-__all__ = ["DetectionFile", "read_detections", "write_tracks"]
+__all__ = ["DetectionFile", "TrackRows", "read_detections", "read_tracks", "write_tracks"]

@@ -121,7 +121,9 @@ def _checked(raw: RawTable) -> _Rows:
         row = int(np.argmax(strange))
         raise raw.fault(row, f"coordinates: expected world, ego or sensor, got {str(coordinates[row])!r}")
     pose = _pose(raw, coordinates)
-    return _Rows(raw, scene, timestamp, raw.texts("sensor", "sensor"), coordinates, empty, _boxes(raw, empty), pose)
+    return _Rows(
+        raw, scene, timestamp, raw.texts("sensor", "sensor"), coordinates, empty, box_columns(raw, empty), pose
+    )
 
 
 def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
@@ -132,8 +134,8 @@ def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
         raise raw.fault(row, f"timestamp: expected rows in order of time, time runs backwards at {timestamp[row]} s")
 
 
-def _boxes(raw: RawTable, empty: BoolArray) -> Detections:
-    """The detections of all rows; those of empty rows hold zeros and are never looked at."""
+def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
+    """Boxes and scores of all rows; those of empty rows hold zeros and are never looked at."""
     position = np.stack([raw.numbers("x"), raw.numbers("y"), raw.numbers("z", 0.0)], axis=-1)
     position[empty] = 0.0
     for axis, name in enumerate("xyz"):

@@ -1,4 +1,4 @@
-"""The three formats of detection tables: CSV, newline-delimited JSON, NumPy archives."""
+"""The three formats of tables of boxes: CSV, newline-delimited JSON, NumPy archives."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import logging
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TextIO
@@ -20,9 +21,20 @@ from saga_fg.errors import InputError
 log = logging.getLogger(__name__)
 
 
-def read_raw_table(path: Path) -> RawTable:
-    """Read a table by its suffix. Raises `InputError` for another suffix and for files that are not what it says."""
-    readers: dict[str, Callable[[Path], RawTable]] = {
+@dataclass(frozen=True)
+class Layout:
+    """The columns a table may have, and those it must."""
+
+    columns: tuple[str, ...] = COLUMNS
+    required: tuple[str, ...] = REQUIRED
+
+
+def read_raw_table(path: Path, layout: Layout | None = None) -> RawTable:
+    """Read a table, of detections unless another layout is given, by its suffix.
+
+    Raises `InputError` for another suffix and for files that are not what it says.
+    """
+    readers: dict[str, Callable[[Path, Layout], RawTable]] = {
         ".csv": _read_csv,
         ".ndjson": _read_ndjson,
         ".jsonl": _read_ndjson,
@@ -31,7 +43,7 @@ def read_raw_table(path: Path) -> RawTable:
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected a file name that ends in {', '.join(readers)}")
     try:
-        return readers[path.suffix.lower()](path)
+        return readers[path.suffix.lower()](path, layout or Layout())
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -42,7 +54,7 @@ def _open(path: Path) -> TextIO:
     return path.open(encoding="utf-8-sig", newline="")
 
 
-def _read_csv(path: Path) -> RawTable:
+def _read_csv(path: Path, layout: Layout) -> RawTable:
     rows: list[list[str]] = []
     lines: list[int] = []
     with _open(path) as file:
@@ -63,13 +75,13 @@ def _read_csv(path: Path) -> RawTable:
     columns: dict[str, Values] = {
         name: [value.strip() or None for value in column]
         for name, column in zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True)
-        if name in COLUMNS
+        if name in layout.columns
     }
-    _check_names(path, set(header))
+    _check_names(path, set(header), layout)
     return RawTable(path, columns, len(rows), lambda row: f"line {lines[row]}", numerals=True)
 
 
-def _read_ndjson(path: Path) -> RawTable:
+def _read_ndjson(path: Path, layout: Layout) -> RawTable:
     rows: list[dict[str, Any]] = []
     lines: list[int] = []
     with _open(path) as file:
@@ -85,28 +97,28 @@ def _read_ndjson(path: Path) -> RawTable:
             rows.append(row)
             lines.append(number)
     names = set().union(*rows)
-    columns: dict[str, Values] = {name: [row.get(name) for row in rows] for name in COLUMNS if name in names}
+    columns: dict[str, Values] = {name: [row.get(name) for row in rows] for name in layout.columns if name in names}
     if not rows:
-        columns = {name: [] for name in COLUMNS}
+        columns = {name: [] for name in layout.columns}
     elif "x" not in columns and "y" not in columns:  # every frame is empty
         columns |= {"x": [None] * len(rows), "y": [None] * len(rows)}
-    _check_names(path, names | columns.keys())
+    _check_names(path, names | columns.keys(), layout)
     return RawTable(path, columns, len(rows), lambda row: f"line {lines[row]}")
 
 
-def _read_npz(path: Path) -> RawTable:
+def _read_npz(path: Path, layout: Layout) -> RawTable:
     columns: dict[str, Values] = {}
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             names = set(archive.files)
-            for name in COLUMNS:
+            for name in layout.columns:
                 if name in names:
                     columns[name] = archive[name]
     except (ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: expected a NumPy archive of plain arrays: {error}") from error
     except TypeError as error:  # a single array, without a name
         raise InputError(f"{path}: expected a NumPy archive of plain arrays, got a single array") from error
-    _check_names(path, names)
+    _check_names(path, names, layout)
     length = len(columns["timestamp"]) if np.ndim(columns.get("timestamp", 0.0)) == 1 else 0
     for name, column in columns.items():
         if np.shape(column) != (length,):
@@ -114,14 +126,14 @@ def _read_npz(path: Path) -> RawTable:
     return RawTable(path, columns, length, lambda row: f"row {row}")
 
 
-def _check_names(path: Path, names: set[str]) -> None:
+def _check_names(path: Path, names: set[str], layout: Layout) -> None:
     """Columns that are missing, or look misspelt, are errors; others that have no meaning here get a warning."""
-    unknown = sorted(names - set(COLUMNS))
+    unknown = sorted(names - set(layout.columns))
     for name in unknown:
-        nearest = get_close_matches(name, set(COLUMNS) - names, n=1, cutoff=0.75)
+        nearest = get_close_matches(name, set(layout.columns) - names, n=1, cutoff=0.75)
         if nearest:
             raise InputError(f"{path}: unknown column {name!r}; did you mean {nearest[0]!r}?")
-    for name in REQUIRED:
+    for name in layout.required:
         if name not in names:
             there = ", ".join(sorted(names)[:12]) or "none"
             raise InputError(f"{path}: expected a column {name!r}, the columns there are {there}")

@@ -1,4 +1,4 @@
-"""Tracks as a table, one row per track and moment: CSV or newline-delimited JSON. See the package for the columns."""
+"""Tracks written as a table, a row per track and moment: CSV or newline-delimited JSON. Columns: see the package."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 
 from data_tools.atomic_files import atomic_file
 from data_tools.located import located
+from saga_fg.arrays import upper_triangle
 from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
 from saga_fg.track import Tracks
 
 TRACK_COLUMNS = (
     *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
-    *("cov_xx", "cov_xy", "cov_yy", "coasting"),
+    *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
 )
 
 
@@ -53,9 +54,10 @@ def _rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterat
             if len(moments) != len(scene):
                 raise InputError(f"expected tracks for {len(scene)} moments, got {len(moments)}")
         for timestamp, tracks in zip(scene.timestamps.tolist(), moments, strict=True):
-            boxes, covariance = tracks.boxes, tracks.position_covariance
+            boxes = tracks.boxes
             before = np.column_stack([boxes.position, boxes.size, boxes.yaw, boxes.velocity, tracks.score])
-            after = np.column_stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1], tracks.coasting])
+            covariances = (tracks.position_covariance, tracks.velocity_covariance)
+            after = np.column_stack([*(upper_triangle(P) for P in covariances), tracks.coasting])
             for id_, label, *numbers in zip(
                 tracks.id.tolist(), boxes.label.tolist(), *np.hstack([before, after]).T.tolist(), strict=True
             ):

@@ -5,16 +5,20 @@
 World boxes go back to the rectified camera frame; the 2D box is the projection of the 3D box, clipped to the image.
 Boxes that do not show in the image are left out: the benchmark knows only what the camera sees. `truncated` and
 `occluded`, which evaluators do not read in results, are 0.
+
+The format has neither velocities nor covariances, nor what lies outside the image. All of that is in a table beside
+the sequences' files, `tracks.csv`, in world coordinates (`data_tools.detection_files`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from data_tools.atomic_files import atomic_directory
+from data_tools.detection_files import write_tracks
 from data_tools.kitti.calibration import Calibration
 from data_tools.kitti.camera_boxes import world_boxes_to_camera
 from data_tools.kitti.dataset import KittiTracking
@@ -27,6 +31,7 @@ from saga_fg.errors import InputError
 from saga_fg.geometry import inverse_transform
 from saga_fg.track import Tracks
 
+TRACK_TABLE = "tracks.csv"
 IMAGE_SIZE = (1242, 375)  # pixels, the largest common to most sequences
 
 _TYPE_OF_LABEL = {name.lower(): name for name in TYPES if name != "DontCare"}
@@ -40,14 +45,21 @@ def write_kitti_results(
 ) -> None:
     """Write the tracks of some sequences, each with one `Tracks` for each of its timestamps, to directory/NNNN.txt.
 
+    All of them together go to directory/tracks.csv as well, in full.
+
     `scenes` may be a generator: the files appear when all is done. Raises `InputError` for a directory that is not
     writable, tracks that do not fit the scene, a size or heading that is unknown, a class KITTI does not have.
     """
     with atomic_directory(directory) as folder:
-        for scene, moments in scenes:
-            with located(f"{directory}: sequence {scene.name}"):
-                text = kitti_result_text(scene, moments, dataset.calibration(scene.name), image_size)
-            (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
+
+        def written() -> Iterator[tuple[Scene, Sequence[Tracks]]]:
+            for scene, moments in scenes:
+                with located(f"{directory}: sequence {scene.name}"):
+                    text = kitti_result_text(scene, moments, dataset.calibration(scene.name), image_size)
+                (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
+                yield scene, moments
+
+        write_tracks(folder / TRACK_TABLE, written())
 
 
 def kitti_result_text(

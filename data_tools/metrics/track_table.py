@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -23,6 +23,7 @@ class TrackTable:
     id      (N,) names of the objects or tracks; a name occurs once at a moment at most
     boxes   label, position, size, yaw, velocity, all moments in one coordinate frame
     score   (N,) confidence; 0 for ground truth
+    position_covariance  (N, 2, 2) of the horizontal position, m^2, NaN where unknown; may be left out
 
     Raises `InputError` for moments out of order or an identity that occurs twice at one moment.
     """
@@ -31,6 +32,7 @@ class TrackTable:
     id: StrArray
     boxes: Boxes
     score: FloatArray
+    position_covariance: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
@@ -48,6 +50,9 @@ class TrackTable:
             )
         for name, array in (("moment", moment), ("id", names), ("score", checked("score", self.score, (n,)))):
             object.__setattr__(self, name, array)
+        given = self.position_covariance if len(self.position_covariance) else np.full((n, 2, 2), np.nan)
+        covariance = checked("position_covariance", given, (n, 2, 2), "finite-or-nan")
+        object.__setattr__(self, "position_covariance", covariance)
 
     @classmethod
     def of_annotations(cls, moments: Sequence[Annotations], hidden: bool = True) -> Self:
@@ -65,7 +70,8 @@ class TrackTable:
         moment = np.repeat(np.arange(len(moments)), [len(found) for found in moments])
         numbers = np.concatenate([np.empty(0, dtype=np.int64), *(found.id for found in moments)])
         score = np.concatenate([np.empty(0), *(found.score for found in moments)])
-        return cls(moment, numbers.astype(np.str_), boxes, score)
+        covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in moments)])
+        return cls(moment, numbers.astype(np.str_), boxes, score, covariance)
 
     def __len__(self) -> int:
         return len(self.boxes)

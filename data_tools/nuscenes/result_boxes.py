@@ -5,7 +5,8 @@ A result file is `{"meta": {...}, "results": {sample_token: [box, ...]}}`; a box
     sample_token, translation (x, y, z of the centre, m), size (width, length, height, m),
     rotation (unit quaternion w, x, y, z), velocity (vx, vy, m/s; NaN or null for unknown),
 
-and `detection_name`, `detection_score` or `tracking_name`, `tracking_score`, `tracking_id`.
+and `detection_name`, `detection_score` or `tracking_name`, `tracking_score`, `tracking_id`. A field of our own, which
+the official evaluation leaves alone, is `position_covariance` (xx, xy, yy of the horizontal position, m^2) of a track.
 Source: https://github.com/nutonomy/nuscenes-devkit, python-sdk/nuscenes/eval/{detection,tracking}/README.md.
 
 Here sizes are (length, width, height) and rotations are yaw angles.
@@ -21,23 +22,28 @@ import numpy as np
 
 from data_tools.located import unknown
 from data_tools.nuscenes.classes import DETECTION_CLASSES, TRACKING_CLASSES
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.arrays import BoolArray, FloatArray, StrArray, from_upper_triangle
 from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
 from saga_fg.geometry import quaternion_yaw
 
 Task = Literal["detection", "tracking"]
 _UNKNOWN = (np.nan, np.nan)
-_NUMBERS = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2, "score": 1}
+_NUMBERS = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2, "score": 1, "position_covariance": 3}
+_NO_COVARIANCE = (np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class ResultBoxes:
-    """All boxes of a file: `boxes` and `score` (N,), tracks' `id` (N,) ("" for detections), rows of each sample."""
+    """All boxes of a file: `boxes` and `score` (N,), tracks' `id` (N,) ("" for detections), rows of each sample.
+
+    position_covariance (N, 2, 2), m^2: NaN where the file has none.
+    """
 
     boxes: Boxes
     score: FloatArray
     id: StrArray
+    position_covariance: FloatArray
     rows: dict[str, slice]
 
 
@@ -63,6 +69,7 @@ class ResultColumns:
             columns: dict[str, list[Any]] = {name: [box[name] for box in boxes] for name in _NUMBERS if name in _FIXED}
             columns["velocity"] = [_velocity(box) for box in boxes]
             columns["score"] = [(box[score],) for box in boxes]
+            columns["position_covariance"] = [box.get("position_covariance", _NO_COVARIANCE) for box in boxes]
             labels = [box[label] for box in boxes]
             ids = [box["tracking_id"] for box in boxes] if self._task == "tracking" else [""] * len(boxes)
             strangers = [box for box in boxes if box.get("sample_token", token) != token]
@@ -94,6 +101,11 @@ class ResultColumns:
             ("rotation", np.abs(norm - 1) <= 1e-3, "a unit quaternion (w, x, y, z)"),
             ("velocity", ~np.isinf(columns["velocity"]).any(axis=1), "finite numbers, or NaN for unknown"),
             ("score", np.isfinite(columns["score"]).all(axis=1), "a finite number"),
+            (
+                "position_covariance",
+                ~np.isinf(columns["position_covariance"]).any(axis=1),
+                "finite numbers (xx, xy, yy) in m^2",
+            ),
         ):
             self._require(good, name, columns[name], expected)
         labels = np.array(self._labels, dtype=np.str_)
@@ -109,7 +121,8 @@ class ResultColumns:
             yaw=quaternion_yaw(columns["rotation"] / norm[:, None]),
             velocity=columns["velocity"],
         )
-        return ResultBoxes(boxes, columns["score"][:, 0], np.array(self._ids, dtype=np.str_), self._rows)
+        covariance = from_upper_triangle(columns["position_covariance"])
+        return ResultBoxes(boxes, columns["score"][:, 0], np.array(self._ids, dtype=np.str_), covariance, self._rows)
 
     def _require(self, good: BoolArray, name: str, column: FloatArray, expected: str) -> None:
         if not good.all():

@@ -52,6 +52,7 @@ def _scored(
             np.concatenate([sample.id for sample in samples]),
             Boxes.concatenate([sample.boxes for sample in samples]),
             np.concatenate([sample.score for sample in samples]),
+            np.concatenate([sample.position_covariance for sample in samples]),
         ),
         racks=racks,
     )

@@ -5,6 +5,9 @@
 
 in the global frame. Every sample of a scene is listed, with at most 500 boxes; a track keeps its class. Source:
 https://github.com/nutonomy/nuscenes-devkit, python-sdk/nuscenes/eval/tracking/README.md.
+
+A box written here has one field more, which the official evaluation leaves alone: `position_covariance` (xx, xy, yy of
+the horizontal position, m^2).
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from data_tools.atomic_files import atomic_file
 from data_tools.located import located
 from data_tools.nuscenes.classes import TRACKING_CLASSES
 from data_tools.nuscenes.result_files import ResultMeta, read_result_file
-from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.arrays import FloatArray, StrArray, upper_triangle
 from saga_fg.boxes import Boxes
 from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
@@ -81,6 +84,7 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
         chosen.id.tolist(),
         boxes.label.tolist(),
         chosen.score.tolist(),
+        upper_triangle(chosen.position_covariance).round(6).tolist(),
         strict=True,
     )
     return [
@@ -93,18 +97,23 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
             "tracking_id": f"{scene}-{id_}",
             "tracking_name": label,
             "tracking_score": score,
+            "position_covariance": covariance,
         }
-        for translation, size, rotation, velocity, id_, label, score in columns
+        for translation, size, rotation, velocity, id_, label, score, covariance in columns
     ]
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedBoxes:
-    """The boxes of one sample of a tracking result: `id` (N,) names of the tracks, `boxes`, `score` (N,)."""
+    """The boxes of one sample of a tracking result: `id` (N,) names of the tracks, `boxes`, `score` (N,).
+
+    position_covariance (N, 2, 2), m^2: NaN where the file has none.
+    """
 
     id: StrArray
     boxes: Boxes
     score: FloatArray
+    position_covariance: FloatArray
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -127,5 +136,7 @@ def read_tracking_results(path: str | Path) -> TrackingResults:
         ids = columns.id[rows]
         if len(np.unique(ids)) != len(ids):
             raise InputError(f"{path}: sample {token}: tracking_id: expected each track at most once")
-        samples[token] = TrackedBoxes(ids, columns.boxes.select(rows), columns.score[rows])
+        samples[token] = TrackedBoxes(
+            ids, columns.boxes.select(rows), columns.score[rows], columns.position_covariance[rows]
+        )
     return TrackingResults(result.meta, samples)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from kitti_example import write_sequence
 
+from data_tools.detection_files import read_tracks
 from data_tools.kitti import KittiTracking, read_kitti_labels, write_kitti_results
+from data_tools.kitti.tracking_results import TRACK_TABLE
 from saga_fg import Boxes, InputError, Scene, Tracks
 
 
@@ -43,6 +45,18 @@ def test_the_official_layout(data: KittiTracking, tmp_path: Path) -> None:
     expected_bbox = [600 - 700 * 2.8 / 8, 180 + 700 * 0.25 / 12, 600 - 700 * 1.2 / 12, 180 + 700 * 1.75 / 8]
     np.testing.assert_allclose(numbers[:4], expected_bbox, atol=1e-4)
     np.testing.assert_allclose(numbers[4:], [1.5, 1.6, 4, -2, 1.75, 10, -np.pi / 2, 0.5], atol=1e-6)
+
+
+def test_the_table_beside_the_results_has_all_tracks_in_world_coordinates(data: KittiTracking, tmp_path: Path) -> None:
+    scene = data.scene("0007")
+    behind = car((-30, 2, 1))  # not in the image
+    write_kitti_results(tmp_path / "out", data, [(scene, [behind, car((11, 2, 1)), Tracks.empty(0.2)])])
+    assert len(read_kitti_labels(tmp_path / "out" / "0007.txt")) == 1
+    rows = read_tracks(tmp_path / "out" / TRACK_TABLE)
+    assert rows.scene.tolist() == ["0007", "0007"]
+    assert rows.timestamp.tolist() == scene.timestamps[:2].tolist()
+    np.testing.assert_array_equal(rows.boxes.position, [[-30, 2, 1], [11, 2, 1]])
+    np.testing.assert_array_equal(rows.position_covariance, np.zeros((2, 2, 2)))
 
 
 def test_labels_to_the_world_and_back(data: KittiTracking, tmp_path: Path) -> None:

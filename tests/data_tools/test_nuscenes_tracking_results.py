@@ -29,7 +29,8 @@ def tracks(
     n = len(ids)
     position = np.arange(3 * n, dtype=float).reshape(n, 3)
     boxes = Boxes.of(labels, position, np.tile(size, (n, 1)), np.full(n, yaw), np.tile(velocity, (n, 1)))
-    return Tracks(0.0, np.array(ids), boxes, np.array(score), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros(n))
+    covariance = np.tile([[0.5, 0.1], [0.1, 0.25]], (n, 1, 1))
+    return Tracks(0.0, np.array(ids), boxes, np.array(score), covariance, covariance, np.zeros(n))
 
 
 def test_the_official_layout(tmp_path: Path) -> None:
@@ -54,6 +55,7 @@ def test_the_official_layout(tmp_path: Path) -> None:
         "tracking_id": "scene-1-7",
         "tracking_name": "car",
         "tracking_score": 0.5,
+        "position_covariance": [0.5, 0.1, 0.25],
     }
 
 
@@ -70,7 +72,23 @@ def test_written_and_read_again(tmp_path: Path) -> None:
     assert read.score.tolist() == [0.1, 1.0]
     for name in ("position", "size", "yaw", "velocity"):
         np.testing.assert_allclose(getattr(read.boxes, name), getattr(written.boxes, name), atol=1e-6)
+    np.testing.assert_array_equal(read.position_covariance, written.position_covariance)
     assert len(result.samples["c"]) == 0
+
+
+def test_covariances_are_not_required_but_checked(tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    write_tracking_results(path, [(scene(), [tracks(), tracks()])], META)
+    content = json.loads(path.read_text())
+    del content["results"]["a"][0]["position_covariance"]
+    path.write_text(json.dumps(content))
+    samples = read_tracking_results(path).samples
+    assert np.isnan(samples["a"].position_covariance).all()
+    assert np.isfinite(samples["b"].position_covariance).all()
+    content["results"]["a"][0]["position_covariance"] = [1.0, 2.0]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="sample a: box 0: position_covariance: expected 3 numbers"):
+        read_tracking_results(path)
 
 
 def test_ids_of_two_scenes_differ(tmp_path: Path) -> None:
