@@ -5,6 +5,7 @@ Linear families give native `gtsam.JacobianFactor`s, which no solver needs Pytho
 `ResidualFactors`. One family a file.
 """
 
+from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
@@ -36,6 +37,7 @@ __all__ = [
     "MeasurementModel",
     "NonlinearInteraction",
     "PlanarPose",
+    "Pose",
     "Radar",
     "RangeBearing",
     "RangeRate",
@@ -48,6 +50,7 @@ __all__ = [
     "SpatialPose",
     "Variable",
     "Vector",
+    "between_factor",
     "box",
     "check_dimensions",
     "detection_factor",
@@ -63,9 +66,12 @@ __all__ = [
     "linearised",
     "marginal_factors",
     "marginal_moments",
+    "noise_model",
     "nonlinear_graph",
     "nonlinear_graph_at",
     "odometry_factors",
+    "pose",
+    "pose_prior_factor",
     "position",
     "position_velocity",
     "prior_factor",

@@ -83,6 +83,13 @@ def quaternion_rotation(quaternion: FloatArray) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rotation_quaternion(rotation: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4), (w, x, y, z) with w >= 0, of rotation matrices (N, 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True))
+
+
 def checked_quaternions(name: str, value: ArrayLike) -> FloatArray:
     """`value` as unit quaternions (N, 4), (w, x, y, z); raises `InputError` where the norm is off 1 by over 1e-3."""
     quaternions = checked(name, value, (None, 4))

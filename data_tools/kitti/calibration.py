@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.kitti.text import read_lines
+from data_tools.text_tables import read_lines
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 

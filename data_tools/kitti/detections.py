@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.kitti.camera_boxes import CameraBoxes
-from data_tools.kitti.text import TextTable, read_table
+from data_tools.text_tables import TextTable, read_table
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.errors import InputError
 

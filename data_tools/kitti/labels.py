@@ -16,8 +16,8 @@ from typing import Self
 import numpy as np
 
 from data_tools.kitti.camera_boxes import CameraBoxes
-from data_tools.kitti.text import TextTable, read_table
 from data_tools.located import unknown
+from data_tools.text_tables import TextTable, read_table
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.kitti.text import read_table
+from data_tools.text_tables import read_table
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.atomic_files import write_text
-from data_tools.kitti.text import read_table
 from data_tools.located import located
+from data_tools.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError

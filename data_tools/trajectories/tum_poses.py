@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_tools.atomic_files import write_text
-from data_tools.kitti.text import read_table
 from data_tools.located import located
+from data_tools.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
 from saga_fg.errors import InputError
 from saga_fg.geometry import quaternion_rotation

@@ -13,6 +13,7 @@ from pipelines.cli.demo import demo
 from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.reporting import ReportingGroup
 from pipelines.cli.simulate import simulate
+from pipelines.cli.slam import slam_app
 from pipelines.cli.track import track_app
 
 app = typer.Typer(
@@ -26,6 +27,7 @@ app = typer.Typer(
 app.add_typer(track_app, name="track")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(bench_app, name="bench")
+app.add_typer(slam_app, name="slam")
 app.command()(simulate)
 app.command()(demo)
 app.command()(config)

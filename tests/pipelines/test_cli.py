@@ -27,7 +27,7 @@ def saga_fg(*arguments: str | Path) -> Result:
 
 @pytest.mark.parametrize(
     "command",
-    ["track nuscenes", "track kitti", "track file", "evaluate nuscenes", "simulate", "demo", "config"],
+    ["track nuscenes", "track kitti", "track file", "evaluate nuscenes", "simulate", "demo", "config", "slam g2o"],
     ids=lambda c: c,
 )
 def test_help_shows_a_worked_example(command: str) -> None:

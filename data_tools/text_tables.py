@@ -1,4 +1,4 @@
-"""Reading KITTI's text files: lines of values, separated by spaces or commas."""
+"""Reading text files of numbers: lines of values, separated by spaces or commas."""
 
 from __future__ import annotations
 

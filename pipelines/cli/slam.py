@@ -1,0 +1,16 @@
+"""`saga-fg slam`: trajectories and maps, from recordings and graph files."""
+
+from __future__ import annotations
+
+import typer
+
+from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.slam_g2o import g2o
+
+slam_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
+slam_app.command()(g2o)
+
+
+@slam_app.callback()
+def slam() -> None:
+    """Estimate where the vehicle was and what stands around it, in one factor graph."""

@@ -1,0 +1,50 @@
+"""`saga-fg slam g2o`: the optimum of a pose graph from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.cli.options import Verbose
+from pipelines.cli.reporting import working
+from pipelines.cli.summary import counted
+
+
+def g2o(
+    file: Annotated[Path, typer.Argument(help="Pose graph in the g2o format, in the plane or in space.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt and iSAM2 (QR) on the graph too.")
+    ] = False,
+    verbose: Verbose = False,
+) -> None:
+    """Optimise a pose graph, whatever the guess in the file is worth.
+
+    Writes the optimised graph (poses.g2o), covariances.csv, errors.json and a picture from above (above.png).
+
+    \b
+    Examples:
+      saga-fg slam g2o sphere2500.g2o --output sphere
+      saga-fg slam g2o MIT.g2o --output MIT --compare
+    """
+    from data_tools.pose_graphs import read_g2o
+    from pipelines.slam.pose_graph import write_pose_graph
+    from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
+    from saga_fg.pose_graph import factor_graph, optimise_poses, pose_values
+
+    graph = read_g2o(file)
+    with working("optimising"):
+        optimised = optimise_poses(graph)
+    guess = factor_graph(graph).error(pose_values(graph.world_T_pose))
+    errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
+    if compare:
+        with working("GTSAM's optimisers"):
+            errors |= {"GTSAM Levenberg-Marquardt": levenberg_marquardt(graph), "GTSAM iSAM2 (QR)": isam2(graph)}
+    write_pose_graph(output, graph, optimised, errors)
+    poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
+    typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (guess in the file {guess:.6g})")
+    for name, error in errors.items():
+        if name.startswith("GTSAM"):
+            typer.echo(f"{name}: error {error:.6g}, ours is {optimised.error / error:.4f} times that")

@@ -1,0 +1,1 @@
+"""SLAM: pipelines from recordings and graph files to trajectories, landmarks and maps."""
