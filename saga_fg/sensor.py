@@ -3,14 +3,18 @@ r"""Sensors: all that a sensor contributes to the filter is what it observes, ho
     z = H x + v,   v ~ N(0, R)
     R = s(score)^2 ( position^2 I + (range_noise r)^2 u u^T + (bearing_noise r)^2 n n^T )
 
-with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. The motion of the
-world never depends on which sensor speaks, so a new sensor is a few lines of configuration.
+with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. A score means
+something else for every detector and class; its calibration makes it a probability that compares (Platt 1999),
+
+    P(the detection is true) = 1 / (1 + exp(-(offset + slope logit(score)))).
+
+The motion of the world never depends on which sensor speaks, so a new sensor is a few lines of configuration.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,10 +22,13 @@ import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.errors import InputError
+from saga_fg.frame import Detections, Frame
 from saga_fg.geometry import inverse_transform, wrap_angle, yaw_transform
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 DEFAULT = "default"  # key of the settings for every class that has none of its own
+LEAST_PROBABILITY = 1e-3  # of a detection, and of its being none
+_LARGEST_LOGIT = math.log((1 - LEAST_PROBABILITY) / LEAST_PROBABILITY)
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,18 @@ class NoiseModel:
     def __post_init__(self) -> None:
         require_positive(self, "position", "velocity", "yaw", "height")
         require_between(self, 0, math.inf, "range_noise", "bearing_noise", "low_score")
+
+
+@dataclass(frozen=True)
+class ScoreCalibration:
+    """How the scores of a class become probabilities: straight on the logit."""
+
+    slope: float = setting(1.0, "change of the logit of the probability with the logit of the score")
+    offset: float = setting(0.0, "logit of the probability at a score of one half")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "slope")
+        require_between(self, -math.inf, math.inf, "offset")
 
 
 @dataclass(frozen=True)
@@ -83,27 +102,55 @@ class Sensor:
     )
     use_velocity: bool = setting(True, "take in the velocity where the detector measured one")
     detection_probability: float = setting(0.9, "chance that a visible object in the field of view is detected")
+    class_detection: Mapping[str, float] = settings_group(dict, "that chance by class, where it differs")
     score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
+    calibration: Mapping[str, ScoreCalibration] = settings_group(
+        lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
+    )
+    births: Literal["alone", "confirmed"] = setting(
+        "alone", "whether a track born of its detections counts at once, or when other evidence has confirmed it"
+    )
     field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
     extrinsics: Extrinsics = settings_group(Extrinsics, "where it sits, for detections in sensor coordinates")
     time_offset: float = setting(0.0, "added to the sensor's timestamps to get the time of measurement, s")
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1, "detection_probability")
+        for label, chance in self.class_detection.items():
+            if not 0 <= chance <= 1:
+                raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")
         require_between(self, -math.inf, math.inf, "time_offset")
         require_one_of(self, "score", ("probability", "logit"))
+        require_one_of(self, "births", ("alone", "confirmed"))
 
-    def probability(self, score: FloatArray) -> FloatArray:
-        """The detector's scores (N,) as probabilities in [0.001, 0.999]."""
-        p = score if self.score == "probability" else 1 / (1 + np.exp(-np.clip(score, -50, 50)))
-        return np.clip(p, 1e-3, 1 - 1e-3)
+    def logit(self, score: FloatArray) -> FloatArray:
+        """The logits (N,) of the detector's own scores, before calibration, within those of 0.001 and 0.999."""
+        raw = np.asarray(score, dtype=np.float64)
+        if self.score == "probability":
+            p = np.clip(raw, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+            raw = np.log(p / (1 - p))
+        return np.clip(raw, -_LARGEST_LOGIT, _LARGEST_LOGIT)
+
+    def probability(self, score: FloatArray, label: StrArray) -> FloatArray:
+        """The detector's scores (N,) of objects of these classes (N,) as probabilities in [0.001, 0.999]."""
+        return self.calibrated(self.logit(score), label)
+
+    def calibrated(self, logit: FloatArray, label: StrArray) -> FloatArray:
+        """The probabilities (N,) of scores with these logits (N,) before calibration."""
+        fallback = self.calibration.get(DEFAULT, ScoreCalibration())
+        slope = _by_class(label, lambda c: self.calibration.get(c, fallback).slope)
+        offset = _by_class(label, lambda c: self.calibration.get(c, fallback).offset)
+        p = 1 / (1 + np.exp(-np.clip(offset + slope * logit, -50, 50)))
+        return np.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+
+    def detection_chance(self, label: StrArray) -> FloatArray:
+        """(N,) chance that a visible object of each class in the field of view is detected."""
+        return _by_class(label, lambda c: self.class_detection.get(c, self.detection_probability))
 
     def deviations(self, label: StrArray, name: str) -> FloatArray:
         """(N,) the noise parameter `name` of each class."""
         fallback = self.noise.get(DEFAULT, NoiseModel())
-        classes, index = np.unique(label, return_inverse=True)
-        values = [getattr(self.noise.get(str(c), fallback), name) for c in classes]
-        return np.asarray(values, dtype=np.float64)[index] if len(label) else np.empty(0)
+        return _by_class(label, lambda c: getattr(self.noise.get(c, fallback), name))
 
     def position_covariance(
         self, label: StrArray, position: FloatArray, probability: FloatArray, origin: FloatArray
@@ -122,6 +169,15 @@ class Sensor:
         R = R + along[:, :, None] * along[:, None, :] + across[:, :, None] * across[:, None, :]
         return np.asarray(R * self._score_factor(label, probability)[:, None, None])
 
+    def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
+        """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
+
+        Where the sensor stood is unknown (None), so is the range, and its part of the noise is left out.
+        """
+        label, position = detections.boxes.label, detections.boxes.position[:, :2]
+        probability = self.probability(detections.score, label)
+        return self.position_covariance(label, position, probability, position if origin is None else origin)
+
     def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """R (N, 2, 2), (m/s)^2."""
         variance = self.deviations(label, "velocity") ** 2 * self._score_factor(label, probability)
@@ -129,6 +185,19 @@ class Sensor:
 
     def _score_factor(self, label: StrArray, probability: FloatArray) -> FloatArray:
         return np.asarray((1 + self.deviations(label, "low_score") * (1 - probability)) ** 2)
+
+    def in_world(self, frame: Frame) -> Detections:
+        """The detections of a frame of this sensor, in world coordinates."""
+        if frame.world_T_ego is None or frame.coordinates == "world":
+            return frame.detections
+        ego_T_source = self.extrinsics.ego_T_sensor if frame.coordinates == "sensor" else np.eye(4)
+        return frame.detections.transformed(frame.world_T_ego @ ego_T_source)
+
+    def origin(self, frame: Frame) -> FloatArray | None:
+        """Where the sensor stood (2,), world, m; None where the pose is unknown."""
+        if frame.world_T_ego is None:
+            return None
+        return np.asarray((frame.world_T_ego @ self.extrinsics.ego_T_sensor)[:2, 3])
 
     def sees(self, position: FloatArray, world_T_ego: FloatArray | None) -> BoolArray:
         """Which positions (N, 2), world, lie in the field of view; all of them where the pose is unknown."""
@@ -140,6 +209,14 @@ class Sensor:
         middle, half = (view.min_azimuth + view.max_azimuth) / 2, (view.max_azimuth - view.min_azimuth) / 2
         azimuth = np.abs(wrap_angle(np.arctan2(local[:, 1], local[:, 0]) - middle))
         return np.asarray((np.hypot(*local.T) <= view.max_range) & (azimuth <= half + 1e-9))
+
+
+def _by_class(label: StrArray, value: Callable[[str], float]) -> FloatArray:
+    """(N,) the value of each row's class, asked for once a class."""
+    if len(label) == 0:
+        return np.empty(0)
+    classes, index = np.unique(label, return_inverse=True)
+    return np.array([value(str(c)) for c in classes], dtype=np.float64)[index]
 
 
 def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:

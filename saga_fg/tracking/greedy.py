@@ -63,12 +63,8 @@ class GreedyTracker:
         """Take in one frame; returns the tracks seen in it, in world coordinates."""
         sensor = sensor_model(self.sensors, frame.sensor)
         now = self._time = max(self._time, frame.timestamp + sensor.time_offset)
-        detections = frame.detections
-        if frame.coordinates != "world":
-            assert frame.world_T_ego is not None
-            ego_T_source = sensor.extrinsics.ego_T_sensor if frame.coordinates == "sensor" else np.eye(4)
-            detections = detections.transformed(frame.world_T_ego @ ego_T_source)
-        p = sensor.probability(detections.score)
+        detections = sensor.in_world(frame)
+        p = sensor.probability(detections.score, detections.boxes.label)
         rows = np.flatnonzero(p >= self.settings.min_score)
         boxes, p = detections.boxes.select(rows), p[rows]
         memory = self._memory

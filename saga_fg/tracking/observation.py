@@ -9,7 +9,7 @@ import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.boxes import Boxes
-from saga_fg.frame import Detections, Frame
+from saga_fg.frame import Frame
 from saga_fg.sensor import Sensor
 from saga_fg.tracking.settings import ClassSettings, class_values
 from saga_fg.tracking.suppression import strongest
@@ -36,25 +36,15 @@ class Observed:
 
 def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) -> Observed:
     """The detections of a frame that are probable enough for their class and no duplicates."""
-    world_T_sensor = None if frame.world_T_ego is None else frame.world_T_ego @ sensor.extrinsics.ego_T_sensor
-    detections = _in_world(frame, sensor)
-    probability = sensor.probability(detections.score)
+    detections = sensor.in_world(frame)
+    probability = sensor.probability(detections.score, detections.boxes.label)
     keep = np.flatnonzero(probability >= class_values(classes, "min_score", detections.boxes.label))
     apart = class_values(classes, "duplicate_distance", detections.boxes.label[keep])
     keep = keep[strongest(detections.boxes.select(keep), probability[keep], apart)]
     boxes, probability = detections.boxes.select(keep), probability[keep]
-    # where the sensor stood is unknown without a pose, and so is the range: its part of the noise is left out
-    place = boxes.position[:, :2] if world_T_sensor is None else world_T_sensor[:2, 3]
     R = np.zeros((len(boxes), 4, 4))
-    R[:, :2, :2] = sensor.position_covariance(boxes.label, boxes.position[:, :2], probability, place)
+    R[:, :2, :2] = sensor.detection_covariance(detections.select(keep), sensor.origin(frame))
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise = np.where(np.isfinite(boxes.yaw), sensor.deviations(boxes.label, "yaw"), UNKNOWN_YAW_NOISE)
     with_velocity = np.isfinite(boxes.velocity[:, 0] + boxes.velocity[:, 1]) & sensor.use_velocity
     return Observed(boxes, probability, R, with_velocity, sensor.deviations(boxes.label, "height"), yaw_noise, keep)
-
-
-def _in_world(frame: Frame, sensor: Sensor) -> Detections:
-    if frame.world_T_ego is None or frame.coordinates == "world":
-        return frame.detections
-    ego_T_source = sensor.extrinsics.ego_T_sensor if frame.coordinates == "sensor" else np.eye(4)
-    return frame.detections.transformed(frame.world_T_ego @ ego_T_source)

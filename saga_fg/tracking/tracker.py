@@ -26,6 +26,7 @@ from saga_fg.track import Tracks
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.observation import Observed, observe
+from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ class _Columns:
     last_in_view: FloatArray
     confirmed: BoolArray
     has_moved: BoolArray
+    accepted: BoolArray
 
     def select(self, rows: IntArray | BoolArray) -> _Columns:
         return _Columns(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -93,7 +95,9 @@ class Tracker:
             none,
             none.astype(bool),
             none.astype(bool),
+            none.astype(bool),
         )
+        self._evidence = SensorEvidence()
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
 
     def step(self, frame: Frame) -> Tracks:
@@ -116,7 +120,7 @@ class Tracker:
         matching = self._associate(observed, delay)
         self._update(observed, matching, delay)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
-        born = self._bear(observed, matching, delay)
+        born = self._bear(observed, matching, frame.sensor, delay)
         rows = np.concatenate([matching.detection, born])
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self._columns.id) - len(born) :]])
         self.assignment = Assignment(ids, observed.row[rows])
@@ -222,7 +226,7 @@ class Tracker:
         position = self._kinematics()[0] + self._origin
         visible = sensor.sees(position, frame.world_T_ego)
         columns.last_in_view[visible] = self._time
-        p_detect = np.where(visible, sensor.detection_probability, 0.0)
+        p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
         r = columns.existence
         missed = np.ones(n, dtype=bool)
         missed[matching.track] = False
@@ -233,12 +237,15 @@ class Tracker:
         before = np.clip(r[matching.track], 1e-3, 1 - 1e-3)
         after = before / (1 - before) * odds
         columns.existence[matching.track] = np.clip(after / (1 + after), 0.0, 0.999)
-        columns.score[matching.track] = p
+        self._evidence.hear(frame.sensor, self._time - delay, matching.track, p, missed & visible, p_detect)
+        fused = self._evidence.probability(self._time, max(self.settings.score_memory, delay))
+        columns.score = np.where(np.isfinite(fused), fused, columns.score)
+        columns.accepted |= self._evidence.confirmed(self.settings.confirmations)
         columns.last_seen[matching.track] = np.maximum(columns.last_seen[matching.track], self._time - delay)
         columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
 
-    def _bear(self, observed: Observed, matching: Matching, delay: float) -> IntArray:
+    def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
 
         Those of `delay` s ago have moved on since.
@@ -270,8 +277,10 @@ class Tracker:
                 now,
                 p >= self.settings.existence.confirm,
                 np.zeros(len(born), bool),
+                np.full(len(born), self.sensor(sensor).births == "alone"),
             )
         )
+        self._evidence.born(sensor, p, self._time - delay)
         self._box = self._box.extended(
             BoxFilter.born(
                 boxes.size, p, boxes.position[:, 2], observed.z_noise[born], boxes.yaw, observed.yaw_noise[born]
@@ -299,12 +308,15 @@ class Tracker:
         if dead.any():
             self._state.remove(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
+            self._evidence.select(~dead)
 
     def _report(self, timestamp: float) -> Tracks:
         columns, settings = self._columns, self.settings
         coasting = np.maximum(self._time - columns.last_seen, 0.0)
-        shown = (columns.confirmed | (columns.existence >= settings.existence.report)) & (
-            coasting <= settings.report_coasting
+        shown = (
+            columns.accepted
+            & (columns.confirmed | (columns.existence >= settings.existence.report))
+            & (coasting <= settings.report_coasting)
         )
         rows = np.flatnonzero(shown)
         position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())

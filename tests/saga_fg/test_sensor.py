@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg import Sensor
+from saga_fg import InputError, Sensor
 from saga_fg.geometry import transform_points, yaw_transform
-from saga_fg.sensor import Extrinsics, FieldOfView, NoiseModel
+from saga_fg.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 
 metres = st.floats(-200, 200)
 
@@ -78,14 +78,29 @@ def test_each_class_has_its_noise_and_the_default_serves_all_others():
 @given(st.floats(-1e300, 1e300))
 def test_probabilities_are_never_certain(score):
     for kind in ("probability", "logit"):
-        p = Sensor(score=kind).probability(np.array([score]))[0]
+        p = Sensor(score=kind).probability(np.array([score]), labels("car"))[0]
         assert 1e-3 <= p <= 1 - 1e-3
 
 
 def test_scores_are_probabilities_or_logits():
-    assert Sensor().probability(np.array([0.25])) == pytest.approx([0.25])
+    assert Sensor().probability(np.array([0.25]), labels("car")) == pytest.approx([0.25])
     logits = np.array([-2.0, 0.0, 1.5])
-    assert Sensor(score="logit").probability(logits) == pytest.approx(1 / (1 + np.exp(-logits)))
+    assert Sensor(score="logit").probability(logits, labels("a", "a", "b")) == pytest.approx(1 / (1 + np.exp(-logits)))
+
+
+def test_calibration_is_straight_on_the_logit_class_by_class():
+    calibration = {"car": ScoreCalibration(slope=2.0, offset=-1.0), "default": ScoreCalibration(offset=0.5)}
+    sensor = Sensor(calibration=calibration)
+    p = sensor.probability(np.array([0.7, 0.7]), labels("car", "bus"))
+    logit = np.log(0.7 / 0.3)
+    assert np.log(p / (1 - p)) == pytest.approx([2 * logit - 1, logit + 0.5])
+
+
+def test_classes_differ_in_their_chance_of_detection():
+    sensor = Sensor(detection_probability=0.8, class_detection={"pedestrian": 0.5})
+    assert sensor.detection_chance(labels("car", "pedestrian")).tolist() == [0.8, 0.5]
+    with pytest.raises(InputError, match=r"class_detection\.car: expected a number from 0 to 1"):
+        Sensor(class_detection={"car": 1.5})
 
 
 # field of view
