@@ -21,7 +21,7 @@ from data_tools.central_differences import central_differences
 from data_tools.kitti.calibration import Calibration, read_calibration
 from data_tools.kitti.camera_boxes import camera_boxes_to_world
 from data_tools.kitti.detections import read_kitti_detections
-from data_tools.kitti.labels import has_box, read_kitti_labels
+from data_tools.kitti.labels import KittiObjects, has_box, read_kitti_labels
 from data_tools.kitti.oxts import read_poses
 from data_tools.located import located, unknown
 from saga_fg.arrays import FloatArray
@@ -78,6 +78,10 @@ class KittiTracking:
         """The calibration of a sequence."""
         return read_calibration(self._file("calib", name))
 
+    def labels(self, name: str) -> KittiObjects:
+        """The lines of a sequence's label file, `DontCare` regions included."""
+        return read_kitti_labels(self._file("label_02", name))
+
     def scene(self, name: str) -> Scene:
         """Read one of the chosen sequences; raises `InputError` for another name or a broken file."""
         poses = read_poses(self._file("oxts", name))
@@ -108,7 +112,7 @@ class KittiTracking:
 
     def _annotations(self, name: str, times: FloatArray, world_T_camera: FloatArray) -> list[Annotations]:
         path = self._file("label_02", name)
-        objects = read_kitti_labels(path)
+        objects = self.labels(name)
         objects = objects.select(has_box(objects))
         if len(objects) and objects.frame.max() >= len(times):
             raise InputError(f"{path}: frame {objects.frame.max()}: expected frames 0 to {len(times) - 1} only")

@@ -9,6 +9,13 @@ from data_tools.metrics.bootstrap import (
     root_mean_square,
 )
 from data_tools.metrics.consistency import coverage, coverages, nees, nees_band
+from data_tools.metrics.error_figures import (
+    Calibration,
+    ErrorFigures,
+    calibration,
+    error_figures,
+    errors_by_class,
+)
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.hota import HotaFigures, hota_figures
 from data_tools.metrics.kitti_tracking import (
@@ -16,6 +23,7 @@ from data_tools.metrics.kitti_tracking import (
     KittiTrackingSequence,
     kitti_tracking_figures,
 )
+from data_tools.metrics.label_errors import LabelErrors, label_errors, label_velocities
 from data_tools.metrics.matching import Matching, match_scene
 from data_tools.metrics.nuscenes_tracking import (
     NuScenesTrackingMetrics,
@@ -29,11 +37,14 @@ from data_tools.metrics.scene import SceneMetrics, SceneMetricSettings, scene_me
 from data_tools.metrics.track_table import TrackTable
 
 __all__ = [
+    "Calibration",
+    "ErrorFigures",
     "ErrorSample",
     "HotaFigures",
     "Interval",
     "KittiTrackingFigures",
     "KittiTrackingSequence",
+    "LabelErrors",
     "Matching",
     "NuScenesTrackingMetrics",
     "NuScenesTrackingScene",
@@ -43,11 +54,16 @@ __all__ = [
     "SceneMetrics",
     "TrackTable",
     "TrackingFigures",
+    "calibration",
     "coverage",
     "coverages",
     "difference",
+    "error_figures",
+    "errors_by_class",
     "hota_figures",
     "kitti_tracking_figures",
+    "label_errors",
+    "label_velocities",
     "match_scene",
     "nees",
     "nees_band",

@@ -54,6 +54,12 @@ class TrackTable:
         covariance = checked("position_covariance", given, (n, 2, 2), "finite-or-nan")
         object.__setattr__(self, "position_covariance", covariance)
 
+    def select(self, rows: IntArray) -> Self:
+        """The boxes of row indices, in order."""
+        return type(self)(
+            self.moment[rows], self.id[rows], self.boxes.select(rows), self.score[rows], self.position_covariance[rows]
+        )
+
     @classmethod
     def of_annotations(cls, moments: Sequence[Annotations], hidden: bool = True) -> Self:
         """Ground truth as a table; without `hidden`, visible objects only."""

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import typer
 
-from pipelines.cli.options import Verbose, chosen_scenes
-from pipelines.cli.reporting import ReportingGroup, working
+from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_files
+from pipelines.cli.reporting import ReportingGroup, progress_bar, working
 from pipelines.cli.tables import JsonFile, show_tables
+from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
+from pipelines.figures import FigureTable
+from saga_fg.errors import InputError
 
 evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
+
+Hota = Annotated[bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")]
+
+
+class Evaluation(Protocol):
+    """What an evaluation gives."""
+
+    def tables(self) -> list[FigureTable]: ...
+    def figures(self) -> dict[str, object]: ...
 
 
 @evaluate_app.callback()
@@ -28,26 +41,123 @@ def nuscenes(
         str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
     ] = None,
     scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
+    detections: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--detections",
+            help="Detections the tracks were made of: judge errors on the labels they match.",
+            metavar="NAME=FILE",
+        ),
+    ] = None,
+    hota: Hota = False,
     json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
-    """Score a nuScenes tracking result, by the official metrics.
+    """Score a nuScenes tracking result, by the official metrics and at its labels.
 
-    The figures equal those of the official development kit, which need not be installed.
+    The official figures equal those of the development kit, which need not be installed.
 
     \b
-    Example:
+    Examples:
       saga-fg evaluate nuscenes tracks.json --dataroot data/nuscenes --split mini_train
+      saga-fg evaluate nuscenes tracks.json --dataroot data/nuscenes --split mini_train \\
+          --detections lidar=megvii.json --hota --json figures.json
     """
-    from data_tools.atomic_files import check_writable
     from pipelines.evaluation import evaluate_nuscenes
-    from pipelines.figures import write_figures
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
+    files = sensor_files(detections or [])
+    _report(lambda: evaluate_nuscenes(result, dataroot, version, chosen, files, hota), json_file)
+
+
+@evaluate_app.command()
+def kitti(
+    result: Annotated[Path, typer.Argument(help="Folder of results NNNN.txt, of any tracker.")],
+    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/, label_02/ ...")],
+    sequences: Annotated[
+        str | None, typer.Option("--sequences", help="Sequences with commas between them; all results if left out.")
+    ] = None,
+    iou: Annotated[str, typer.Option("--iou", help="Least 3D overlaps of a pair, with commas.")] = "0.25,0.5,0.7",
+    classes: Annotated[str, typer.Option("--classes", help="Classes, with commas.")] = "car,pedestrian,cyclist",
+    detections: Annotated[
+        Path | None,
+        typer.Option(
+            "--detections", help="Folder of the detections the tracks were made of: judge errors on what they match."
+        ),
+    ] = None,
+    hota: Hota = False,
+    json_file: JsonFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """Score KITTI tracking results by the 3D metrics averaged over recall, and at their labels.
+
+    Velocities and covariances come from the table tracks.csv beside the results, which `saga-fg track kitti` writes.
+
+    \b
+    Examples:
+      saga-fg evaluate kitti results --dataroot data/kitti
+      saga-fg evaluate kitti results --dataroot data/kitti --sequences 0000,0011 --iou 0.5 \\
+          --detections data/kitti/detections/pointrcnn --hota --json figures.json
+    """
+    from pipelines.evaluation import evaluate_kitti
+
+    chosen = names("--sequences", sequences) if sequences is not None else None
+    overlaps, labels = _overlaps(iou), names("--classes", classes)
+    _report(lambda: evaluate_kitti(result, dataroot, chosen, labels, overlaps, detections, hota), json_file)
+
+
+@evaluate_app.command()
+def simulated(
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 4,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
+    method: MethodOption = "saga",
+    estimator: EstimatorOption = None,
+    lag: LagOption = None,
+    config: Config = None,
+    simulator: Annotated[
+        Path | None,
+        typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE"),
+    ] = None,
+    json_file: JsonFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """Track simulated traffic and score it against the simulator's truth, hidden objects included.
+
+    \b
+    Examples:
+      saga-fg evaluate simulated --scenes 4 --seed 0
+      saga-fg evaluate simulated --method kf --config mine.yaml --json figures.json
+    """
+    from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+    from pipelines.configuration import load_settings
+    from pipelines.evaluation import evaluate_simulated
+
+    settings = configured("simulated", config, method, estimator, lag)
+    traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
+    dataset = SimulatedTraffic(traffic, scenes, seed)
+    with progress_bar(scenes) as progress:
+        _report(lambda: evaluate_simulated(dataset, lambda: settings.new_tracker(method), progress), json_file, "")
+
+
+def _report(run: Callable[[], Evaluation], json_file: Path | None, doing: str = "scoring") -> None:
+    """Run an evaluation, show its tables, write its figures."""
+    from data_tools.atomic_files import check_writable
+    from pipelines.figures import write_figures
+
     if json_file is not None:
         check_writable(json_file)
-    with working("scoring"):
-        evaluation = evaluate_nuscenes(result, dataroot, version, chosen)
+    with working(doing):
+        evaluation = run()
     show_tables(evaluation.tables())
     if json_file is not None:
         write_figures(json_file, evaluation.figures())
+
+
+def _overlaps(text: str) -> tuple[float, ...]:
+    try:
+        overlaps = tuple(float(value) for value in names("--iou", text))
+    except ValueError:
+        raise InputError(f"--iou: expected numbers with commas between them, got {text!r}") from None
+    if not all(0 < value <= 1 for value in overlaps):
+        raise InputError(f"--iou: expected overlaps above 0 and at most 1, got {text!r}")
+    return overlaps

@@ -14,7 +14,7 @@ from pipelines.figures import FigureTable
 
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
 
-LEAST_WIDTH = 140  # narrower, the tables are no longer ones
+LEAST_WIDTH = 160  # narrower, the tables are no longer ones
 
 
 def show_tables(tables: Iterable[FigureTable]) -> None:

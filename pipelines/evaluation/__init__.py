@@ -1,5 +1,14 @@
 """Evaluations: results of a tracker beside the ground truth, as tables, figures and pictures."""
 
+from pipelines.evaluation.kitti import KittiEvaluation, evaluate_kitti
 from pipelines.evaluation.nuscenes import NuScenesEvaluation, evaluate_nuscenes
+from pipelines.evaluation.simulated import SimulatedEvaluation, evaluate_simulated
 
-__all__ = ["NuScenesEvaluation", "evaluate_nuscenes"]
+__all__ = [
+    "KittiEvaluation",
+    "NuScenesEvaluation",
+    "SimulatedEvaluation",
+    "evaluate_kitti",
+    "evaluate_nuscenes",
+    "evaluate_simulated",
+]

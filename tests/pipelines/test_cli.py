@@ -8,10 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from pipelines.cli import app
@@ -25,11 +28,16 @@ def saga_fg(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["track nuscenes", "track kitti", "track file", "evaluate nuscenes", "simulate", "demo", "config", "slam g2o"],
-    ids=lambda c: c,
-)
+def commands(group: Any, path: str = "") -> Iterator[str]:
+    """All commands by their full names: `track nuscenes`, ..."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, f"{path}{name} ")
+        else:
+            yield f"{path}{name}"
+
+
+@pytest.mark.parametrize("command", list(commands(get_command(app))))
 def test_help_shows_a_worked_example(command: str) -> None:
     result = saga_fg(*command.split(), "--help")
     assert result.exit_code == 0

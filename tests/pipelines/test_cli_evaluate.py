@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from kitti_example import write_sequence
 from nuscenes_random_drive import VERSION, write_random_drive
 from typer.testing import CliRunner, Result
 
@@ -71,3 +72,66 @@ def test_a_result_that_lacks_a_sample_is_refused(drive: Path, tmp_path: Path) ->
     result = evaluate("nuscenes", tmp_path / "short.json", "--dataroot", drive, "--split", "drive")
     assert result.exit_code == 2
     assert "scene-0-3 is missing" in result.stderr
+
+
+def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path: Path) -> None:
+    pytest.importorskip("trackeval")
+    data, tracks, file = tmp_path / "data", tmp_path / "tracks.json", tmp_path / "figures.json"
+    (tmp_path / "short.yaml").write_text("duration: 6.0\nwarm_up: 5.0\n")
+    lidar = f"lidar={data / 'detections' / 'lidar.json'}"
+    of_data = ("--dataroot", data, "--split", "all", "--detections", lidar)
+    for command in (
+        ("simulate", "-o", data, "--scenes", "1", "--config", tmp_path / "short.yaml"),
+        ("track", "nuscenes", *of_data, "-o", tracks),
+        ("evaluate", "nuscenes", tracks, *of_data, "--hota", "--json", file),
+    ):
+        result = CliRunner().invoke(app, [str(argument) for argument in command])
+        assert result.exit_code == 0, result.output
+    figures = json.loads(file.read_text())
+    overall = figures["errors"]["overall"]
+    assert 0 < overall["tracked"] <= overall["labels"]
+    assert 0 < overall["position"] < 1
+    assert 0 < overall["detection"] < 1
+    assert 0 < figures["calibration"]["overall"]["held"]["0.9"] <= 1
+    assert figures["hota"]["car"]["2D"]["hota"] >= figures["hota"]["car"]["3D"]["hota"] > 0.2
+    assert "HOTA, CLEAR and Identity" in result.stdout
+
+
+def test_kitti_labels_as_results_are_perfect(tmp_path: Path) -> None:
+    root, results, file = write_sequence(tmp_path / "kitti"), tmp_path / "results", tmp_path / "figures.json"
+    results.mkdir()
+    labels = (root / "training" / "label_02" / "0007.txt").read_text().splitlines()
+    (results / "0007.txt").write_text("".join(f"{line} 0.9\n" for line in labels if "DontCare" not in line))
+    result = evaluate("kitti", results, "--dataroot", root, "--iou", "0.5,0.7", "--json", file)
+    assert result.exit_code == 0, result.output
+    figures = json.loads(file.read_text())
+    assert figures["sequences"] == ["0007"]
+    assert set(figures["per_class"]) == {"car"}  # a sitting person is none that counts
+    assert set(figures["per_class"]["car"]) == {"0.5", "0.7"}
+    assert figures["per_class"]["car"]["0.7"]["mota"] == 1.0
+    assert figures["errors"]["car"]["position"] == 0.0
+    assert figures["errors"]["car"]["velocity"] is None
+    assert figures["calibration"]["car"]["boxes"] == 0
+    assert "Calibration" not in result.stdout
+
+
+@pytest.mark.parametrize("iou", ["half", "0", "1.5", ","])
+def test_overlaps_that_are_none(tmp_path: Path, iou: str) -> None:
+    result = evaluate("kitti", tmp_path, "--dataroot", tmp_path, "--iou", iou)
+    assert result.exit_code == 2
+    assert "--iou: expected" in result.stderr
+
+
+def test_simulated_scenes_are_judged_at_every_moment(tmp_path: Path) -> None:
+    file = tmp_path / "figures.json"
+    (tmp_path / "short.yaml").write_text("duration: 4.0\nwarm_up: 5.0\n")
+    arguments = ("--scenes", "1", "--seed", "3", "--simulator", tmp_path / "short.yaml", "--method", "kf")
+    result = evaluate("simulated", *arguments, "--json", file)
+    assert result.exit_code == 0, result.output
+    figures = json.loads(file.read_text())
+    overall = figures["tracking"]["overall"]
+    assert overall["objects"] > 100
+    assert overall["objects"] == sum(f["objects"] for name, f in figures["tracking"].items() if name != "overall")
+    assert overall["objects"] == figures["errors"]["overall"]["labels"]
+    assert 0 < overall["position_rmse"] < 1
+    assert figures["calibration"]["overall"]["boxes"] > 50

@@ -44,7 +44,8 @@ class KittiTrackingFigures:
     """Figures of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
 
     gt: true boxes that count; mt, ml: shares of trajectories mostly tracked, mostly lost; tp, recall and precision
-    include pairs with true boxes that don't count. All but samota, amota, amotp are at the threshold of best MOTA.
+    include pairs with true boxes that don't count. All but samota, amota, amotp are at the `threshold` on a track's
+    mean score that gives the best MOTA (-inf: all tracks).
     """
 
     samota: float
@@ -62,6 +63,7 @@ class KittiTrackingFigures:
     fn: int
     ids: int
     frag: int
+    threshold: float
 
 
 def kitti_tracking_figures(
@@ -105,6 +107,7 @@ def kitti_tracking_figures(
         fn=fn,
         ids=int(final.trajectories.switches[0]),
         frag=int(final.trajectories.fragments[0]),
+        threshold=float(cuts[best]),
     )
 
 

@@ -1,0 +1,145 @@
+"""What a tracker says of labelled objects beside what the labels say: position, velocity, heading, covariance.
+
+Labels and tracks are paired moment by moment (`nearest_pairs`). Where the detections are known, position, velocity and
+heading are judged on the labels that a detection matches, so that every tracker on the same detections is judged on the
+same labels, and its positions can be compared with those it was given. Covariances are judged on all pairs.
+
+The velocity of a label is the difference of its positions `reach` moments before and after,
+
+    v_k = (p_{k+r} - p_{k-r}) / (t_{k+r} - t_{k-r})
+
+and unknown where the object has no label at either. A label is *moving* if its speed is at least `MOVING`, else parked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+
+from data_tools.metrics.consistency import nees
+from data_tools.metrics.error_sample import ErrorSample
+from data_tools.metrics.nearest_pairs import nearest_pairs
+from data_tools.metrics.track_table import TrackTable
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.boxes import Boxes
+from saga_fg.geometry import wrap_angle
+
+GATE = 2.0  # m
+MOVING = 1.0  # m/s
+
+
+@dataclass(frozen=True, eq=False)
+class LabelErrors:
+    """N labels, each (N,); NaN where there is no track, no detection, or where a quantity is unknown.
+
+    label      class
+    object     number of the object, from 0
+    speed      of the label, m/s
+    matched    whether a detection matches it (all, where the detections are not known)
+    detection  error of that detection's position, m
+    position, velocity, heading  errors of the track, m, m/s, rad in [0, pi]
+    nees       normalised squared error of the track's position, 2 degrees of freedom
+    """
+
+    label: StrArray
+    object: IntArray
+    speed: FloatArray
+    matched: BoolArray
+    detection: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    heading: FloatArray
+    nees: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def select(self, rows: BoolArray) -> Self:
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @classmethod
+    def pool(cls, scenes: Iterable[LabelErrors]) -> Self:
+        """The labels of all scenes; objects of different scenes are different ones."""
+        parts, first = [], 0
+        for scene in scenes:
+            parts.append(replace(scene, object=scene.object + first))
+            first += int(scene.object.max(initial=-1)) + 1
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    @property
+    def tracked(self) -> BoolArray:
+        """(N,) which labels have a track."""
+        return np.isfinite(self.position)
+
+    @property
+    def moving(self) -> BoolArray:
+        """(N,) which labels move; not those of unknown speed."""
+        return np.asarray(self.speed >= MOVING)
+
+    def sample(self, name: str, rows: BoolArray | None = None) -> ErrorSample:
+        """The known errors `name` of the matched labels that have a track, of those `rows` (N,) alone if given."""
+        values: FloatArray = getattr(self, name)
+        chosen = self.matched & self.tracked & np.isfinite(values)
+        return ErrorSample(values[chosen if rows is None else chosen & rows])
+
+
+def label_errors(
+    truth: TrackTable,
+    found: TrackTable,
+    velocity: FloatArray,
+    detections: tuple[IntArray, Boxes] | None = None,
+    gate: float = GATE,
+) -> LabelErrors:
+    """The errors of `found` at the labels `truth` (N) of one scene, whose velocities (N, 2) are given.
+
+    detections  (moment (M,), boxes (M)): what the tracks were made of
+    gate        largest distance of a label and its track or detection, m
+    """
+    n = len(truth)
+    columns: dict[str, Any] = {
+        name: np.full(n, np.nan) for name in ("detection", "position", "velocity", "heading", "nees")
+    }
+    placed = truth.moment, truth.boxes
+    row, column, distance = nearest_pairs(placed, (found.moment, found.boxes), gate)
+    a, b = truth.boxes.select(row), found.boxes.select(column)
+    columns["position"][row] = distance
+    columns["velocity"][row] = np.linalg.norm(b.velocity - velocity[row], axis=1)
+    columns["heading"][row] = np.abs(wrap_angle(b.yaw - a.yaw))
+    covariance = found.position_covariance[column]
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    offset = (b.position - a.position)[known, :2]
+    columns["nees"][row[known]] = nees(offset, covariance[known])
+    matched = np.ones(n, dtype=np.bool_)
+    if detections is not None:
+        row, _, distance = nearest_pairs(placed, detections, gate)
+        columns["detection"][row] = distance
+        matched = np.isfinite(columns["detection"])
+    _, number = np.unique(truth.id, return_inverse=True)
+    return LabelErrors(truth.boxes.label, number, np.linalg.norm(velocity, axis=1), matched, **columns)
+
+
+def label_velocities(truth: TrackTable, timestamps: FloatArray, reach: int) -> FloatArray:
+    """Velocities (N, 2), m/s, of labels over `reach` moments to either side; NaN where these have no label.
+
+    timestamps  (K,) of the moments, s
+    """
+    _, number = np.unique(truth.id, return_inverse=True)
+    stride = len(timestamps) + 2 * reach
+    key = number * stride + truth.moment + reach
+    order = np.argsort(key)
+    before, after = (_rows_of(key[order], key + step) for step in (-reach, reach))
+    known = (before >= 0) & (after >= 0)
+    first, last = order[before[known]], order[after[known]]
+    velocity = np.full((len(truth), 2), np.nan)
+    elapsed = timestamps[truth.moment[last]] - timestamps[truth.moment[first]]
+    velocity[known] = (truth.boxes.position[last, :2] - truth.boxes.position[first, :2]) / elapsed[:, None]
+    return velocity
+
+
+def _rows_of(keys: IntArray, wanted: IntArray) -> IntArray:
+    """Where each wanted key is among the sorted keys, -1 for nowhere."""
+    at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+    return np.where(keys[at] == wanted, at, -1) if len(keys) else np.empty(0, dtype=np.int64)

@@ -1,0 +1,110 @@
+"""A KITTI tracking result scored: figures averaged over recall, errors at labels, calibration, HOTA."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.kitti.scored_sequences import ScoredSequence, read_scored_sequences
+from data_tools.metrics import (
+    KittiTrackingFigures,
+    KittiTrackingSequence,
+    LabelErrors,
+    kitti_tracking_figures,
+    label_errors,
+    label_velocities,
+)
+from pipelines.evaluation.errors import error_json, error_tables
+from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
+from pipelines.evaluation.placed_detections import placed_detections
+from pipelines.figures import FigureTable, cell
+
+CLASSES = ("car", "pedestrian", "cyclist")
+IOUS = (0.25, 0.5, 0.7)
+REACH = 5  # frames to either side for a label's velocity, 0.5 s
+_COLUMNS = (
+    *("class", "3D IoU", "sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
+    *("TP", "FP", "FN", "GT", "MT", "ML"),
+)
+ByIou = Mapping[float, KittiTrackingFigures]
+
+
+@dataclass(frozen=True, eq=False)
+class KittiEvaluation:
+    """The figures of one result over some sequences: by class that occurs, and 3D IoU."""
+
+    sequences: tuple[str, ...]
+    tracking: Mapping[str, ByIou]
+    errors: LabelErrors
+    hota: Sequence[HotaRow] = ()
+
+    def tables(self) -> list[FigureTable]:
+        """For people."""
+        first = kitti_table("KITTI 3D tracking metrics, in %", self.tracking)
+        return [first, *error_tables(self.errors), *([hota_table(self.hota)] if self.hota else [])]
+
+    def figures(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "sequences": self.sequences,
+            "per_class": self.tracking,
+            **error_json(self.errors),
+            "hota": hota_json(self.hota),
+        }
+
+
+def evaluate_kitti(
+    result: str | Path,
+    dataroot: str | Path,
+    sequences: Collection[str] | None = None,
+    classes: Sequence[str] = CLASSES,
+    ious: Sequence[float] = IOUS,
+    detections: str | Path | None = None,
+    with_hota: bool = False,
+) -> KittiEvaluation:
+    """Score the results NNNN.txt of folder `result` in the chosen sequences (None: all it has).
+
+    detections  folder of the detections, to judge errors on the labels that they match
+
+    Raises `InputError` for missing or broken files; `MissingExtraError` for HOTA without trackeval.
+    """
+    scored = read_scored_sequences(result, dataroot, sequences, detections)
+    pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
+    tracking: dict[str, ByIou] = {}
+    for label in classes:
+        by_iou = {iou: figures for iou in ious if (figures := kitti_tracking_figures(pairs, label, iou)) is not None}
+        if by_iou:
+            tracking[label] = by_iou
+    best = {label: next(iter(by_iou.values())).threshold for label, by_iou in tracking.items()}
+    return KittiEvaluation(
+        tuple(scored),
+        tracking,
+        LabelErrors.pool(kitti_label_errors(each, classes, detections is not None) for each in scored.values()),
+        hota([(each.truth, each.found) for each in scored.values()], best) if with_hota else (),
+    )
+
+
+def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str], with_detections: bool) -> LabelErrors:
+    """The errors at all labels of the classes in one sequence."""
+    truth = scored.truth.select(np.flatnonzero(np.isin(scored.truth.boxes.label, classes)))
+    velocity = label_velocities(truth, scored.scene.timestamps, REACH)
+    return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if with_detections else None)
+
+
+def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:
+    """A row for each class and overlap."""
+    rows = ((label, f"{iou:g}", f) for label, by_iou in tracking.items() for iou, f in by_iou.items())
+    return FigureTable(title, _COLUMNS, tuple((label, iou, *_cells(f)) for label, iou, f in rows))
+
+
+def _cells(f: KittiTrackingFigures) -> tuple[str, ...]:
+    def percent(*values: float) -> tuple[str, ...]:
+        return tuple(cell(100 * value, 2) for value in values)
+
+    counts = (cell(value) for value in (f.tp, f.fp, f.fn, f.gt))
+    first = percent(f.samota, f.amota, f.amotp, f.mota, f.motp)
+    return (*first, cell(f.ids), cell(f.frag), *percent(f.recall, f.precision), *counts, *percent(f.mt, f.ml))
