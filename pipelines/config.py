@@ -38,8 +38,11 @@ class TrackConfig:
         """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre)."""
         if method == "centerpoint":
             return GreedyTracker(self.greedy, self.sensors)
-        settings = self.tracker if method == "saga" else replace(self.tracker, edges=())
-        return Tracker(settings, self.sensors)
+        return Tracker(self.of_method(method).tracker, self.sensors)
+
+    def of_method(self, method: Method) -> TrackConfig:
+        """The same, without edges unless the method has them."""
+        return self if method == "saga" else replace(self, tracker=replace(self.tracker, edges=()))
 
 
 def load_config(family: Family, path: Path | None = None) -> TrackConfig:

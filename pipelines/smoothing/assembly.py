@@ -1,0 +1,125 @@
+"""Smoothed objects to labels: size, height, heading, score and quality of every box at the moments wanted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.smoothing.rounds import SmoothedObjects
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.boxes import Boxes
+from saga_fg.smoothing import (
+    Evidence,
+    LabelCounts,
+    Labels,
+    Lives,
+    SmoothingSettings,
+    StateTable,
+    constant_sizes,
+    lives_of_evidence,
+    offline_values,
+    previous_rows,
+    quality_of,
+    scalar_readings,
+    smooth_headings,
+    smooth_walks,
+)
+from saga_fg.track import Tracks
+
+HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
+
+
+def label_moments(
+    evidence: Evidence, track_of: IntArray, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
+) -> tuple[Labels, ...]:
+    """The labels at the times `wanted` (M,), s. track_of (N,): the online track of each detection, -1 for none."""
+    lives, states = objects.lives, objects.states
+    owner = lives.rows_of(states.id)
+    rows = np.flatnonzero(objects.object_of >= 0)
+    holder = lives.rows_of(objects.object_of[rows])
+    at = states.rows_of(evidence.moment[rows], objects.object_of[rows])
+    boxes, p = evidence.boxes, evidence.probability[rows]
+    size = constant_sizes(holder, len(lives), boxes.size[rows], p, evidence.distance[rows])
+    duration = _since_before(states, evidence.times)
+    heights = scalar_readings(at, boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
+    z, _ = smooth_walks(states, HEIGHT_DRIFT**2 * duration, heights)
+    label = lives.label[owner]
+    turning = offline_values(settings.classes, "yaw_drift", label) ** 2 * duration
+    turning = np.where(_stands(objects), 1e-6, turning)
+    moving = offline_values(settings.classes, "motion_heading", lives.label)
+    yaw, yaw_variance = smooth_headings(states, lives, evidence, rows, at, turning, moving)
+    lasting = offline_values(settings.classes, "lasting_error", label)
+    P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
+    gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
+    source = _sources(evidence, track_of, objects, wanted)
+    quality = quality_of(objects.score[owner], P, settings.quality)
+    moments = []
+    for time in wanted.tolist():
+        there = states.at(int(np.searchsorted(evidence.times, time)))
+        position = np.concatenate([states.mean[there, :2] + evidence.origin, z[there, None]], axis=1)
+        found = Boxes(label[there], position, size[owner[there]], yaw[there], states.mean[there, 2:])
+        velocity_covariance = states.covariance[there, 2:, 2:]
+        score = objects.score[owner[there]]
+        tracks = Tracks(time, states.id[there], found, score, P[there], velocity_covariance, gap[there])
+        moments.append(Labels(tracks, yaw_variance[there], source[there], quality[there]))
+    return tuple(moments)
+
+
+def count_labels(
+    evidence: Evidence, objects: SmoothedObjects, labels: tuple[Labels, ...], wanted: FloatArray
+) -> LabelCounts:
+    """The summary of a recording."""
+    source = np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])
+    at = np.searchsorted(evidence.times, wanted)
+    gone = objects.dropped
+    dropped = np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)
+    return LabelCounts(
+        observed=int((source == "observed").sum()),
+        filled=int((source == "filled").sum()),
+        extended=int((source == "extended").sum()),
+        dropped=int(dropped.sum()),
+        objects=len(objects.lives),
+        dropped_objects=len(gone),
+        joined=objects.joined,
+    )
+
+
+def _stands(objects: SmoothedObjects) -> BoolArray:
+    """(R,) whether each state is one of a standing object."""
+    stands = np.zeros(len(objects.states), dtype=np.bool_)
+    at = objects.states.rows_of(objects.standing.moment, objects.standing.id)
+    stands[at[at >= 0]] = True
+    return stands
+
+
+def _since_before(states: StateTable, times: FloatArray) -> FloatArray:
+    """(R,) s from the object's state before to each state, 0 for its first."""
+    before = previous_rows(states)
+    return np.asarray(np.where(before >= 0, times[states.moment] - times[states.moment[before]], 0.0))
+
+
+def _time_to_detection(states: StateTable, times: FloatArray, object_of: IntArray, seen: FloatArray) -> FloatArray:
+    """(R,) s from each state to the object's nearest detection; object_of (m,), seen (m,) s of the detections."""
+    start, span = times[0], 2 * (times[-1] - times[0]) + 1.0
+    keys = np.sort(object_of * span + (seen - start))
+    wanted = states.id * span + (times[states.moment] - start)
+    after = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.asarray(np.minimum(np.abs(keys[after] - wanted), np.abs(wanted - keys[np.maximum(after - 1, 0)])))
+
+
+def _sources(evidence: Evidence, track_of: IntArray, objects: SmoothedObjects, wanted: FloatArray) -> StrArray:
+    """(R,) extended before and after the detections of the online tracks; else observed at the wanted moment that is
+    nearest to a detection, filled elsewhere."""
+    states, times = objects.states, evidence.times
+    rows = np.flatnonzero(objects.object_of >= 0)
+    at = np.searchsorted(times, wanted)
+    middle = (wanted[1:] + wanted[:-1]) / 2
+    nearest = at[np.searchsorted(middle, times[evidence.moment[rows]])]
+    observed = np.zeros(len(states), dtype=np.bool_)
+    hit = states.rows_of(nearest, objects.object_of[rows])
+    observed[hit[hit >= 0]] = True
+    online: Lives = lives_of_evidence(
+        np.where(track_of >= 0, objects.object_of, -1), evidence.boxes.label, evidence.moment
+    )
+    row = online.rows_of(states.id)
+    beyond = (states.moment < online.first[row]) | (states.moment > online.last[row])
+    return np.where(beyond, "extended", np.where(observed, "observed", "filled"))

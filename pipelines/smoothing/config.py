@@ -1,0 +1,31 @@
+"""The configuration of smoothing: that of tracking, and what is known offline only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from pipelines.config import Family, TrackConfig, load_config
+from pipelines.configuration import load_settings, read_settings
+from saga_fg.settings import settings_group
+from saga_fg.smoothing import SmoothingSettings
+
+
+@dataclass(frozen=True)
+class SmoothConfig:
+    """Everything that shapes labels: the online pass by `tracking`, the rest by `smoothing`."""
+
+    tracking: TrackConfig = settings_group(TrackConfig, "the online pass: trackers and sensors")
+    smoothing: SmoothingSettings = settings_group(SmoothingSettings, "what makes labels of its tracks")
+
+
+def load_smooth_config(family: Family, path: Path | None = None) -> SmoothConfig:
+    """The defaults shipped for a kind of data, with what a YAML file overrides.
+
+    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    """
+    shipped = files("pipelines") / "configs" / "smoothing" / f"{family}.yaml"
+    config = SmoothConfig(tracking=load_config(family))
+    config = read_settings(SmoothConfig, shipped.read_text(encoding="utf-8"), shipped.name, config)
+    return config if path is None else load_settings(SmoothConfig, path, config)

@@ -1,0 +1,132 @@
+"""The rounds of smoothing a recording: each knows more than the one before, and leaves better objects.
+
+1. tracklets on their own, reaching beyond both ends;
+2. the same with the edges that follow from round 1: ends and beginnings that meet become one object;
+3. the objects so joined, with edges: detections nobody took are claimed, objects with too little evidence dropped, and
+   stands recognised;
+4. what is left, from first to last detection, with edges, robust losses and pinned stands: the final states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.smoothing import (
+    Evidence,
+    Lives,
+    SmoothedEdges,
+    SmoothingSettings,
+    Standing,
+    StateTable,
+    claim_detections,
+    constant_sizes,
+    evidence_scores,
+    join_tracklets,
+    lives_of_evidence,
+    no_edges,
+    robust_weights,
+    smooth_states,
+    standing_states,
+)
+from saga_fg.tracking import TrackerSettings
+from saga_fg.tracking.settings import class_values
+
+MAX_CLAIM = 3.0  # largest distance between a state and a detection it claims, m
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedObjects:
+    """What the rounds come to.
+
+    lives      the objects kept
+    object_of  (N,) the object of each detection, -1 for none or one that was dropped
+    states     of the objects at all moments of their lives
+    score      (n,) of the lives
+    standing   the states in which an object stands
+    joined     tracklets that became part of another's object
+    dropped    the lives of the objects dropped
+    """
+
+    lives: Lives
+    object_of: IntArray
+    states: StateTable
+    score: FloatArray
+    standing: Standing
+    joined: int
+    dropped: Lives
+
+
+def smooth_objects(
+    evidence: Evidence, track_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
+) -> SmoothedObjects:
+    """All rounds. track_of (N,): the online track of each detection, -1 for none."""
+    rounds = _Rounds(evidence, settings, tracker)
+    label, moment = evidence.boxes.label, evidence.moment
+    tracklets = lives_of_evidence(track_of, label, moment)
+    states = rounds.reaching(tracklets, track_of, max(settings.extension, settings.joining.max_gap))
+    first = join_tracklets(tracklets, states, rounds.velocity_prior(tracklets), evidence, settings.joining)
+    object_of = track_of.copy()
+    tracked = np.flatnonzero(track_of >= 0)
+    object_of[tracked] = first[tracklets.rows_of(track_of[tracked])]
+
+    joined = lives_of_evidence(object_of, label, moment)
+    states = rounds.reaching(joined, object_of, settings.extension)
+    object_of = claim_detections(evidence, object_of, joined, states, settings.claim, MAX_CLAIM)
+    lives = lives_of_evidence(object_of, label, moment)
+    within = states.within(lives)
+    score = evidence_scores(evidence, object_of, lives, within, settings.prior_time)
+    kept = score >= settings.min_score
+    object_of = np.where(np.isin(object_of, lives.id[kept]), object_of, -1)
+    standing = standing_states(within, evidence, object_of, settings.standing)
+    final = rounds.final(lives.select(kept), object_of, states, standing)
+    joined_count = len(tracklets) - len(joined)
+    return SmoothedObjects(
+        lives.select(kept), object_of, final, score[kept], standing, joined_count, lives.select(~kept)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rounds:
+    """What all rounds share."""
+
+    evidence: Evidence
+    settings: SmoothingSettings
+    tracker: TrackerSettings
+
+    def velocity_prior(self, lives: Lives) -> FloatArray:
+        """(n, 2, 2) covariance of the velocity of something new."""
+        speed = class_values(self.tracker.classes, "birth_speed", lives.label)
+        return np.asarray(speed[:, None, None] ** 2 * np.eye(2))
+
+    def reaching(self, lives: Lives, object_of: IntArray, ahead: float) -> StateTable:
+        """States of objects that reach beyond their detections: on their own, then with the edges that follow."""
+        longer = lives.reaching(self.evidence.times, self.settings.extension, ahead)
+        prior, classes = self.velocity_prior(longer), self.settings.classes
+        states = smooth_states(self.evidence, object_of, longer, prior, classes, no_edges)
+        if not self.tracker.edges:
+            return states
+        edges = self._edges(longer, object_of, states)
+        return smooth_states(self.evidence, object_of, longer, prior, classes, edges)
+
+    def final(self, lives: Lives, object_of: IntArray, states: StateTable, standing: Standing) -> StateTable:
+        """With everything, from first to last detection; `states` of an earlier round tell the edges."""
+        for _ in range(self.settings.reweightings + 1 if self.settings.robust else 1):
+            edges = self._edges(lives, object_of, states.within(lives)) if self.tracker.edges else no_edges
+            loss = self.settings.robust
+            weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)
+            prior, classes = self.velocity_prior(lives), self.settings.classes
+            states = smooth_states(self.evidence, object_of, lives, prior, classes, edges, weight, standing)
+        return states
+
+    def _edges(self, lives: Lives, object_of: IntArray, states: StateTable) -> SmoothedEdges:
+        rows = np.flatnonzero(object_of >= 0)
+        rows = rows[np.isin(object_of[rows], lives.id)]
+        owner, boxes, p = lives.rows_of(object_of[rows]), self.evidence.boxes, self.evidence.probability[rows]
+        size = constant_sizes(owner, len(lives), boxes.size[rows], p, self.evidence.distance[rows])
+        yaw = np.full(len(lives), np.nan)
+        known = np.isfinite(boxes.yaw[rows])
+        yaw[owner[known]] = boxes.yaw[rows[known]]
+        return SmoothedEdges.of(self.tracker.edges, self.tracker.explained_noise, lives, states, yaw, size[:, 0])

@@ -1,0 +1,56 @@
+"""One recording: detections in, labels out."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from threadpoolctl import threadpool_limits
+
+from pipelines.config import Method
+from pipelines.smoothing.assembly import count_labels, label_moments
+from pipelines.smoothing.config import SmoothConfig
+from pipelines.smoothing.online import track_evidence
+from pipelines.smoothing.rounds import smooth_objects
+from pipelines.tracking import Progress
+from saga_fg.dataset import Scene
+from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
+from saga_fg.track import Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedScene:
+    """A recording and its labels, one table for each of its timestamps.
+
+    counts   where the boxes come from
+    frames   frames taken in
+    seconds  time spent
+    """
+
+    scene: Scene
+    labels: tuple[Labels, ...]
+    counts: LabelCounts
+    frames: int
+    seconds: float
+
+    @property
+    def tracks(self) -> tuple[Tracks, ...]:
+        """The labels as tracks."""
+        return tuple(moment.tracks for moment in self.labels)
+
+
+def smooth_scene(
+    scene: Scene, config: SmoothConfig, method: Method = "saga", progress: Progress | None = None
+) -> SmoothedScene:
+    """Smooth one recording, with the edges of the tracker's settings unless `method` is another than `saga`."""
+    tracking = config.tracking.of_method(method)
+    with threadpool_limits(limits=1, user_api="blas"):  # threads cost more than they bring to small matrices
+        start = time.perf_counter()
+        evidence = gather_evidence(scene.frames, scene.timestamps, tracking.sensors, tracking.tracker.classes)
+        tracker = tracking.new_tracker(method)
+        track_of = track_evidence(scene, tracker, evidence, tracking.sensors, tracking.tracker.classes, progress)
+        objects = smooth_objects(evidence, track_of, config.smoothing, tracking.tracker)
+        labels = label_moments(evidence, track_of, objects, scene.timestamps, config.smoothing)
+        counts = count_labels(evidence, objects, labels, scene.timestamps)
+        seconds = time.perf_counter() - start
+    return SmoothedScene(scene, labels, counts, len(scene.frames), seconds)

@@ -1,0 +1,153 @@
+r"""The states of all objects at all moments of a recording, given everything that was measured of them.
+
+    prior         position unknown, velocity as at a birth                 first moment of a life
+    interaction   || x_i(k+1) - sum_j F_ij x_j(k) - b_i ||_{Q_i}            every interval, edges frozen
+    detection     rho( || z - H x_i(k) ||_R )                              every attributed detection
+    standing      || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object stands
+
+over one factor graph (`saga_fg.estimators.BatchSmoother`). The edges of an interval follow from given states at its
+start: those of an earlier, simpler round. Robust losses (`factors.robust`) are reached by reweighting between rounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from factors import Robust
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.discretisation import discretise
+from saga_fg.estimators import BatchSmoother, Measurements
+from saga_fg.interactions import VELOCITY
+from saga_fg.node import NodeType
+from saga_fg.scene_graph import SceneGraph
+from saga_fg.smoothing.evidence import Evidence
+from saga_fg.smoothing.settings import OfflineClass, StandingSettings, offline_class
+from saga_fg.smoothing.states import Lives, StateTable
+
+UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of a life, m
+LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
+
+GraphOf = Callable[[int, IntArray, tuple[NodeType, ...]], SceneGraph]
+"""The graph over an interval: called with its first moment, the ids of the objects there, and their node types."""
+
+
+def no_edges(moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGraph:
+    """Objects that move on their own."""
+    return SceneGraph(ids, types)
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """States (m,) of objects that stand: their moments and ids; settings of how firmly."""
+
+    settings: StandingSettings = field(default_factory=StandingSettings)
+    moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def at(self, moment: int, ids: IntArray) -> BoolArray:
+        """(n,) which of these objects stand at a moment."""
+        return np.isin(ids, self.id[self.moment == moment])
+
+
+def smooth_states(
+    evidence: Evidence,
+    object_of: IntArray,
+    lives: Lives,
+    velocity_prior: FloatArray,
+    classes: Mapping[str, OfflineClass],
+    graph_of: GraphOf = no_edges,
+    weight: FloatArray | None = None,
+    standing: Standing | None = None,
+) -> StateTable:
+    """Smoothed states of every object at every moment of its life.
+
+    object_of (N,) the object of each detection, negative for none; velocity_prior (n, 2, 2) of the lives' velocities;
+    weight (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
+    """
+    standing = standing or Standing()
+    weight = np.ones(len(evidence)) if weight is None else weight
+    types = _node_types(lives, classes)
+    start = _first_positions(evidence, object_of, lives)
+    smoother = BatchSmoother(likelihoods=False)
+    present = np.empty(0, dtype=np.int64)
+    moments = evidence.moment
+    bounds = np.searchsorted(moments, np.arange(len(evidence.times) + 1))
+    begin = int(lives.first.min(initial=0))
+    end = int(lives.last.max(initial=-1))
+    for k in range(begin, end + 1):
+        if k > begin:
+            graph = graph_of(k - 1, lives.id[present], tuple(types[i] for i in present.tolist()))
+            still = standing.at(k - 1, graph.nodes) & standing.at(k, graph.nodes)
+            graph = replace(graph, diffusion_scale=np.where(still, standing.settings.noise, graph.diffusion_scale))
+            smoother.predict(discretise(graph, float(evidence.times[k] - evidence.times[k - 1])))
+        born = np.flatnonzero(lives.first == k)
+        if len(born):
+            mean = np.concatenate([start[born], np.zeros((len(born), 2))], axis=1)
+            P = np.zeros((len(born), 4, 4))
+            P[:, :2, :2] = UNKNOWN_POSITION**2 * np.eye(2)
+            P[:, 2:, 2:] = velocity_prior[born]
+            smoother.add(lives.id[born], mean, P)
+            present = np.concatenate([present, born])
+        _measure(smoother, evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
+        pinned = lives.id[present][standing.at(k, lives.id[present])]
+        if len(pinned):
+            H = types[0].selector(VELOCITY)
+            smoother.update(
+                Measurements(pinned, np.zeros((len(pinned), 2)), H, standing.settings.velocity**2 * np.eye(2))
+            )
+        gone = lives.last[present] == k
+        if gone.any():
+            smoother.marginalise(lives.id[present[gone]])
+            present = present[~gone]
+    if end < begin:
+        return StateTable.of_moments([])
+    parts = []
+    for k, state in enumerate(smoother.smoothed()):
+        parts.append((begin + k, state.nodes, state.mean(state.nodes), state.covariance(state.nodes)))
+    return StateTable.of_moments([part for part in parts if len(part[1])])
+
+
+def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, loss: Robust) -> FloatArray:
+    """(N,) weight of each detection at given states of its object, 1 where it has none: one step of iteratively
+    reweighted least squares, which over the rounds comes to the minimum of the robust loss."""
+    weight = np.ones(len(evidence))
+    at = states.rows_of(evidence.moment, object_of)
+    rows = np.flatnonzero(at >= 0)
+    residual = evidence.boxes.position[rows, :2] - states.mean[at[rows], :2]
+    d2 = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(evidence.R[rows, :2, :2]), residual)
+    weight[rows] = np.maximum(loss.weight(np.sqrt(d2)), LEAST_WEIGHT)
+    return weight
+
+
+def _measure(smoother: BatchSmoother, evidence: Evidence, object_of: IntArray, rows: slice, weight: FloatArray) -> None:
+    """Take in the attributed detections of a moment."""
+    mine = np.arange(rows.start, rows.stop)[object_of[rows] >= 0]
+    for velocity in (True, False):
+        chosen = mine[evidence.with_velocity[mine] == velocity]
+        if len(chosen) == 0:
+            continue
+        k = 4 if velocity else 2
+        z = np.concatenate([evidence.boxes.position[chosen, :2], evidence.boxes.velocity[chosen]], axis=1)[:, :k]
+        R = evidence.R[chosen, :k, :k] / weight[chosen, None, None]
+        smoother.update(Measurements(object_of[chosen], z, np.eye(4)[:k], R))
+
+
+def _node_types(lives: Lives, classes: Mapping[str, OfflineClass]) -> list[NodeType]:
+    """The node type of each object; classes that move alike share one."""
+    types: dict[float, NodeType] = {}
+    result = []
+    for label in lives.label.tolist():
+        motion = offline_class(classes, label).motion
+        result.append(types.setdefault(motion.acceleration_noise, NodeType("object", motion)))
+    return result
+
+
+def _first_positions(evidence: Evidence, object_of: IntArray, lives: Lives) -> FloatArray:
+    """(n, 2) where each object was first detected."""
+    position = np.zeros((len(lives), 2))
+    rows = np.flatnonzero(object_of >= 0)[::-1]
+    position[lives.rows_of(object_of[rows])] = evidence.boxes.position[rows, :2]
+    return position

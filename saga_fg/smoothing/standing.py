@@ -1,0 +1,56 @@
+r"""Objects that stand still, recognised from smoothed states and what was measured of them.
+
+A run of moments is a stand if the smoothed speed stays below `max_speed` for at least `min_time`, and the positions
+measured meanwhile drift no further than chance or a few decimetres would have it: with the weighted regression
+
+    z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2
+
+the drift |u*| T over its duration T is below `max_drift`. A parked vehicle is one that stands in all its life.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from saga_fg.arrays import IntArray
+from saga_fg.smoothing.batch_states import Standing
+from saga_fg.smoothing.evidence import Evidence
+from saga_fg.smoothing.settings import StandingSettings
+from saga_fg.smoothing.states import StateTable
+
+
+def standing_states(
+    states: StateTable, evidence: Evidence, object_of: IntArray, settings: StandingSettings
+) -> Standing:
+    """The states in which objects stand."""
+    order = np.lexsort((states.moment, states.id))
+    ids, moments = states.id[order], states.moment[order]
+    slow = np.hypot(*states.mean[order, 2:].T) <= settings.max_speed
+    begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
+    ends = np.flatnonzero(slow & np.concatenate([(ids[1:] != ids[:-1]) | ~slow[1:], [True]]))
+    times = evidence.times
+    rows = np.flatnonzero(object_of >= 0)
+    rows = rows[np.argsort(object_of[rows], kind="stable")]
+    owner, seen_at = object_of[rows], evidence.moment[rows]
+    kept: list[IntArray] = []
+    for a, b in zip(begins.tolist(), ends.tolist(), strict=True):
+        if times[moments[b]] - times[moments[a]] < settings.min_time:
+            continue
+        mine = slice(np.searchsorted(owner, ids[a]), np.searchsorted(owner, ids[a], side="right"))
+        within = rows[mine][(seen_at[mine] >= moments[a]) & (seen_at[mine] <= moments[b])]
+        if len(within) and _drift(evidence, within) <= settings.max_drift:
+            kept.append(np.arange(a, b + 1))
+    chosen = np.concatenate([np.empty(0, dtype=np.int64), *kept])
+    return Standing(settings, moments[chosen], ids[chosen])
+
+
+def _drift(evidence: Evidence, rows: IntArray) -> float:
+    """How far the measured positions of some detections of an object drift from the first to the last, m."""
+    t = evidence.times[evidence.moment[rows]]
+    w = 2 / np.trace(evidence.R[rows, :2, :2], axis1=1, axis2=2)
+    dt = t - np.average(t, weights=w)
+    spread = float(np.sum(w * dt**2))
+    if spread == 0:
+        return 0.0
+    slope = (w * dt) @ evidence.boxes.position[rows, :2] / spread
+    return float(np.hypot(*slope) * (t[-1] - t[0]))

@@ -1,0 +1,112 @@
+"""Objects over the moments of a recording: when they live, and their smoothed states as one table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+
+
+@dataclass(frozen=True, eq=False)
+class Lives:
+    """n objects: id (n,) unique and ascending, label (n,) classes, first and last (n,) moments, both included."""
+
+    id: IntArray
+    label: StrArray
+    first: IntArray
+    last: IntArray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        """The objects of a mask or of row indices."""
+        return type(self)(self.id[rows], self.label[rows], self.first[rows], self.last[rows])
+
+    def rows_of(self, ids: IntArray) -> IntArray:
+        """The rows of some objects that are all there."""
+        return np.searchsorted(self.id, ids)
+
+    def reaching(self, times: FloatArray, back: float, ahead: float) -> Self:
+        """The same, beginning up to `back` s earlier and ending up to `ahead` s later; times (K,) s, of all moments."""
+        first = np.searchsorted(times, times[self.first] - back)
+        last = np.searchsorted(times, times[self.last] + ahead, side="right") - 1
+        return replace(self, first=np.minimum(first, self.first), last=np.maximum(last, self.last))
+
+
+def lives_of_evidence(object_of: IntArray, label: StrArray, moment: IntArray) -> Lives:
+    """The lives of all objects from their first to their last detection.
+
+    object_of (N,) the object of each detection, negative for none; label (N,), moment (N,) of the detections
+    """
+    rows = np.flatnonzero(object_of >= 0)
+    ids, index = np.unique(object_of[rows], return_inverse=True)
+    first = np.full(len(ids), np.iinfo(np.int64).max)
+    last = np.full(len(ids), -1)
+    np.minimum.at(first, index, moment[rows])
+    np.maximum.at(last, index, moment[rows])
+    example = np.zeros(len(ids), dtype=np.int64)
+    example[index] = rows
+    return Lives(ids, label[example] if len(ids) else np.empty(0, dtype="<U1"), first, last)
+
+
+@dataclass(frozen=True, eq=False)
+class StateTable:
+    """Smoothed states, R rows in order of moments and within a moment of ids.
+
+    moment, id (R,); mean (R, 4) local position (m) and velocity (m/s); covariance (R, 4, 4)
+    """
+
+    moment: IntArray
+    id: IntArray
+    mean: FloatArray
+    covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @classmethod
+    def of_moments(cls, parts: Sequence[tuple[int, IntArray, FloatArray, FloatArray]]) -> Self:
+        """From (moment, ids, means, covariances) of each moment in order."""
+        if not parts:
+            return cls(*(np.empty(0, dtype=np.int64),) * 2, np.empty((0, 4)), np.empty((0, 4, 4)))
+        moment = np.repeat([k for k, *_ in parts], [len(ids) for _, ids, *_ in parts])
+        ids, mean, P = (np.concatenate([part[i] for part in parts]) for i in (1, 2, 3))
+        order = np.lexsort((ids, moment))
+        return cls(moment[order], ids[order], mean[order], P[order])
+
+    def select(self, rows: BoolArray | IntArray) -> Self:
+        """The states of a mask or of row indices in order."""
+        return type(self)(self.moment[rows], self.id[rows], self.mean[rows], self.covariance[rows])
+
+    def within(self, lives: Lives) -> Self:
+        """The states of some objects from their first to their last moment."""
+        row = np.minimum(lives.rows_of(self.id), max(len(lives) - 1, 0))
+        if len(lives) == 0:
+            return self.select(np.empty(0, dtype=np.int64))
+        there = (lives.id[row] == self.id) & (lives.first[row] <= self.moment) & (self.moment <= lives.last[row])
+        return self.select(there)
+
+    @cached_property
+    def _bounds(self) -> IntArray:
+        return np.searchsorted(self.moment, np.arange((int(self.moment[-1]) if len(self) else 0) + 2))
+
+    def at(self, moment: int) -> slice:
+        """The rows of a moment."""
+        if moment + 1 >= len(self._bounds):
+            return slice(len(self), len(self))
+        return slice(int(self._bounds[moment]), int(self._bounds[moment + 1]))
+
+    def rows_of(self, moment: IntArray, ids: IntArray) -> IntArray:
+        """(m,) the rows of these objects at these moments, -1 where there is none."""
+        if len(self) == 0:
+            return np.full(len(ids), -1, dtype=np.int64)
+        span = max(int(self.id.max()), int(ids.max(initial=0))) + 1
+        keys, wanted = self.moment * span + self.id, moment * span + ids
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        return np.where((keys[at] == wanted) & (ids >= 0), at, -1)

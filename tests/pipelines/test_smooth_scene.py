@@ -1,0 +1,57 @@
+"""Smoothing a simulated recording from end to end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_tools.metrics import match_scene
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from pipelines.smoothing import SmoothedScene, load_smooth_config, smooth_scene
+from pipelines.tracking import track_scene
+
+
+@pytest.fixture(scope="module")
+def smoothed() -> SmoothedScene:
+    dataset = SimulatedTraffic(replace(SimulatorSettings(), duration=6.0), scenes=1, seed=5)
+    return smooth_scene(dataset.scene("scene-0001"), load_smooth_config("simulated"))
+
+
+def test_labels_fit_the_scene_and_are_counted(smoothed: SmoothedScene) -> None:
+    assert len(smoothed.labels) == len(smoothed.scene)
+    sources = np.concatenate([moment.source for moment in smoothed.labels])
+    counts = smoothed.counts
+    assert (counts.observed, counts.filled, counts.extended) == tuple(
+        int((sources == name).sum()) for name in ("observed", "filled", "extended")
+    )
+    assert counts.boxes == sum(map(len, smoothed.labels)) > 0
+    assert counts.filled > 0
+
+
+def test_an_object_keeps_size_class_and_score_and_has_no_holes(smoothed: SmoothedScene) -> None:
+    seen: dict[int, list[int]] = {}
+    first: dict[int, tuple[str, list[float], float]] = {}
+    for k, tracks in enumerate(smoothed.tracks):
+        for i, id_ in enumerate(tracks.id.tolist()):
+            seen.setdefault(id_, []).append(k)
+            now = str(tracks.boxes.label[i]), tracks.boxes.size[i].tolist(), float(tracks.score[i])
+            assert first.setdefault(id_, now) == now
+    assert all(np.diff(moments).max(initial=1) == 1 for moments in seen.values())
+
+
+def test_smoothed_positions_and_headings_are_better_than_online_ones(smoothed: SmoothedScene) -> None:
+    scene = smoothed.scene
+    assert scene.ground_truth is not None
+    online = track_scene(scene, load_smooth_config("simulated").tracking.new_tracker("saga")).tracks
+    errors: list[list[float]] = []
+    runs = [(moments, match_scene(scene.ground_truth, moments)) for moments in (online, smoothed.tracks)]
+    for k, truth in enumerate(scene.ground_truth):
+        rows = [dict(zip(m[k].object_row.tolist(), m[k].track_row.tolist(), strict=True)) for _, m in runs]
+        for i in np.flatnonzero(truth.visible).tolist():
+            if i in rows[0] and i in rows[1]:
+                boxes = [moments[k].boxes.position[row[i], :2] for (moments, _), row in zip(runs, rows, strict=True)]
+                errors.append([float(np.hypot(*(box - truth.boxes.position[i, :2]))) for box in boxes])
+    online_rmse, smoothed_rmse = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert smoothed_rmse < 0.85 * online_rmse
