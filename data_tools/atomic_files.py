@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from typing import BinaryIO
 
 from saga_fg.errors import InputError
 
+_LEFTOVER = re.compile(r"\..*\.[0-9a-f]{12}\.tmp", re.DOTALL)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -86,6 +88,13 @@ def check_writable(path: str | Path) -> None:
     _, temporary, file = _opened(path)
     file.close()
     temporary.unlink()
+
+
+def remove_leftovers(folder: str | Path) -> None:
+    """Remove the temporary files of this module that killed processes have left in a folder; nobody may be writing."""
+    for path in Path(folder).glob(".*.tmp"):
+        if _LEFTOVER.fullmatch(path.name):
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:

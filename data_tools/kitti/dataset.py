@@ -20,7 +20,7 @@ import numpy as np
 from data_tools.central_differences import central_differences
 from data_tools.kitti.calibration import Calibration, read_calibration
 from data_tools.kitti.camera_boxes import camera_boxes_to_world
-from data_tools.kitti.detections import read_kitti_detections
+from data_tools.kitti.detections import detection_files, read_kitti_detections
 from data_tools.kitti.labels import KittiObjects, has_box, read_kitti_labels
 from data_tools.kitti.oxts import read_poses
 from data_tools.located import located, unknown
@@ -81,6 +81,11 @@ class KittiTracking:
     def labels(self, name: str) -> KittiObjects:
         """The lines of a sequence's label file, `DontCare` regions included."""
         return read_kitti_labels(self._file("label_02", name))
+
+    def files(self, name: str) -> tuple[Path, ...]:
+        """The files that a sequence is read from, but for its ground truth."""
+        found = () if self._detections is None else detection_files(self._detections, name).values()
+        return (self._file("oxts", name), self._file("calib", name), *found)
 
     def scene(self, name: str) -> Scene:
         """Read one of the chosen sequences; raises `InputError` for another name or a broken file."""

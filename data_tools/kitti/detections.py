@@ -42,13 +42,9 @@ def read_kitti_detections(folder: str | Path, sequence: str, frames: int) -> Kit
 
     Raises `InputError` if no class has a file for the sequence, and for lines that are not as above.
     """
-    folder = Path(folder)
-    paths = {name: folder / name / f"{sequence}.txt" for name in CLASS_CODES}
-    present = {name: path for name, path in paths.items() if path.is_file()}
-    if not present:
-        raise InputError(f"{folder}: expected {' or '.join(f'{name}/{sequence}.txt' for name in CLASS_CODES)}")
+    present = detection_files(Path(folder), sequence)
     for name in CLASS_CODES.keys() - present.keys():
-        log.warning("%s: no such file, sequence %s has no detections of this class", paths[name], sequence)
+        log.warning("%s: no detections of class %s in sequence %s", folder, name, sequence)
     tables = [_read(path, name, frames) for name, path in present.items()]
     frame = np.concatenate([table[0] for table in tables])
     numbers = np.concatenate([table[1] for table in tables])
@@ -57,6 +53,15 @@ def read_kitti_detections(folder: str | Path, sequence: str, frames: int) -> Kit
     numbers = numbers[order]
     boxes = CameraBoxes(numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11])
     return KittiDetections(frame[order], type_[order], boxes, numbers[:, 4])
+
+
+def detection_files(folder: Path, sequence: str) -> dict[str, Path]:
+    """The files of a sequence by class. Raises `InputError` if there is none."""
+    paths = {name: folder / name / f"{sequence}.txt" for name in CLASS_CODES}
+    present = {name: path for name, path in paths.items() if path.is_file()}
+    if not present:
+        raise InputError(f"{folder}: expected {' or '.join(f'{name}/{sequence}.txt' for name in CLASS_CODES)}")
+    return present
 
 
 def _read(path: Path, name: str, frames: int) -> tuple[IntArray, FloatArray]:

@@ -8,6 +8,7 @@ from data_tools.nuscenes.splits import split_scenes
 from data_tools.nuscenes.tracking_results import (
     TrackedBoxes,
     TrackingResults,
+    merge_tracking_results,
     read_tracking_results,
     write_tracking_results,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "ResultMeta",
     "TrackedBoxes",
     "TrackingResults",
+    "merge_tracking_results",
     "read_scored_scenes",
     "read_tracking_results",
     "split_scenes",

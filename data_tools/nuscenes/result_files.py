@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
@@ -44,27 +44,37 @@ def read_result_file(
     """
     path = Path(path)
     columns = ResultColumns(str(path), task)
-    meta, found = ResultMeta(), False
+    meta = ResultMeta()
+    for token, value in result_entries(path):
+        if token is None:
+            meta = _meta(path, value)
+        elif known is not None and token not in known:
+            raise InputError(f"{path}: sample {token}: expected samples of the tables, they hold no such sample")
+        elif wanted is None or token in wanted:
+            columns.add(token, value)
+    return ResultFile(meta, columns.finish())
+
+
+def result_entries(path: Path) -> Iterator[tuple[str | None, Any]]:
+    """Each sample's token and its boxes as they stand in the file; None and the file's `meta` in between.
+
+    Raises `InputError` for a file that cannot be read, is not JSON or has no results.
+    """
+    found = False
     with open_json(path) as file:
         stream = JsonStream(file, str(path))
         for key in stream.members():
             if key == "results":
                 found = True
                 for token in stream.members():
-                    if known is not None and token not in known:
-                        raise InputError(
-                            f"{path}: sample {token}: expected samples of the tables, they hold no such sample"
-                        )
-                    boxes = stream.value()
-                    if wanted is None or token in wanted:
-                        columns.add(token, boxes)
+                    yield token, stream.value()
             else:
                 value = stream.value()
-                meta = _meta(path, value) if key == "meta" else meta
+                if key == "meta":
+                    yield None, value
         stream.end()
     if not found:
         raise InputError(f"{path}: expected a field 'results' with the boxes of each sample")
-    return ResultFile(meta, columns.finish())
 
 
 def _meta(path: Path, value: Any) -> ResultMeta:

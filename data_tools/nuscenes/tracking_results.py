@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ import numpy as np
 from data_tools.atomic_files import atomic_file
 from data_tools.located import located
 from data_tools.nuscenes.classes import TRACKING_CLASSES
-from data_tools.nuscenes.result_files import ResultMeta, read_result_file
+from data_tools.nuscenes.result_files import ResultMeta, read_result_file, result_entries
 from saga_fg.arrays import FloatArray, StrArray, upper_triangle
 from saga_fg.boxes import Boxes
 from saga_fg.dataset import Scene
@@ -45,23 +45,39 @@ def write_tracking_results(
     zero. Track ids become "scene-id" and so are unique over scenes. Raises `InputError` for a path that is not
     writable, tracks that do not fit the scene, a size or heading that is unknown, a track that changes its class.
     """
+    _write(path, (sample for scene, moments in scenes for sample in _samples(str(path), scene, moments)), meta)
+
+
+def merge_tracking_results(path: str | Path, parts: Iterable[Path], meta: ResultMeta) -> None:
+    """Write the samples of several result files into one, in order; never more than one sample is in memory.
+
+    Raises `InputError` as `write_tracking_results` does, and for parts that are no result files.
+    """
+    _write(path, ((token, boxes) for part in parts for token, boxes in result_entries(part) if token is not None), meta)
+
+
+def _write(path: str | Path, samples: Iterable[tuple[str, list[dict[str, Any]]]], meta: ResultMeta) -> None:
     with atomic_file(path) as binary:
         file = io.TextIOWrapper(binary, encoding="utf-8", write_through=True)
         file.write(f'{{"meta": {json.dumps(asdict(meta))}, "results": {{')
         written: set[str] = set()
-        for scene, moments in scenes:
-            with located(f"{path}: scene {scene.name}"):
-                if len(moments) != len(scene):
-                    raise InputError(f"expected tracks for {len(scene)} samples, got {len(moments)}")
-                class_of: dict[int, str] = {}
-                for token, tracks in zip(scene.tokens, moments, strict=True):
-                    if not token or token in written:
-                        raise InputError(f"expected a token of its own for every sample, got {token!r}")
-                    boxes = _boxes(scene.name, token, tracks, class_of)
-                    file.write(f"{',' if written else ''}\n{json.dumps(token)}: {json.dumps(boxes, allow_nan=False)}")
-                    written.add(token)
+        for token, boxes in samples:
+            if not token or token in written:
+                raise InputError(f"{path}: expected a token of its own for every sample, got {token!r}")
+            file.write(f"{',' if written else ''}\n{json.dumps(token)}: {json.dumps(boxes, allow_nan=False)}")
+            written.add(token)
         file.write("\n}}\n")
         file.detach()
+
+
+def _samples(path: str, scene: Scene, moments: Sequence[Tracks]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Token and boxes of each sample of a scene."""
+    with located(f"{path}: scene {scene.name}"):
+        if len(moments) != len(scene):
+            raise InputError(f"expected tracks for {len(scene)} samples, got {len(moments)}")
+        class_of: dict[int, str] = {}
+        for token, tracks in zip(scene.tokens, moments, strict=True):
+            yield token, _boxes(scene.name, token, tracks, class_of)
 
 
 def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> list[dict[str, Any]]:

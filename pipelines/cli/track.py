@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_files
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.scaling import RayAddress, Workers, at_scale, end_of, run_at_scale
 from pipelines.cli.summary import Summary
 from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
+from saga_fg.errors import InputError
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -36,6 +38,8 @@ def nuscenes(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    workers: Workers = None,
+    ray: RayAddress = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -52,8 +56,11 @@ def nuscenes(
           --method kf --output tracks.json
       saga-fg track nuscenes --dataroot data/nuscenes --scenes scene-0103 \\
           --detections lidar=a.json --estimator fixed-lag --lag 3 --output tracks.json
+      saga-fg track nuscenes --dataroot data/nuscenes --version v1.0-trainval --split val \\
+          --detections lidar=a.json --workers 0 --output run   # all cores; writes run/tracks.json
     """
-    from data_tools.nuscenes import NuScenes, write_tracking_results
+    from data_tools.nuscenes import NuScenes, merge_tracking_results, write_tracking_results
+    from pipelines.scale_out import HeldScene, TrackTask
     from pipelines.tracking import track_dataset
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
@@ -61,6 +68,17 @@ def nuscenes(
     files = sensor_files(detections)
     apart(output, *files.values())
     dataset = NuScenes(dataroot, version, files, chosen)
+    if at_scale(workers, ray):
+        task = TrackTask(settings, method, "nuscenes", dataset.meta)
+        inputs = (HeldScene(dataset.scene(name)) for name in chosen)
+        report = run_at_scale(inputs, len(chosen), task, output, workers, ray)
+        merged = output / "tracks.json"
+        if report.failed:
+            merged.unlink(missing_ok=True)
+        else:
+            merge_tracking_results(merged, (output / task.result(name) for name in chosen), dataset.meta)
+        end_of(report)
+        return
     summary = Summary(output)
     with progress_bar(len(chosen)) as progress:
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
@@ -81,6 +99,8 @@ def kitti(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    workers: Workers = None,
+    ray: RayAddress = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -92,10 +112,16 @@ def kitti(
           --sequences 0000,0011 --output results
     """
     from data_tools.kitti import KittiTracking, write_kitti_results
+    from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
 
     settings = configured("kitti", config, method, estimator, lag)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
+    if at_scale(workers, ray):
+        sequence_inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
+        task = TrackTask(settings, method, "kitti")
+        end_of(run_at_scale(sequence_inputs, len(dataset.scenes), task, output, workers, ray))
+        return
     summary = Summary(output)
     with progress_bar(len(dataset.scenes)) as progress:
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
@@ -105,7 +131,13 @@ def kitti(
 
 @track_app.command()
 def file(
-    detections: Annotated[Path, typer.Argument(help="Table of detections: .csv, .ndjson, .jsonl or .npz.")],
+    detections: Annotated[
+        list[str],
+        typer.Argument(
+            help="Table of detections: .csv, .ndjson, .jsonl or .npz. In parallel: several of them, patterns, URLs, "
+            "or lists of such in a .txt file."
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Table of tracks to write: .csv, .ndjson or .jsonl.")],
     scenes: Annotated[
         str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
@@ -113,6 +145,11 @@ def file(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    workers: Workers = None,
+    ray: RayAddress = None,
+    table: Annotated[
+        Literal["csv", "ndjson"], typer.Option("--table", help="Format of the tables, with --workers or --ray.")
+    ] = "csv",
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -125,13 +162,26 @@ def file(
     Examples:
       saga-fg track file detections.csv --output tracks.csv
       saga-fg track file detections.ndjson --method kf --config mine.yaml --output tracks.ndjson
+      saga-fg track file 's3://fleet/2026-11/*.csv' --workers 0 --output run   # writes run/tracks/NAME.csv
     """
     from data_tools.detection_files import read_detections, write_tracks
+    from data_tools.remote_files import expanded, local_copy
+    from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset
 
     settings = configured("file", config, method, estimator, lag)
-    apart(output, detections)
-    dataset = read_detections(detections)
+    if at_scale(workers, ray):
+        if scenes is not None:
+            raise InputError("--scenes: all scenes of a file are done with --workers or --ray")
+        urls = expanded(detections)
+        task = TrackTask(settings, method, ".csv" if table == "csv" else ".ndjson")
+        end_of(run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray))
+        return
+    if len(detections) > 1:
+        raise InputError("expected one table of detections, or --workers N and a folder as --output for several")
+    with local_copy(detections[0]) as path:
+        apart(output, path)
+        dataset = read_detections(path)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
     summary = Summary(output)
     with progress_bar(len(chosen)) as progress:

@@ -4,7 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.atomic_files import atomic_directory, atomic_file, check_writable, write_bytes, write_text
+from data_tools.atomic_files import (
+    atomic_directory,
+    atomic_file,
+    check_writable,
+    remove_leftovers,
+    write_bytes,
+    write_text,
+)
 from saga_fg.errors import InputError
 
 
@@ -158,3 +165,12 @@ def test_a_path_is_checked_before_long_work(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "missing" / "new.json"):
         with pytest.raises(InputError, match=path.name):
             check_writable(path)
+
+
+def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:
+    for name in (".a.csv.0123456789ab.tmp", "a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"):
+        (tmp_path / name).touch()
+    (tmp_path / ".folder.0123456789ab.tmp").mkdir()
+    (tmp_path / ".folder.0123456789ab.tmp" / "inside").touch()
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"}

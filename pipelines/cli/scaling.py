@@ -1,0 +1,71 @@
+"""Running a command over many scenes at once: the options, the run, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.summary import counted
+from saga_fg.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.scale_out import Pool, Report, SceneInput, SceneTask
+
+FAILED_SCENES = 1  # exit code
+
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=0,
+        help="Do the scenes in parallel, in so many processes (0: one a core); --output is a folder then, and a second "
+        "run does only what is not done.",
+        metavar="N",
+    ),
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        help='Do the scenes on a Ray cluster: "auto", HOST:PORT, ray://HOST:PORT, or "local" for one of --workers '
+        "CPUs on this machine.",
+        metavar="ADDRESS",
+    ),
+]
+
+
+def at_scale(workers: int | None, ray: str | None) -> bool:
+    """Whether the scenes are to be done in parallel."""
+    return workers is not None or ray is not None
+
+
+def run_at_scale(
+    inputs: Iterable[SceneInput], total: int, task: SceneTask, output: Path, workers: int | None, ray: str | None
+) -> Report:
+    """Do the task with all inputs, and print what became of them."""
+    from pipelines.scale_out import LocalPool, RayPool, run_scenes
+
+    if output.suffix:
+        raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
+
+    def new_pool(scratch: Path) -> Pool:
+        return LocalPool(workers or 0, scratch) if ray is None else RayPool(ray, workers or 0)
+
+    with progress_bar(unit="scenes") as bar:
+        report = run_scenes(inputs, total, task, output, new_pool, lambda _, done, of: bar("scenes", done, of))
+    counts = "".join(f", {number} {noun}" for noun, number in report.counts.items())
+    states = f"{len(report.done)} done, {len(report.unchanged)} unchanged, {len(report.failed)} failed"
+    typer.echo(f"{output}: {counted(report.scenes, 'scene')}: {states}{counts}")
+    return report
+
+
+def end_of(report: Report) -> None:
+    """Name the scenes that failed, with their reasons, and end with an exit code if there are any."""
+    for name, reason in report.failed.items():
+        typer.echo(f"failed: {name}: {reason}", err=True)
+    if report.failed:
+        raise typer.Exit(FAILED_SCENES)

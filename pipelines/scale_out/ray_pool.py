@@ -1,0 +1,79 @@
+"""Jobs on a Ray cluster (https://docs.ray.io): one task a job, placed, moved and retried by Ray.
+
+Nodes need this package in the same version. Inputs that are read by the driver travel with their job; those that are
+read by the worker (files) must be reachable from every node under the same name. Results travel back to the driver.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from pipelines.scale_out.job import Job, Outcome, perform
+from pipelines.scale_out.local_pool import ATTEMPTS
+from saga_fg.errors import InputError, MissingExtraError
+
+log = logging.getLogger(__name__)
+
+_AHEAD = 2  # jobs in flight for each CPU, so that none waits for the driver
+
+
+@dataclass(frozen=True)
+class RayPool:
+    """address: as `ray.init` takes it ("auto", "host:6379", "ray://host:10001"), or "local" for a cluster on this
+    machine that ends with the run; workers: CPUs of that one, jobs in flight on others (0: as many as there are).
+    """
+
+    address: str
+    workers: int = 0
+
+    def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
+        """The outcomes as they come. Raises `MissingExtraError` without Ray, `InputError` where there is no cluster."""
+        ray = _connected(self.address, self.workers)
+        try:
+            limit = self.workers if self.workers and self.address != "local" else self._in_flight(ray)
+            task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(perform)
+            names: dict[Any, str] = {}
+            while True:
+                while len(names) < limit and (job := next(jobs, None)) is not None:
+                    names[task.remote(job)] = job.input.name
+                if not names:
+                    return
+                for reference in ray.wait(list(names))[0]:
+                    yield _outcome(ray, reference, names.pop(reference))
+        finally:
+            ray.shutdown()
+
+    def _in_flight(self, ray: ModuleType) -> int:
+        return _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+def _outcome(ray: ModuleType, reference: Any, name: str) -> Outcome:
+    try:
+        outcome = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else ""
+        return Outcome(name, "failed", reason=f"{type(error).__name__}: {reason}")
+    assert isinstance(outcome, Outcome)
+    return outcome
+
+
+def _connected(address: str, workers: int) -> ModuleType:
+    """Ray, connected to a cluster."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray is about to do, and warns of
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingExtraError('--ray: Ray is not installed; pip install "saga-fg[ray]"') from error
+    local: dict[str, Any] = {"num_cpus": workers or None, "include_dashboard": False} if address == "local" else {}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, configure_logging=False, **local)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise InputError(f"--ray {address}: no cluster there: {str(error).strip().splitlines()[0]}") from error
+    module: ModuleType = ray
+    return module

@@ -1,0 +1,128 @@
+"""Many scenes: jobs to a pool of workers, results and manifest to a folder, and again only what has to be.
+
+A scene is left as it is if the manifest has it as done with the same inputs, configuration and version, and its
+results are the files that were written then. One run at a time may write to a folder.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Protocol
+
+from data_tools.atomic_files import write_text
+from pipelines.scale_out.job import Job, Outcome, SceneInput, SceneTask, sha256
+from pipelines.scale_out.manifest import Manifest, Record
+from saga_fg.errors import InputError
+
+log = logging.getLogger(__name__)
+
+
+class Pool(Protocol):
+    """What does jobs: processes of this machine, or a cluster."""
+
+    def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
+        """The outcomes of all jobs, each as soon as it is there."""
+        ...
+
+
+@dataclass
+class Report:
+    """Names of the scenes by what became of them; reasons of those that failed; counts of all that are there."""
+
+    done: list[str] = field(default_factory=list)
+    unchanged: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def scenes(self) -> int:
+        """How many there were."""
+        return len(self.done) + len(self.unchanged) + len(self.failed)
+
+
+def run_scenes(
+    inputs: Iterable[SceneInput],
+    total: int,
+    task: SceneTask,
+    output: Path,
+    new_pool: Callable[[Path], Pool],
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Report:
+    """Do a task with every input, in whichever order; results in `output`, records in `output`/manifest.
+
+    new_pool  makes the workers, given a folder for their temporary files
+    progress  is called with the name of a scene that is finished, how many are, and `total`
+
+    Scenes that fail are in the report and in the manifest, and stop no other. Raises `InputError` for two inputs of one
+    name, and if another run writes to the folder.
+    """
+    manifest, report = Manifest(output), Report()
+    configuration, here = sha256(task.configuration.encode()), version("saga-fg")
+    with _alone(output):
+        manifest.clean()
+        scratch = output / ".scratch"
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir()
+        write_text(output / "configuration.yaml", task.configuration)
+        try:
+            jobs = _jobs(inputs, task, manifest, configuration, here)
+            for outcome in new_pool(scratch).outcomes(jobs, total):
+                if outcome.status != "failed" and outcome.version != here:
+                    reason = f"the worker has saga-fg {outcome.version}, expected {here}"
+                    outcome = Outcome(outcome.name, "failed", outcome.digests, reason=reason)
+                _count(report, outcome, manifest, configuration)
+                if progress is not None:
+                    progress(outcome.name, report.scenes, total)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+    return report
+
+
+def _jobs(
+    inputs: Iterable[SceneInput], task: SceneTask, manifest: Manifest, configuration: str, here: str
+) -> Iterator[Job]:
+    names: set[str] = set()
+    for scene in inputs:
+        if scene.name in names:
+            raise InputError(f"scene {scene.name}: expected a name of its own for every scene, it occurs again")
+        names.add(scene.name)
+        yield Job(scene, task, manifest.valid(scene.name, configuration, here))
+
+
+def _count(report: Report, outcome: Outcome, manifest: Manifest, configuration: str) -> None:
+    """Write an outcome down, and count it."""
+    record: Record | None
+    if outcome.status == "unchanged":
+        report.unchanged.append(outcome.name)
+        record = manifest.record(outcome.name)
+    else:
+        record = manifest.take(outcome, configuration)
+        if outcome.status == "done":
+            report.done.append(outcome.name)
+        else:
+            report.failed[outcome.name] = outcome.reason
+            log.info("%s failed: %s", outcome.name, outcome.reason)
+    for name, number in record.counts.items() if record is not None else ():
+        report.counts[name] = report.counts.get(name, 0) + number
+
+
+@contextmanager
+def _alone(output: Path) -> Iterator[None]:
+    """Hold the folder for this run; the system lets go of it when the process ends, however it does."""
+    try:
+        import fcntl
+    except ImportError:  # no such thing on Windows: whoever starts two runs there has to know
+        yield
+        return
+    with (output / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{output}: another run is writing to this folder") from error
+        yield

@@ -1,0 +1,165 @@
+"""`saga-fg track ... --workers N`, killed in the middle and run again; and on a Ray cluster of two workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from scale_out_example import InThisProcess, content, write_recordings
+from typer.testing import CliRunner, Result
+
+from data_tools.nuscenes import read_tracking_results
+from pipelines.cli import app
+from pipelines.scale_out import TrackTask
+from saga_fg.dataset import Dataset
+from saga_fg.errors import InputError
+
+COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
+
+
+def saga_fg(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    (folder / "short.yaml").write_text("duration: 2.0\nwarm_up: 3.0\n")
+    result = saga_fg("simulate", "-o", folder / "data", "--scenes", "3", "--config", folder / "short.yaml")
+    assert result.exit_code == 0, result.output
+    return folder / "data"
+
+
+def nuscenes(simulated: Path) -> list[str | Path]:
+    detections = f"lidar={simulated / 'detections' / 'lidar.json'}"
+    return ["track", "nuscenes", "--dataroot", simulated, "--detections", detections, "--split", "all"]
+
+
+def test_the_merged_file_is_that_of_one_process(simulated: Path, tmp_path: Path) -> None:
+    assert saga_fg(*nuscenes(simulated), "-o", tmp_path / "tracks.json").exit_code == 0
+    result = saga_fg(*nuscenes(simulated), "-o", tmp_path / "run", "--workers", "2")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith(f"{tmp_path / 'run'}: 3 scenes: 3 done, 0 unchanged, 0 failed, 12 frames, ")
+    assert (tmp_path / "run" / "tracks.json").read_bytes() == (tmp_path / "tracks.json").read_bytes()
+
+
+def test_failed_scenes_are_named_and_there_is_no_merged_file(
+    simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(task: TrackTask, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
+        if name == "scene-0002":
+            raise InputError("bad weather")
+        return done(task, name, dataset, folder)
+
+    done = TrackTask.run
+    monkeypatch.setattr(TrackTask, "run", run)
+    monkeypatch.setattr("pipelines.scale_out.LocalPool", lambda workers, scratch: InThisProcess())
+    result = saga_fg(*nuscenes(simulated), "-o", tmp_path / "run", "--workers", "1")
+    assert result.exit_code == 1
+    assert "3 scenes: 2 done, 0 unchanged, 1 failed" in result.stdout
+    assert result.stderr == "failed: scene-0002: bad weather\n"
+    assert not (tmp_path / "run" / "tracks.json").exists()
+    monkeypatch.setattr(TrackTask, "run", done)
+    result = saga_fg(*nuscenes(simulated), "-o", tmp_path / "run", "--workers", "1")
+    assert result.exit_code == 0
+    assert "3 scenes: 1 done, 2 unchanged, 0 failed" in result.stdout
+    assert len(read_tracking_results(tmp_path / "run" / "tracks.json").samples) == 12
+
+
+def test_files_by_pattern_and_url(tmp_path: Path) -> None:
+    write_recordings(tmp_path / "in", 3)
+    run = ["track", "file", "--workers", "1"]
+    assert saga_fg(*run, tmp_path / "in" / "*.csv", "-o", tmp_path / "pattern").exit_code == 0
+    assert saga_fg(*run, f"file://{tmp_path}/in/*.csv", "-o", tmp_path / "url").exit_code == 0
+    (tmp_path / "list.txt").write_text(f"# ours\n{tmp_path}/in/a00.csv\n\nfile://{tmp_path}/in/a01.csv\n")
+    assert saga_fg(*run, tmp_path / "list.txt", "-o", tmp_path / "list").exit_code == 0
+    assert len(content(tmp_path / "pattern")) == 3
+    assert content(tmp_path / "pattern") == content(tmp_path / "url")
+    assert list(content(tmp_path / "list")) == ["a00.csv", "a01.csv"]
+    failed = saga_fg(*run, tmp_path / "in" / "a00.csv", f"file://{tmp_path}/in/none.csv", "-o", tmp_path / "pattern")
+    assert failed.exit_code == 1
+    assert "0 done, 1 unchanged, 1 failed" in failed.stdout
+    assert failed.stderr.startswith(f"failed: none: file://{tmp_path}/in/none.csv: cannot be read: FileNotFoundError")
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (("-o", "out.csv"), "--output out.csv: expected the name of a folder"),
+        (("-o", "out", "--scenes", "a00"), "--scenes: all scenes of a file are done"),
+        (("-o", "out", "none*.csv"), "expected at least one file"),
+    ],
+)
+def test_mistakes_end_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extra: tuple[str, ...], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = () if "none*.csv" in extra else ("a00.csv",)
+    result = saga_fg("track", "file", *files, "--workers", "1", *extra)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_run_is_completed_by_the_next(tmp_path: Path) -> None:
+    inputs = write_recordings(tmp_path / "in", 12, rows=60)
+    run = ["track", "file", str(tmp_path / "in" / "*.csv"), "--workers", "2", "--output", str(tmp_path / "out")]
+    driver = subprocess.Popen([*COMMAND, *run], stdout=subprocess.DEVNULL)
+    while len(list(tmp_path.glob("out/manifest/*.json"))) < 3:
+        assert driver.poll() is None
+        time.sleep(0.002)
+    os.kill(driver.pid, signal.SIGKILL)
+    driver.wait()
+    done = {path: path.stat().st_mtime_ns for path in tmp_path.glob("out/manifest/*.json")}
+    assert 3 <= len(done) < len(inputs)
+    (tmp_path / "out" / "tracks" / ".a11.csv.0123456789ab.tmp").write_text("half a fi")  # as a write that was cut off
+    again = subprocess.run([*COMMAND, *run], capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert f"12 scenes: {12 - len(done)} done, {len(done)} unchanged, 0 failed" in again.stdout
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    run[-1] = str(tmp_path / "serial")
+    assert saga_fg(*run).exit_code == 0
+    assert content(tmp_path / "out") == content(tmp_path / "serial")
+    assert len(content(tmp_path / "out")) == 12
+    assert not (tmp_path / "out" / ".scratch").exists()
+
+
+CLUSTER = """
+from pathlib import Path
+import sys
+from scale_out_example import Deadly, write_recordings
+from pipelines.scale_out import RayPool, run_scenes
+
+folder = Path(sys.argv[1])
+inputs = write_recordings(folder / "in", 6)
+(folder / "deaths").mkdir()
+task = Deadly("a02", folder / "deaths", 1)
+report = run_scenes(inputs, 6, task, folder / "ray", lambda scratch: RayPool("local", 2))
+assert sorted(report.done) == [f"a{k:02d}" for k in range(6)], report
+"""
+
+
+def test_a_ray_cluster_of_two_workers_of_which_one_is_killed(tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray comes with the extra ray")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    command = [sys.executable, "-c", CLUSTER, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stderr
+    assert len(list((tmp_path / "deaths").iterdir())) == 1
+    pattern = str(tmp_path / "in" / "*.csv")
+    assert saga_fg("track", "file", pattern, "--workers", "1", "-o", tmp_path / "serial").exit_code == 0
+    assert content(tmp_path / "ray") == content(tmp_path / "serial")
+
+
+def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_recordings(tmp_path / "in", 1)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    result = saga_fg("track", "file", tmp_path / "in" / "a00.csv", "--ray", "local", "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert result.stderr == 'error: --ray: Ray is not installed; pip install "saga-fg[ray]"\n'
