@@ -5,6 +5,7 @@ Linear families give native `gtsam.JacobianFactor`s, which no solver needs Pytho
 `ResidualFactors`. One family a file.
 """
 
+from factors.absolute import attitude_factor, position_factor
 from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
@@ -17,12 +18,17 @@ from factors.gaussian import (
     nonlinear_graph_at,
 )
 from factors.interaction import interaction_factor, interaction_factors
+from factors.lane import lane_boundary_factors, lane_keeping_factors
 from factors.marginal import marginal_factors, marginal_moments
 from factors.measurement import Components, MeasurementModel, box, position, position_velocity
 from factors.nonlinear import Linearisable, ResidualFactor
 from factors.nonlinear_interaction import NonlinearInteraction
 from factors.odometry import odometry_factors
+from factors.on_plane import on_plane_factor
+from factors.plane import OrientedPlane, plane, plane_factor
+from factors.point import point_factors
 from factors.polar import Radar, RangeBearing, RangeRate
+from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
 from factors.relative_detection import relative_detection_factors
 from factors.robust import Robust
@@ -36,6 +42,7 @@ __all__ = [
     "Linearisable",
     "MeasurementModel",
     "NonlinearInteraction",
+    "OrientedPlane",
     "PlanarPose",
     "Pose",
     "Radar",
@@ -50,6 +57,8 @@ __all__ = [
     "SpatialPose",
     "Variable",
     "Vector",
+    "attitude_factor",
+    "bearing_range_factor",
     "between_factor",
     "box",
     "check_dimensions",
@@ -61,6 +70,8 @@ __all__ = [
     "interaction_factor",
     "interaction_factors",
     "joint_prior_factor",
+    "lane_boundary_factors",
+    "lane_keeping_factors",
     "linear_detection_factor",
     "linear_detection_factors",
     "linearised",
@@ -70,12 +81,18 @@ __all__ = [
     "nonlinear_graph",
     "nonlinear_graph_at",
     "odometry_factors",
+    "on_plane_factor",
+    "plane",
+    "plane_factor",
+    "point_factors",
     "pose",
     "pose_prior_factor",
     "position",
+    "position_factor",
     "position_velocity",
     "prior_factor",
     "prior_factors",
+    "range_factor",
     "relative_detection_factors",
     "solve",
 ]

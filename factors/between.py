@@ -61,10 +61,15 @@ def between_factor(
     return gtsam.BetweenFactorPose3(one, other, measured, noise)
 
 
+def gaussian_noise(name: str, covariance: ArrayLike, dim: int) -> gtsam.noiseModel.Gaussian:
+    """GTSAM's noise model of a covariance (dim, dim); raises `FactorError` unless it is positive definite."""
+    whitener(name, covariance, dim)
+    return gtsam.noiseModel.Gaussian.Covariance(np.asarray(covariance, dtype=np.float64))
+
+
 def noise_model(
     name: str, covariance: ArrayLike, dim: int, robust: Robust | None = None
 ) -> gtsam.noiseModel.Gaussian | gtsam.noiseModel.Robust:
-    """GTSAM's noise model of a covariance (dim, dim), which must be positive definite, under a robust loss if any."""
-    whitener(name, covariance, dim)  # which refuses what GTSAM would crash on
-    gaussian = gtsam.noiseModel.Gaussian.Covariance(np.asarray(covariance, dtype=np.float64))
+    """The same under a robust loss, if one is given."""
+    gaussian = gaussian_noise(name, covariance, dim)
     return gaussian if robust is None else robust.model(gaussian)

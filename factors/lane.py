@@ -1,0 +1,190 @@
+"""Lanes as curves: a boundary seen from the vehicle, and objects that keep to a centre line.
+
+A lane curve is a landmark c = (c_0, ..., c_k) in a level frame of its own, world_T_curve = (R_c, t_c), which is fixed
+and has its x axis along the road:
+
+    y = f(x) = c_0 + c_1 x + ... + c_k x^k
+
+A point at (x, y) in that frame is off the curve by, to first order,
+
+    r = (y - f(x)) / s - offset,        s = sqrt(1 + f'(x)^2)
+
+with positive offsets to the left. Derivatives, e = y - f(x):
+
+    dr/dx = -f' / s - e f' f'' / s^3        dr/dy = 1 / s        dr/dc_i = -x^i / s - e f' i x^(i-1) / s^3
+
+A boundary point z (3,), seen from the pose (R, t), lies at (x, y, .) = R_c^T (R z + t - t_c); with the pose moved to
+(R Exp(w), t + R v) that changes by R_c^T R (v - [z]x w). An object's place is part of its state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.between import pose
+from factors.errors import FactorError
+from factors.measurement import checked_components
+from factors.robust import Robust
+from factors.rotations import cross_matrix
+from factors.stacked import ResidualFactors
+from factors.validation import FloatArray, checked, checked_covariances
+from factors.variables import SpatialPose
+
+
+def lane_boundary_factors(
+    rows: ArrayLike,
+    z: ArrayLike,
+    variances: ArrayLike,
+    world_T_curve: ArrayLike,
+    coefficients: int,
+    offsets: ArrayLike = 0.0,
+    robust: Robust | None = None,
+) -> ResidualFactors:
+    """Return n factors of points on a lane curve, seen from the vehicle.
+
+    rows: (n, 2) keys of the pose (`gtsam.Pose3`) and the curve (a vector of `coefficients`); z: (n, 3), m, in the
+    pose's frame; variances: (n,), or one for all, m^2, across the curve; world_T_curve: (4, 4); offsets: (n,), or one
+    for all, m to the left of the curve. Raises `FactorError`.
+    """
+    measured = checked("z", z, (None, 3)).copy()
+    n = len(measured)
+    curve = _Curve(_frame(world_T_curve), _checked_count(coefficients), _column("offsets", offsets, n))
+    function = _Boundary(measured, curve)
+    return ResidualFactors(
+        rows=np.asarray(rows),
+        dims=(SpatialPose(), coefficients),
+        residual=function.residual,
+        covariances=checked_covariances("variances", _column("variances", variances, n)[:, None, None], n, 1),
+        jacobians=function.jacobians,
+        robust=robust,
+        name="points of a lane curve",
+    )
+
+
+def lane_keeping_factors(
+    rows: ArrayLike,
+    variances: ArrayLike,
+    world_T_curve: ArrayLike,
+    coefficients: int,
+    state_dim: int,
+    position: tuple[int, int] = (0, 1),
+    offsets: ArrayLike = 0.0,
+    robust: Robust | None = None,
+) -> ResidualFactors:
+    """Return n factors of objects that keep to a lane curve, or to a line beside it.
+
+    rows: (n, 2) keys of the object (a vector of `state_dim`) and the curve (a vector of `coefficients`); variances:
+    (n,), or one for all, m^2: how far objects stray; position: where the world position, m, sits in the object's state;
+    world_T_curve, offsets: as for `lane_boundary_factors`. Raises `FactorError`.
+    """
+    n = len(np.asarray(rows))
+    checked_components("position", position, state_dim, least=2)
+    curve = _Curve(_frame(world_T_curve), _checked_count(coefficients), _column("offsets", offsets, n))
+    function = _Keeping(curve, state_dim, tuple(position))
+    return ResidualFactors(
+        rows=np.asarray(rows),
+        dims=(state_dim, coefficients),
+        residual=function.residual,
+        covariances=checked_covariances("variances", _column("variances", variances, n)[:, None, None], n, 1),
+        jacobians=function.jacobians,
+        robust=robust,
+        name="objects keeping to a lane curve",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """frame: world_T_curve; count: coefficients; offsets (n,)."""
+
+    frame: FloatArray
+    count: int
+    offsets: FloatArray
+
+    def inside(self, world: FloatArray) -> FloatArray:
+        """World points (n, 3) in the frame of the curve."""
+        return np.asarray((world - self.frame[:3, 3]) @ self.frame[:3, :3])
+
+    def residual(self, xy: FloatArray, c: FloatArray) -> FloatArray:
+        """r (n, 1) of points (n, 2) in the frame of the curve."""
+        e, s, *_ = self._parts(xy, c)
+        return (e / s - self.offsets)[:, None]
+
+    def derivatives(self, xy: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """dr/d(x, y) (n, 2) and dr/dc (n, count)."""
+        e, s, slope, bend, powers, slopes = self._parts(xy, c)
+        along = -slope / s - e * slope * bend / s**3
+        by_c = -powers / s[:, None] - (e * slope / s**3)[:, None] * slopes
+        return np.stack([along, 1 / s], axis=1), by_c
+
+    def _parts(self, xy: FloatArray, c: FloatArray) -> tuple[FloatArray, ...]:
+        """e, s, f', f'' (n,), and x^i, i x^(i-1) (n, count)."""
+        i = np.arange(self.count)
+        x = xy[:, :1]
+        powers = x**i
+        slopes = i * x ** np.maximum(i - 1, 0)
+        bends = i * (i - 1) * x ** np.maximum(i - 2, 0)
+        slope = (slopes * c).sum(axis=1)
+        return xy[:, 1] - (powers * c).sum(axis=1), np.hypot(1, slope), slope, (bends * c).sum(axis=1), powers, slopes
+
+
+@dataclass(frozen=True, eq=False)
+class _Boundary:
+    z: FloatArray
+    curve: _Curve
+
+    def residual(self, pose: FloatArray, c: FloatArray) -> FloatArray:
+        return self.curve.residual(self._inside(pose), c)
+
+    def jacobians(self, pose: FloatArray, c: FloatArray) -> Sequence[FloatArray]:
+        by_xy, by_c = self.curve.derivatives(self._inside(pose), c)
+        turned = self.curve.frame[:3, :3].T @ pose[:, :3, :3]
+        by_tangent = np.concatenate([-turned @ cross_matrix(self.z), turned], axis=2)[:, :2]
+        return [by_xy[:, None, :] @ by_tangent, by_c[:, None, :]]
+
+    def _inside(self, pose: FloatArray) -> FloatArray:
+        world = (pose[:, :3, :3] @ self.z[:, :, None])[:, :, 0] + pose[:, :3, 3]
+        return self.curve.inside(world)[:, :2]
+
+
+@dataclass(frozen=True, eq=False)
+class _Keeping:
+    curve: _Curve
+    state_dim: int
+    position: tuple[int, ...]
+
+    def residual(self, state: FloatArray, c: FloatArray) -> FloatArray:
+        return self.curve.residual(self._inside(state), c)
+
+    def jacobians(self, state: FloatArray, c: FloatArray) -> Sequence[FloatArray]:
+        by_xy, by_c = self.curve.derivatives(self._inside(state), c)
+        J_state = np.zeros((len(state), 1, self.state_dim))
+        J_state[:, 0, list(self.position)] = by_xy @ self.curve.frame[:2, :2].T
+        return [J_state, by_c[:, None, :]]
+
+    def _inside(self, state: FloatArray) -> FloatArray:
+        world = np.zeros((len(state), 3))
+        world[:, :2] = state[:, list(self.position)]
+        return self.curve.inside(world)[:, :2]
+
+
+def _frame(world_T_curve: ArrayLike) -> FloatArray:
+    T = checked("world_T_curve", world_T_curve, (4, 4)).copy()
+    pose("world_T_curve", T)
+    if abs(T[2, 2] - 1) > 1e-9:
+        raise FactorError("world_T_curve: expected a level frame, turned about the vertical alone")
+    return T
+
+
+def _checked_count(coefficients: int) -> int:
+    if isinstance(coefficients, bool) or not isinstance(coefficients, int) or coefficients < 1:
+        raise FactorError(f"coefficients: expected a number of them, at least 1, got {coefficients!r}")
+    return coefficients
+
+
+def _column(name: str, value: ArrayLike, n: int) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    return checked(name, np.full(n, array) if array.ndim == 0 else array, (n,)).copy()
