@@ -12,6 +12,7 @@ from pipelines.cli.config import config
 from pipelines.cli.demo import demo
 from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.serve import serve, status
 from pipelines.cli.simulate import simulate
 from pipelines.cli.slam import slam_app
 from pipelines.cli.track import track_app
@@ -30,6 +31,8 @@ app.add_typer(bench_app, name="bench")
 app.add_typer(slam_app, name="slam")
 app.command()(simulate)
 app.command()(demo)
+app.command()(serve)
+app.command()(status)
 app.command()(config)
 
 

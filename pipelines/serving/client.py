@@ -1,0 +1,63 @@
+"""A small client of the service, for Python programs and for `saga-fg status`."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from pipelines.serving.address import Address
+from pipelines.serving.messages import encode
+from saga_fg.errors import InputError
+
+
+class StreamClient:
+    """A connection to a service; a context manager.
+
+    Raises `InputError` where nobody listens, and `ConnectionError` when the service goes away.
+    """
+
+    def __init__(self, address: Address, timeout: float | None = 30.0) -> None:
+        family = (
+            socket.AF_UNIX if address.path is not None else socket.AF_INET6 if ":" in address.host else socket.AF_INET
+        )
+        self._socket = socket.socket(family)
+        self._socket.settimeout(timeout)
+        try:
+            self._socket.connect(str(address.path) if address.path is not None else (address.host, address.port))
+        except OSError as error:
+            self._socket.close()
+            raise InputError(f"{address}: nobody answers there: {error.strerror or error}") from error
+        self._lines = self._socket.makefile("rb")
+
+    def send(self, message: Mapping[str, Any] | bytes) -> None:
+        """Send one message, or a line as it is."""
+        self._socket.sendall(message if isinstance(message, bytes) else encode(message))
+
+    def receive(self) -> dict[str, Any]:
+        """The next answer."""
+        line = self._lines.readline()
+        if not line:
+            raise ConnectionError("the service has closed the connection")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Send one message and wait for the next answer."""
+        self.send(message)
+        return self.receive()
+
+    def close(self) -> None:
+        """End the connection."""
+        self._lines.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,185 @@
+"""The messages of a stream: one JSON object a line, UTF-8. docs/guides/stream.md has the tables.
+
+in   frame      what a sensor detected at one time; `type` may be left out
+     status     asks for counts and latencies
+     subscribe  asks for the tracks of all frames, not just of those this client sends
+     reset      forgets all tracks and the time: a new scene begins
+out  tracks     the answer to a frame
+     held       a frame that waits for its turn; its tracks follow
+     repeat     a frame that was taken in before
+     status, reset, subscribe   the answers to the requests
+     error      a message that could not be used, and why; nothing else happened
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any, Literal, NoReturn, cast
+
+import numpy as np
+
+from pipelines.serving.settings import StreamSettings
+from saga_fg.arrays import FloatArray
+from saga_fg.boxes import Boxes
+from saga_fg.errors import InputError
+from saga_fg.frame import Coordinates, Detections, Frame
+from saga_fg.geometry import yaw_transform
+from saga_fg.track import Tracks
+
+Request = Literal["status", "subscribe", "reset"]
+REQUESTS: tuple[Request, ...] = ("status", "subscribe", "reset")
+
+POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
+NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
+FRAME_KEYS = ("type", "seq", "timestamp", "sensor", "coordinates", "ego", "detections")
+DEFAULTS = {"z": 0.0, "score": 1.0}
+LONGEST_NAME = 64  # characters of a label or a sensor: names are kept
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMessage:
+    """A frame, and its number among the messages of its sensor (None: not numbered)."""
+
+    frame: Frame
+    seq: int | None = None
+
+
+def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Request:
+    """What a line says. Raises `InputError` naming the field and what was expected."""
+    if len(line) > settings.max_message:
+        raise InputError(f"message: expected at most {settings.max_message} bytes")
+    try:
+        message = json.loads(line.decode("utf-8"), parse_constant=_refuse_constant)
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"message: broken JSON: {error}") from error
+    if not isinstance(message, dict):
+        raise InputError(f"message: expected an object, got {_short(message)}")
+    kind = message.get("type", "frame")
+    if kind == "frame":
+        return _frame_message(message, settings)
+    if kind not in REQUESTS:
+        raise InputError(f"type: expected frame, {', '.join(REQUESTS)}, got {_short(kind)}")
+    _known("", message, ("type",))
+    return cast(Request, kind)
+
+
+def tracks_message(tracks: Tracks, message: FrameMessage) -> dict[str, Any]:
+    """The answer to a frame: its tracks in world coordinates, with the columns of track files."""
+    boxes, covariance = tracks.boxes, tracks.position_covariance
+    numbers = np.column_stack(
+        [
+            *(boxes.position, boxes.size, boxes.yaw, boxes.velocity, tracks.score),
+            *(covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1], tracks.coasting),
+        ]
+    )
+    names = (*NUMBERS, "cov_xx", "cov_xy", "cov_yy", "coasting")
+    rows = [
+        {"id": id_, "label": label, **{name: x for name, x in zip(names, row, strict=True) if x == x}}
+        for id_, label, row in zip(tracks.id.tolist(), boxes.label.tolist(), numbers.tolist(), strict=True)
+    ]
+    return {"type": "tracks", **about(message), "timestamp": tracks.timestamp, "tracks": rows}
+
+
+def about(message: FrameMessage) -> dict[str, Any]:
+    """The fields by which a client knows its frame again."""
+    known = {"sensor": message.frame.sensor, "frame_timestamp": message.frame.timestamp}
+    return known if message.seq is None else {"seq": message.seq, **known}
+
+
+def encode(message: Mapping[str, Any]) -> bytes:
+    """One line."""
+    return json.dumps(message, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+
+
+def _frame_message(message: Mapping[str, Any], settings: StreamSettings) -> FrameMessage:
+    _known("", message, FRAME_KEYS)
+    seq = message.get("seq")
+    if seq is not None and (type(seq) is not int or not 0 <= seq < 2**63):
+        raise InputError(f"seq: expected an integer from 0 on, got {_short(seq)}")
+    rows = message.get("detections")
+    if not isinstance(rows, list):
+        raise InputError(f"detections: expected a list, got {_short(rows)}")
+    if len(rows) > settings.max_detections:
+        raise InputError(f"detections: expected at most {settings.max_detections}, got {len(rows)}")
+    coordinates = message.get("coordinates", "world")
+    frame = Frame(
+        timestamp=_number("", message, "timestamp"),
+        sensor=_name("", message, "sensor", "sensor"),
+        detections=_detections(rows),
+        world_T_ego=_pose(message["ego"]) if message.get("ego") is not None else None,
+        coordinates=cast(Coordinates, coordinates if isinstance(coordinates, str) else repr(coordinates)),
+    )
+    return FrameMessage(frame, seq)
+
+
+def _detections(rows: Sequence[Any]) -> Detections:
+    numbers = np.empty((len(rows), len(NUMBERS)))
+    labels = []
+    for k, row in enumerate(rows):
+        where = f"detections[{k}]"
+        if not isinstance(row, dict):
+            raise InputError(f"{where}: expected an object, got {_short(row)}")
+        _known(f"{where}.", row, ("label", *NUMBERS))
+        labels.append(_name(f"{where}.", row, "label", "object"))
+        numbers[k] = [
+            _number(f"{where}.", row, name, None if name in ("x", "y") else DEFAULTS.get(name, np.nan))
+            for name in NUMBERS
+        ]
+    columns = dict(zip(NUMBERS, numbers.T, strict=True))
+
+    def stacked(names: Sequence[str]) -> FloatArray:
+        return np.stack([columns[name] for name in names], axis=-1)
+
+    return Detections(
+        Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY)), columns["score"]
+    )
+
+
+def _pose(ego: Any) -> FloatArray:
+    if not isinstance(ego, dict):
+        raise InputError(f"ego: expected an object with x, y and yaw, got {_short(ego)}")
+    _known("ego.", ego, ("x", "y", "z", "yaw"))
+    return yaw_transform(*(_number("ego.", ego, name, 0.0 if name == "z" else None) for name in ("x", "y", "z", "yaw")))
+
+
+def _number(where: str, values: Mapping[str, Any], name: str, default: float | None = None) -> float:
+    value = values.get(name)
+    if value is None and default is not None:
+        return default
+    if type(value) not in (int, float):
+        got = "it is left out" if value is None else f"got {_short(value)}"
+        raise InputError(f"{where}{name}: expected a number, {got}")
+    try:
+        return float(cast(float, value))
+    except OverflowError:
+        raise InputError(f"{where}{name}: expected a finite number, got {_short(value)}") from None
+
+
+def _name(where: str, values: Mapping[str, Any], name: str, default: str) -> str:
+    value = values.get(name, default)
+    if not isinstance(value, str) or not 0 < len(value) <= LONGEST_NAME:
+        raise InputError(f"{where}{name}: expected a name of 1 to {LONGEST_NAME} characters, got {_short(value)}")
+    return value
+
+
+def _known(where: str, values: Mapping[str, Any], names: Sequence[str]) -> None:
+    unknown = values.keys() - set(names)
+    if unknown:
+        name = min(unknown)
+        nearest = get_close_matches(name, names, n=1, cutoff=0.6)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; expected {', '.join(names)}"
+        raise InputError(f"{where}{_short(name)}: unknown field{hint}")
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise InputError(f"message: expected JSON, which has no {name}")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."

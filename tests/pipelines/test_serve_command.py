@@ -1,0 +1,151 @@
+"""`saga-fg serve` as a process of its own, over sockets and pipes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipelines.bench.service import ServiceBenchSettings, bench_service
+from pipelines.serving import Address, StreamClient, parse_address
+from pipelines.serving.messages import encode
+from saga_fg import InputError
+
+COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
+
+
+def frame(seq: int) -> bytes:
+    return encode({"seq": seq, "timestamp": seq / 10, "detections": [{"label": "car", "x": 0.8 * seq, "y": 0.0}]})
+
+
+@contextmanager
+def serving(*arguments: str) -> Iterator[tuple[Address, subprocess.Popen[str]]]:
+    with subprocess.Popen([*COMMAND, "serve", *arguments], stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stderr is not None
+            line = server.stderr.readline().strip()
+            assert line.startswith("listening at "), line
+            yield parse_address(line.removeprefix("listening at ")), server
+        finally:
+            server.kill()
+
+
+def test_clients_share_one_tracker_and_one_may_listen():
+    with serving("--listen", "127.0.0.1:0") as (address, _):
+        with StreamClient(address) as listener, StreamClient(address) as sender:
+            assert listener.ask({"type": "subscribe"}) == {"type": "subscribe"}
+            for seq in range(5):
+                sender.send(frame(seq))
+                answer = sender.receive()
+                assert answer == listener.receive()
+                assert answer["seq"] == seq
+            sender.send(b"nonsense\n")
+            assert sender.receive()["type"] == "error"
+        with StreamClient(address) as again:
+            again.send(frame(5))
+            assert [track["id"] for track in again.receive()["tracks"]] == [1]
+            status = again.ask({"type": "status"})
+            assert (status["frames"], status["refused"], status["last_seq"]) == (6, 1, {"sensor": 5})
+
+
+def test_a_client_that_hangs_up_with_answers_unread_hurts_nobody():
+    with serving("--listen", "127.0.0.1:0") as (address, _):
+        rude = StreamClient(address)
+        for seq in range(50):
+            rude.send(frame(seq))
+        rude.close()
+        with StreamClient(address) as client:
+            last = client.ask({"type": "status"})["last_seq"].get("sensor", -1)
+            for seq in range(last + 1, 60):
+                client.send(frame(seq))
+                assert client.receive()["type"] in ("tracks", "repeat")
+            assert client.ask({"type": "status"})["frames"] == 60
+
+
+def test_a_line_without_end_is_refused_and_the_next_one_read():
+    with serving("--listen", "127.0.0.1:0") as (address, _), StreamClient(address) as client:
+        client.send(b"[" * (9 * 2**20) + b"\n")
+        assert "at most" in client.receive()["message"]
+        client.send(frame(0))
+        assert client.receive()["type"] == "tracks"
+
+
+def test_a_unix_socket_is_for_its_owner_and_gone_afterwards(tmp_path: Path):
+    path = tmp_path / "saga.sock"
+    with serving("--listen", str(path)) as (address, server):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        with StreamClient(address) as client:
+            client.send(frame(0))
+            assert client.receive()["type"] == "tracks"
+        done = subprocess.run([*COMMAND, "status", str(path), "--json"], capture_output=True, text=True, check=True)
+        assert json.loads(done.stdout)["frames"] == 1
+        second = subprocess.run([*COMMAND, "serve", "--listen", str(path)], capture_output=True, text=True, check=False)
+        assert second.returncode == 2
+        assert "another server listens there" in second.stderr
+        server.send_signal(signal.SIGTERM)
+        _, errors = server.communicate(timeout=60)
+        assert server.returncode == 0
+        assert "1 frames tracked" in errors
+    assert not path.exists()
+
+
+def test_a_socket_left_behind_is_taken_over_and_a_file_is_not(tmp_path: Path):
+    stale = tmp_path / "stale.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(stale))
+    with serving("--listen", str(stale)) as (address, _), StreamClient(address) as client:
+        assert client.ask({"type": "status"})["frames"] == 0
+    file = tmp_path / "notes.txt"
+    file.write_text("mine")
+    done = subprocess.run([*COMMAND, "serve", "--listen", str(file)], capture_output=True, text=True, check=False)
+    assert (done.returncode, file.read_text()) == (2, "mine")
+
+
+def test_other_machines_only_when_asked_for():
+    done = subprocess.run([*COMMAND, "serve", "--listen", "0.0.0.0:0"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "--allow-remote" in done.stderr
+
+
+def test_nobody_there_is_one_line():
+    with pytest.raises(InputError, match="nobody answers there"):
+        StreamClient(parse_address("127.0.0.1:9"))
+    done = subprocess.run([*COMMAND, "status", "/nowhere/x.sock"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: /nowhere/x.sock: nobody answers there")
+
+
+def test_standard_input_to_standard_output(tmp_path: Path):
+    done = subprocess.run(
+        [*COMMAND, "serve", "--reorder", "0.1"], input=b"".join(map(frame, range(4))), capture_output=True, check=True
+    )
+    kinds = [json.loads(line)["type"] for line in done.stdout.splitlines()]
+    assert kinds.count("tracks") == 4
+    assert b"4 frames tracked" in done.stderr
+
+
+def test_a_reader_that_goes_away_ends_the_pipe_in_one_line():
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([*COMMAND, "serve"], input=frame(0), stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert done.returncode == 0
+    assert b"the reader of the tracks has gone away" in done.stderr
+    assert b"Traceback" not in done.stderr
+
+
+def test_endurance_loses_nothing():
+    bench = bench_service(ServiceBenchSettings(frames=60, objects=3, malformed=0.1, late=0.2))
+    assert bench.nothing_lost
+    assert bench.late > 0
+    assert bench.broken > 0
+    assert set(bench.latency) == {"p50", "p90", "p99", "p99.9"}

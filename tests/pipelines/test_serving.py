@@ -1,0 +1,259 @@
+"""The stream: messages, clock, reordering, and what a line is answered."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.config import load_config
+from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
+from pipelines.serving.clock import Clock
+from pipelines.serving.latency import Latencies
+from pipelines.serving.messages import encode, parse_message
+from pipelines.serving.reordering import Reordering
+from saga_fg import InputError
+from saga_fg.geometry import yaw_of
+
+SETTINGS = StreamSettings()
+
+
+def stream(**settings: Any) -> StreamTracker[str]:
+    config = load_config("file")
+    return StreamTracker(lambda: config.new_tracker("saga"), StreamSettings(**settings))
+
+
+def frame(timestamp: float, seq: int | None = None, sensor: str = "lidar", x: float | None = None) -> bytes:
+    car = {"label": "car", "x": 8.0 * timestamp if x is None else x, "y": 2.0, "score": 0.9}
+    message = {"timestamp": timestamp, "sensor": sensor, "detections": [car]}
+    return encode(message if seq is None else {"seq": seq, **message})
+
+
+def answers(service: StreamTracker[str], *lines: bytes) -> list[dict[str, Any]]:
+    return [answer for line in lines for _, answer in service.handle(line, "me")]
+
+
+def test_a_frame_is_read_with_all_its_fields():
+    line = encode(
+        {
+            "seq": 3, "timestamp": 1.5, "sensor": "radar", "coordinates": "ego",
+            "ego": {"x": 10, "y": 20, "yaw": 0.5},
+            "detections": [
+                {"x": 1, "y": 2, "z": 0.5, "length": 4, "width": 2, "height": 1.5, "yaw": 0.1, "vx": 3, "vy": -1,
+                 "label": "truck", "score": 0.25},
+                {"x": -1, "y": 0},
+            ],
+        }
+    )  # fmt: skip
+    message = parse_message(line, SETTINGS)
+    assert not isinstance(message, str)
+    assert message.seq == 3
+    read = message.frame
+    assert (read.timestamp, read.sensor, read.coordinates) == (1.5, "radar", "ego")
+    assert read.world_T_ego is not None
+    np.testing.assert_allclose(read.world_T_ego[:3, 3], [10, 20, 0])
+    assert yaw_of(read.world_T_ego[:3, :3]) == pytest.approx(0.5)
+    boxes = read.detections.boxes
+    assert boxes.label.tolist() == ["truck", "object"]
+    np.testing.assert_array_equal(boxes.position, [[1, 2, 0.5], [-1, 0, 0]])
+    np.testing.assert_array_equal(boxes.size, [[4, 2, 1.5], [np.nan] * 3])
+    np.testing.assert_array_equal(boxes.velocity, [[3, -1], [np.nan] * 2])
+    np.testing.assert_array_equal(read.detections.score, [0.25, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (b"{", "broken JSON"),
+        (b"\xff\xfe", "broken JSON"),
+        (b"[" * 100_000, "broken JSON"),
+        (b"[]", "expected an object"),
+        (b'{"timestamp": NaN, "detections": []}', "JSON, which has no NaN"),
+        (b'{"timestamp": 1e400, "detections": []}', "timestamp: expected a finite number"),
+        (b'{"timestamp": true, "detections": []}', "timestamp: expected a number, got True"),
+        (b'{"detections": []}', "timestamp: expected a number, it is left out"),
+        (b'{"timestamp": 1700000000000000000, "detections": []}', "nanoseconds"),
+        (b'{"timestamp": 1}', "detections: expected a list"),
+        (b'{"timestamp": 1, "detections": [7]}', r"detections\[0\]: expected an object"),
+        (b'{"timestamp": 1, "detections": [{"x": 1}]}', r"detections\[0\].y: expected a number, it is left out"),
+        (b'{"timestamp": 1, "detections": [{"x": 1, "y": "2"}]}', r"detections\[0\].y: expected a number, got '2'"),
+        (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "lenght": 3}]}', "did you mean 'length'"),
+        (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "length": 0}]}', r"size\[0\]: expected positive"),
+        (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "label": ""}]}', "label: expected a name"),
+        (b'{"timestamp": 1, "sensor": {}, "detections": []}', "sensor: expected a name"),
+        (b'{"timestamp": 1, "coordinates": "ego", "detections": []}', "world_T_ego: expected a pose"),
+        (b'{"timestamp": 1, "coordinates": [], "detections": []}', "coordinates: expected one of"),
+        (b'{"timestamp": 1, "ego": {"x": 1, "y": 2}, "detections": []}', "ego.yaw: expected a number"),
+        (b'{"timestamp": 1, "seq": -1, "detections": []}', "seq: expected an integer"),
+        (b'{"timestamp": 1, "timestmap": 1, "detections": []}', "did you mean 'timestamp'"),
+        (b'{"type": "stop"}', "type: expected frame, status, subscribe, reset, got 'stop'"),
+        (b'{"type": "status", "x": 1}', "unknown field"),
+    ],
+)
+def test_what_cannot_be_used_is_answered_counted_and_without_effect(line, message):
+    service = stream()
+    answers(service, frame(0.0))
+    (answer,) = answers(service, line)
+    assert answer["type"] == "error"
+    with pytest.raises(InputError, match=message):
+        raise InputError(answer["message"])
+    assert service.counts["refused"] == 1
+    assert [t["id"] for t in answers(service, frame(0.1))[0]["tracks"]] == [1]
+
+
+def test_limits_hold():
+    with pytest.raises(InputError, match="at most 50 bytes"):
+        parse_message(frame(0.0), StreamSettings(max_message=50))
+    two = encode({"timestamp": 0, "detections": [{"x": 0, "y": 0}] * 2})
+    with pytest.raises(InputError, match="detections: expected at most 1, got 2"):
+        parse_message(two, StreamSettings(max_detections=1))
+    service = stream(max_sensors=1)
+    assert answers(service, frame(0.0, 0, "a"))[0]["type"] == "tracks"
+    assert "sensors" in answers(service, frame(0.1, 0, "b"))[0]["message"]
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(
+                ["type", "seq", "timestamp", "sensor", "coordinates", "ego", "detections", "x", "y", "yaw"]
+            ),
+            inner,
+            max_size=6,
+        )
+    ),
+    max_leaves=20,
+)
+
+
+@given(st.one_of(st.binary(max_size=60), JSON.map(lambda value: json.dumps(value).encode())))
+def test_no_line_breaks_the_stream(line):
+    service = stream()
+    for answer in answers(service, line.replace(b"\n", b" ")):
+        assert answer["type"] in ("error", "tracks", "status", "subscribe", "reset", "held")
+        encode(answer)  # strict JSON
+
+
+def test_tracks_are_answered_in_the_columns_of_track_files():
+    service = stream()
+    *_, last = answers(service, *(frame(k / 10, k) for k in range(20)))
+    assert (last["seq"], last["sensor"], last["frame_timestamp"]) == (19, "lidar", 1.9)
+    (track,) = last["tracks"]
+    assert track["label"] == "car"
+    assert track["x"] == pytest.approx(15.2, abs=0.1)
+    assert track["vx"] == pytest.approx(8.0, abs=0.2)
+    assert track["cov_xx"] > 0
+    assert "length" not in track  # never measured
+    assert track["coasting"] == 0
+
+
+def test_a_frame_with_a_number_is_taken_in_once():
+    service = stream()
+    first = answers(service, frame(0.0, 0), frame(0.1, 1), frame(0.1, 1), frame(0.0, 0), frame(0.1, 0, "camera"))
+    assert [a["type"] for a in first] == ["tracks", "tracks", "repeat", "repeat", "tracks"]
+    assert service.status()["last_seq"] == {"lidar": 1, "camera": 0}
+
+
+def test_held_frames_go_in_in_order_of_time():
+    service = stream(reorder=0.25)
+    lines = [frame(t, k) for k, t in enumerate([0.0, 0.2, 0.1, 0.3, 0.5])]
+    seen = [(a["type"], a["seq"]) for a in answers(service, *lines)]
+    assert seen[:3] == [("held", 0), ("held", 1), ("held", 2)]
+    tracked = [seq for kind, seq in seen if kind == "tracks"]
+    assert tracked == [0, 2, 1]  # 0.5 s is the newest: those up to 0.25 s are due
+    assert [a["seq"] for _, a in service.flush()] == [3, 4]
+    assert service.counts["late"] == 1
+
+
+def test_one_broken_time_stamp_does_not_move_the_clock():
+    service = stream()
+    kinds = [a["type"] for a in answers(service, frame(0.0), frame(1e6), frame(0.1), frame(-1e6), frame(0.2))]
+    assert kinds == ["tracks", "error", "tracks", "error", "tracks"]
+    assert answers(service, frame(0.3))[0]["tracks"][0]["id"] == 1
+
+
+def test_a_clock_that_was_set_is_followed_after_a_second_frame():
+    service = stream()
+    back = answers(service, frame(100.0), frame(0.0), frame(0.1), frame(0.2))
+    assert [a["type"] for a in back] == ["tracks", "error", "tracks", "tracks"]
+    assert back[-1]["timestamp"] == pytest.approx(0.2)
+    assert service.counts["jumps"] == 1
+
+
+def test_reset_begins_anew():
+    service = stream()
+    before = answers(service, frame(50.0), frame(50.1))
+    assert answers(service, b'{"type": "reset"}') == [{"type": "reset"}]
+    after = answers(service, frame(3.0, x=0.0))
+    assert before[-1]["tracks"][0]["id"] == after[0]["tracks"][0]["id"] == 1
+    assert after[0]["timestamp"] == 3.0
+
+
+@given(st.lists(st.floats(-20, 20), max_size=40), st.floats(0, 5), st.integers(1, 5))
+def test_reordering_loses_nothing_and_holds_no_more_than_it_may(times, hold, most):
+    buffer: Reordering[int] = Reordering(hold, most)
+    out = []
+    for k, t in enumerate(times):
+        due = buffer.push(t, k)
+        assert len(buffer) <= most
+        assert [times[i] for i in due] == sorted(times[i] for i in due)
+        out += due
+    out += buffer.flush()
+    assert sorted(out) == list(range(len(times)))
+
+
+def test_the_clock_wants_a_witness():
+    clock = Clock(10.0)
+    assert [clock.judge(t) for t in (5.0, 6.0, 100.0, 7.0, 100.0, 101.0, 0.0, 1.0)] == [
+        *("fits", "fits", "doubtful", "fits", "doubtful", "jumped ahead", "doubtful", "jumped back")
+    ]
+
+
+@given(st.lists(st.floats(1e-5, 1e3), min_size=1, max_size=200), st.sampled_from([50.0, 90.0, 99.0]))
+def test_percentiles_are_right_to_two_percent(seconds, percent):
+    latencies = Latencies()
+    for s in seconds:
+        latencies.add(s)
+    exact = float(np.percentile(seconds, percent, method="inverted_cdf"))
+    assert latencies.percentile(percent) == pytest.approx(exact, rel=0.02)
+
+
+def test_a_pipe_is_served_to_its_end():
+    source = io.BytesIO(frame(0.0) + b"nonsense\n" + b"x" * 2000 + b"\n" + frame(0.1).rstrip(b"\n"))
+    sink = io.BytesIO()
+    service: StreamTracker[None] = StreamTracker(
+        lambda: load_config("file").new_tracker("kf"), StreamSettings(max_message=1000)
+    )
+    serve_pipe(service, source, sink)
+    kinds = [json.loads(line)["type"] for line in sink.getvalue().splitlines()]
+    assert kinds == ["tracks", "error", "error", "tracks"]
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port", "local"),
+    [
+        ("127.0.0.1:80", "127.0.0.1", 80, True),
+        (":7447", "127.0.0.1", 7447, True),
+        ("[::1]:1", "::1", 1, True),
+        ("localhost:1", "localhost", 1, True),
+        ("0.0.0.0:1", "0.0.0.0", 1, False),
+        ("example.org:1", "example.org", 1, False),
+    ],
+)
+def test_addresses(text, host, port, local):
+    address = parse_address(text)
+    assert (address.host, address.port, address.is_local) == (host, port, local)
+
+
+def test_addresses_that_are_none():
+    assert parse_address("/tmp/x.sock").is_local
+    for text in ("nowhere", "host:", "host:99999", "host:-1", "host:²"):
+        with pytest.raises(InputError, match="expected HOST:PORT"):
+            parse_address(text)
