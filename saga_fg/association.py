@@ -8,8 +8,10 @@ one of least total cost, where an unmatched track or detection costs as much as 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -25,6 +27,15 @@ class Matching:
     track: IntArray
     detection: IntArray
     distance: FloatArray
+
+    @classmethod
+    def empty(cls) -> Self:
+        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Matching]) -> Self:
+        """All pairs of `parts`, in order; at least one part."""
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +74,8 @@ def gate(probability: float, dim: int = 2) -> float:
 def assign(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray) -> tuple[IntArray, IntArray]:
     """Rows and columns of the assignment of least cost (n, m) among possible pairs.
 
-    Leaving a pair out costs `unmatched` (a number, or one per track (n, 1)); only pairs cheaper than that are matched.
+    Leaving a pair out costs `unmatched` (a number, one per track (n, 1), or one per pair); only pairs cheaper than that
+    are matched.
     """
     if not possible.any():
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -71,3 +83,18 @@ def assign(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray)
     rows, columns = linear_sum_assignment(gain)
     matched = gain[rows, columns] < 0
     return rows[matched].astype(np.int64), columns[matched].astype(np.int64)
+
+
+def assign_greedily(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray) -> tuple[IntArray, IntArray]:
+    """As `assign`, but the cheapest pair first, which takes its track and its detection from all others."""
+    gain = np.where(possible, np.minimum(cost - unmatched, 0.0), 0.0)
+    rows, columns = np.nonzero(gain < 0)
+    order = np.argsort(gain[rows, columns], kind="stable")
+    taken_row, taken_column = np.zeros(len(gain), dtype=bool), np.zeros(gain.shape[1], dtype=bool)
+    chosen = []
+    for k in order.tolist():
+        if not (taken_row[rows[k]] or taken_column[columns[k]]):
+            taken_row[rows[k]] = taken_column[columns[k]] = True
+            chosen.append(k)
+    kept = np.sort(np.array(chosen, dtype=np.int64))
+    return rows[kept], columns[kept]

@@ -1,10 +1,18 @@
 """Trackers: frames of detections in, tracks out."""
 
 from saga_fg.tracking.greedy import GreedyTracker
-from saga_fg.tracking.settings import ClassSettings, EstimatorName, ExistenceSettings, GreedySettings, TrackerSettings
+from saga_fg.tracking.settings import (
+    AssociationSettings,
+    ClassSettings,
+    EstimatorName,
+    ExistenceSettings,
+    GreedySettings,
+    TrackerSettings,
+)
 from saga_fg.tracking.tracker import Tracker
 
 __all__ = [
+    "AssociationSettings",
     "ClassSettings",
     "EstimatorName",
     "ExistenceSettings",

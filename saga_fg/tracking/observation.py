@@ -37,10 +37,13 @@ class Observed:
 def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) -> Observed:
     """The detections of a frame that are probable enough for their class and no duplicates."""
     detections = sensor.in_world(frame)
-    probability = sensor.probability(detections.score, detections.boxes.label)
-    keep = np.flatnonzero(probability >= class_values(classes, "min_score", detections.boxes.label))
-    apart = class_values(classes, "duplicate_distance", detections.boxes.label[keep])
-    keep = keep[strongest(detections.boxes.select(keep), probability[keep], apart)]
+    label = detections.boxes.label
+    probability = sensor.probability(detections.score, label)
+    keep = np.flatnonzero(probability >= class_values(classes, "min_score", label))
+    limits = (
+        class_values(classes, name, label[keep]) for name in ("duplicate_distance", "shadow_distance", "shadow_ratio")
+    )
+    keep = keep[strongest(detections.boxes.select(keep), probability[keep], *limits)]
     boxes, probability = detections.boxes.select(keep), probability[keep]
     R = np.zeros((len(boxes), 4, 4))
     R[:, :2, :2] = sensor.detection_covariance(detections.select(keep), sensor.origin(frame))

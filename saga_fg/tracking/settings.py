@@ -31,6 +31,11 @@ class ClassSettings:
     min_score: float = setting(0.0, "detections with a lower probability are not used at all")
     birth_score: float = setting(0.1, "detections with a lower probability start no track")
     duplicate_distance: float = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
+    shadow_distance: float = setting(0.0, "a detection this close to a much stronger one of the class is its shadow, m")
+    shadow_ratio: float = setting(0.5, "much stronger: the weaker has less than this share of its probability")
+    overlap_weight: float = setting(
+        0.0, "what a whole unit of 3D GIoU counts in matching, as a squared distance in sigmas"
+    )
     gate: float = setting(0.999, "share of true pairs that the chi-square gate lets through")
     max_distance: float = setting(4.0, "no match beyond this distance between prediction and detection, m")
     max_coasting: float = setting(1.2, "a track without detection is given up after this time, s")
@@ -38,8 +43,8 @@ class ClassSettings:
 
     def __post_init__(self) -> None:
         require_positive(self, "birth_speed", "birth_drift")
-        require_between(self, 0, 1, "min_score", "birth_score", "gate")
-        require_between(self, 0, math.inf, "duplicate_distance", "yaw_drift")
+        require_between(self, 0, 1, "min_score", "birth_score", "shadow_ratio", "gate")
+        require_between(self, 0, math.inf, "duplicate_distance", "shadow_distance", "overlap_weight", "yaw_drift")
         require_positive(self, "max_distance", "max_coasting", infinite=True)
         if self.gate == 1:
             raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
@@ -55,6 +60,22 @@ def class_values(classes: Mapping[str, ClassSettings], name: str, label: StrArra
     distinct, index = np.unique(label, return_inverse=True)
     values = np.array([getattr(settings_of(classes, str(c)), name) for c in distinct], dtype=np.float64)
     return values[index] if len(label) else np.empty(0)
+
+
+@dataclass(frozen=True)
+class AssociationSettings:
+    """How detections are matched to tracks, see `saga_fg.tracking.matching`; gates and caps are the classes'."""
+
+    method: Literal["hungarian", "greedy"] = setting("hungarian", "least total cost, or the cheapest pair first")
+    false_density: float = setting(
+        0.0, "false detections and newcomers of a class per m^2; 0: any pair inside the gate is better than none"
+    )
+    existence_weight: float = setting(0.5, "how much the existence of a track counts, 1 by its face value, 0 not")
+    score_weight: float = setting(0.5, "how much the probability of a detection counts, 1 by its face value, 0 not")
+
+    def __post_init__(self) -> None:
+        require_one_of(self, "method", ("hungarian", "greedy"))
+        require_between(self, 0, math.inf, "false_density", "existence_weight", "score_weight")
 
 
 @dataclass(frozen=True)
@@ -90,6 +111,7 @@ class TrackerSettings:
     )
     estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
     lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
+    association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     score_memory: float = setting(0.15, "what a sensor said of a track counts for its score for this long, s")
     confirmations: int = setting(3, "detections that confirm a track born of a weak sensor; another sensor's one does")

@@ -9,12 +9,11 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.association import Assignment, Matching, assign, gate, mahalanobis
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.association import Assignment, Matching
 from saga_fg.boxes import Boxes
 from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.errors import InputError
@@ -23,36 +22,17 @@ from saga_fg.interactions import NodeTable
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
+from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
+from saga_fg.tracking.columns import TrackColumns
+from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
+from saga_fg.tracking.matching import associate
 from saga_fg.tracking.observation import Observed, observe
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 
 log = logging.getLogger(__name__)
-
-UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
-
-
-@dataclass(eq=False)
-class _Columns:
-    """What the tracker keeps of its n tracks besides their joint state and boxes."""
-
-    id: IntArray
-    label: StrArray
-    existence: FloatArray
-    score: FloatArray
-    last_seen: FloatArray
-    last_in_view: FloatArray
-    confirmed: BoolArray
-    has_moved: BoolArray
-    accepted: BoolArray
-
-    def select(self, rows: IntArray | BoolArray) -> _Columns:
-        return _Columns(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def extended(self, other: _Columns) -> _Columns:
-        return _Columns(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
 class Tracker:
@@ -85,18 +65,8 @@ class Tracker:
         self._time = -math.inf  # of the state; no frame yet
         self._origin = np.zeros(2)
         self._next_id = 1
+        self._columns = TrackColumns.empty()
         none = np.empty(0)
-        self._columns = _Columns(
-            np.empty(0, dtype=np.int64),
-            np.empty(0, dtype="<U1"),
-            none,
-            none,
-            none,
-            none,
-            none.astype(bool),
-            none.astype(bool),
-            none.astype(bool),
-        )
         self._evidence = SensorEvidence()
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
 
@@ -117,7 +87,7 @@ class Tracker:
         before = self._time
         self._predict(max(timestamp, self._time))
         observed = observe(frame, sensor, self.settings.classes)
-        matching = self._associate(observed, delay)
+        matching = self._associate(observed, sensor, delay)
         self._update(observed, matching, delay)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
         born = self._bear(observed, matching, frame.sensor, delay)
@@ -172,29 +142,15 @@ class Tracker:
             self.graph = graph
         self._time = timestamp
 
-    def _associate(self, observed: Observed, delay: float) -> Matching:
-        """Class by class, the assignment of least cost on the joint filter's covariance, as of `delay` s ago."""
+    def _associate(self, observed: Observed, sensor: Sensor, delay: float) -> Matching:
+        """Register what was observed to the prediction, as of `delay` s ago."""
         columns = self._columns
-        tracks, detections, distances = [], [], []
-        if len(columns.id) and len(observed):
-            position, P = self._state.positions_before(columns.id, columns.label, delay)
-            measured = observed.boxes.position[:, :2] - self._origin
-            for label in np.unique(columns.label):
-                t = np.flatnonzero(columns.label == label)
-                z = np.flatnonzero(observed.boxes.label == label)
-                if len(z) == 0:
-                    continue
-                settings = self.class_settings(str(label))
-                d2, log_det = mahalanobis(position[t], P[t], measured[z], observed.R[z, :2, :2])
-                apart = np.hypot(*np.moveaxis(measured[z][None] - position[t][:, None], -1, 0))
-                possible = (d2 < gate(settings.gate)) & (apart < settings.max_distance)
-                row, column = assign(d2 + log_det, possible, gate(settings.gate) + log_det.max(initial=0.0))
-                tracks.append(t[row])
-                detections.append(z[column])
-                distances.append(d2[row, column])
-        if not tracks:
-            return Matching(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
-        return Matching(np.concatenate(tracks), np.concatenate(detections), np.concatenate(distances))
+        if len(columns.id) == 0 or len(observed) == 0:
+            return Matching.empty()
+        position, P = self._state.positions_before(columns.id, columns.label, delay)
+        predicted = self._boxes(np.arange(len(columns.id)), position, np.full_like(position, np.nan))
+        expected = columns.existence * sensor.detection_chance(columns.label)
+        return associate(predicted, P, expected, observed, self.settings)
 
     def _update(self, observed: Observed, matching: Matching, delay: float) -> None:
         columns, boxes = self._columns, observed.boxes
@@ -219,24 +175,17 @@ class Tracker:
 
         elapsed: since the latest frame, s; delay: by which this one comes late, s
         """
-        columns, settings = self._columns, self.settings.existence
-        n = len(columns.id)
-        if n == 0:
+        columns = self._columns
+        if len(columns.id) == 0:
             return
-        position = self._kinematics()[0] + self._origin
-        visible = sensor.sees(position, frame.world_T_ego)
+        visible = sensor.sees(self._kinematics().position + self._origin, frame.world_T_ego)
         columns.last_in_view[visible] = self._time
-        p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
-        r = columns.existence
-        missed = np.ones(n, dtype=bool)
+        missed = np.ones(len(columns.id), dtype=bool)
         missed[matching.track] = False
-        lost = r * (1 - p_detect) / np.maximum(1 - r * p_detect, 1e-9)
-        columns.existence = np.where(missed, lost * math.exp(-elapsed / settings.lifetime), r)
-        p = observed.probability[matching.detection]
-        odds = p / (1 - p) * (1 - settings.clutter_score) / settings.clutter_score
-        before = np.clip(r[matching.track], 1e-3, 1 - 1e-3)
-        after = before / (1 - before) * odds
-        columns.existence[matching.track] = np.clip(after / (1 + after), 0.0, 0.999)
+        p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
+        p, settings = observed.probability[matching.detection], self.settings.existence
+        columns.existence[missed] = after_miss(columns.existence[missed], p_detect[missed], elapsed, settings)
+        columns.existence[matching.track] = after_hit(columns.existence[matching.track], p, settings)
         self._evidence.hear(frame.sensor, self._time - delay, matching.track, p, missed & visible, p_detect)
         fused = self._evidence.probability(self._time, max(self.settings.score_memory, delay))
         columns.score = np.where(np.isfinite(fused), fused, columns.score)
@@ -258,45 +207,19 @@ class Tracker:
         boxes, p = observed.boxes.select(born), observed.probability[born]
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
-        measured, R = observed.with_velocity[born], observed.R[born]
-        start = Kinematics(
-            boxes.position[:, :2] - self._origin,
-            np.where(measured[:, None], boxes.velocity, 0.0),
-            R[:, :2, :2],
-            np.where(measured[:, None, None], R[:, 2:, 2:], self._birth_velocity_covariance(boxes)),
-        )
-        self._state.add(ids, boxes.label, start, delay)
-        seen, now = np.full(len(born), self._time - delay), np.full(len(born), self._time)
+        self._state.add(ids, boxes.label, newborn(observed, born, self._origin, self.settings.classes), delay)
+        confirmed, accepted = p >= self.settings.existence.confirm, self.sensor(sensor).births == "alone"
+        seen = self._time - delay
         self._columns = self._columns.extended(
-            _Columns(
-                ids,
-                boxes.label,
-                p.copy(),
-                p.copy(),
-                seen,
-                now,
-                p >= self.settings.existence.confirm,
-                np.zeros(len(born), bool),
-                np.full(len(born), self.sensor(sensor).births == "alone"),
-            )
+            TrackColumns.born(ids, boxes.label, p, seen, self._time, confirmed, accepted)
         )
-        self._evidence.born(sensor, p, self._time - delay)
+        self._evidence.born(sensor, p, seen)
         self._box = self._box.extended(
             BoxFilter.born(
                 boxes.size, p, boxes.position[:, 2], observed.z_noise[born], boxes.yaw, observed.yaw_noise[born]
             )
         )
         return born
-
-    def _birth_velocity_covariance(self, boxes: Boxes) -> FloatArray:
-        """(n, 2, 2) of a velocity that nothing is known of but the class and the heading."""
-        speed, drift = (self._of_class(name, boxes.label) for name in ("birth_speed", "birth_drift"))
-        ahead = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1)
-        known = np.isfinite(boxes.yaw)
-        along = np.where(known, speed**2 - drift**2, 0.0)[:, None, None] * np.nan_to_num(
-            ahead[:, :, None] * ahead[:, None]
-        )
-        return np.asarray(along + (np.where(known, drift, speed) ** 2)[:, None, None] * np.eye(2))
 
     def _bury(self) -> None:
         """Tracks not seen for too long, or no longer believed, are marginalised."""
@@ -320,18 +243,17 @@ class Tracker:
         )
         rows = np.flatnonzero(shown)
         position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())
-        box = self._box
-        boxes = Boxes(
-            columns.label[rows],
-            np.concatenate([position + self._origin, box.z[rows, None]], axis=1),
-            box.size[rows],
-            box.yaw[rows],
-            velocity,
-        )
+        boxes = self._boxes(rows, position, velocity)
         score = columns.score[rows] * np.where(coasting[rows] > 0, columns.existence[rows], 1.0)
         return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])
 
     # views on the state
+
+    def _boxes(self, rows: IntArray, position: FloatArray, velocity: FloatArray) -> Boxes:
+        """Tracks `rows` (k,) at local positions (k, 2) with velocities (k, 2), in the world."""
+        box = self._box
+        centre = np.concatenate([position + self._origin, box.z[rows, None]], axis=1)
+        return Boxes(self._columns.label[rows], centre, box.size[rows], box.yaw[rows], velocity)
 
     def _kinematics(self) -> Kinematics:
         return self._state.kinematics(self._columns.id, self._columns.label)

@@ -9,10 +9,11 @@ from saga_fg import Boxes
 from saga_fg.tracking.suppression import strongest
 
 
-def kept(x, probability, distance=1.0, label="car"):
+def kept(x, probability, distance=1.0, label="car", shadow=0.0, ratio=0.5):
     n = len(x)
     boxes = Boxes.of(np.broadcast_to(label, n), np.stack([x, np.zeros(n), np.zeros(n)], axis=-1))
-    return strongest(boxes, np.asarray(probability), np.broadcast_to(distance, n).astype(float)).tolist()
+    distances = (np.broadcast_to(d, n).astype(float) for d in (distance, shadow, ratio))
+    return strongest(boxes, np.asarray(probability), *distances).tolist()
 
 
 def test_the_weaker_of_two_goes():
@@ -34,6 +35,13 @@ def test_distance_zero_suppresses_nothing():
     assert kept([0.0, 0.5], [0.9, 0.8], distance=0.5) == [0, 1]
 
 
+def test_a_much_weaker_detection_close_by_is_a_shadow():
+    assert kept([0.0, 1.5, 9.0], [0.9, 0.4, 0.1], shadow=2.0) == [0, 2]
+    assert kept([0.0, 1.5], [0.9, 0.5], shadow=2.0) == [0, 1], "as strong as a second object"
+    assert kept([0.0, 2.5], [0.9, 0.4], shadow=2.0) == [0, 1], "too far away"
+    assert kept([0.0, 0.5], [0.9, 0.8], shadow=2.0) == [0], "a duplicate all the same"
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_few_boxes(n):
     assert kept(np.zeros(n), np.ones(n)) == list(range(n))
@@ -46,7 +54,7 @@ def test_what_stays_is_apart_and_what_goes_was_beaten(seed, n):
     probability = rng.permutation(n) / n
     label = rng.choice(["car", "bus"], n)
     distance = np.where(label == "car", 1.0, 1.5)
-    stays = strongest(Boxes.of(label, position), probability, distance)
+    stays = strongest(Boxes.of(label, position), probability, distance, np.zeros(n), np.ones(n))
     apart = np.hypot(*np.moveaxis(position[:, None, :2] - position[None, :, :2], -1, 0))
     rival = (label[:, None] == label) & (apart < distance[:, None]) & ~np.eye(n, dtype=bool)
     assert (np.diff(stays) > 0).all()

@@ -1,0 +1,72 @@
+"""What the tracker keeps of its tracks besides their joint state and their boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+
+
+@dataclass(eq=False)
+class TrackColumns:
+    """n tracks, in order of birth. Times in s.
+
+    id            (n,)
+    label         (n,) class
+    existence     (n,) probability that the track is a real object
+    score         (n,) probability of its latest detection
+    last_seen     (n,) time of its latest detection
+    last_in_view  (n,) when it was last inside a sensor's field of view
+    confirmed     (n,) misses no longer end it
+    has_moved     (n,) was ever seen moving
+    accepted      (n,) born from a sensor that is trusted alone, or confirmed since
+    """
+
+    id: IntArray
+    label: StrArray
+    existence: FloatArray
+    score: FloatArray
+    last_seen: FloatArray
+    last_in_view: FloatArray
+    confirmed: BoolArray
+    has_moved: BoolArray
+    accepted: BoolArray
+
+    @classmethod
+    def empty(cls) -> Self:
+        none = np.empty(0)
+        return cls.born(np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, 0.0, 0.0, none.astype(bool), True)
+
+    @classmethod
+    def born(
+        cls,
+        ids: IntArray,
+        label: StrArray,
+        probability: FloatArray,
+        seen: float,
+        now: float,
+        confirmed: BoolArray,
+        accepted: bool,
+    ) -> Self:
+        """New tracks `ids` (k,) `now`, from detections of some `probability` (k,) made at `seen`."""
+        k = len(ids)
+        return cls(
+            ids,
+            label,
+            probability.copy(),
+            probability.copy(),
+            np.full(k, seen),
+            np.full(k, now),
+            confirmed,
+            np.zeros(k, dtype=bool),
+            np.full(k, accepted),
+        )
+
+    def select(self, rows: IntArray | BoolArray) -> Self:
+        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def extended(self, other: TrackColumns) -> Self:
+        return type(self)(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))

@@ -1,0 +1,97 @@
+"""Matching by likelihood: who may take which detection, and which one is preferred."""
+
+import numpy as np
+import pytest
+
+from saga_fg import Boxes, TrackerSettings
+from saga_fg.association import assign_greedily
+from saga_fg.tracking import AssociationSettings, ClassSettings
+from saga_fg.tracking.matching import associate
+from saga_fg.tracking.observation import Observed
+
+CAR = (4.0, 2.0, 1.5)
+
+
+def boxes(x, label="car", yaw=0.0, y=0.0):
+    n = len(x)
+    position = np.stack([np.asarray(x, dtype=float), np.broadcast_to(y, n), np.zeros(n)], axis=-1)
+    return Boxes.of(np.broadcast_to(label, n), position, np.tile(CAR, (n, 1)), np.broadcast_to(yaw, n).astype(float))
+
+
+def observed(found, probability, noise=0.3):
+    n = len(found)
+    R = np.tile(noise**2 * np.eye(4), (n, 1, 1))
+    flat = np.zeros(n)
+    return Observed(
+        boxes=found,
+        row=np.arange(n),
+        probability=np.broadcast_to(probability, n),
+        R=R,
+        with_velocity=flat.astype(bool),
+        z_noise=flat,
+        yaw_noise=flat,
+    )
+
+
+def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None, **association):
+    n = len(tracks)
+    settings = TrackerSettings(
+        classes or {"default": ClassSettings(max_distance=20.0)}, association=AssociationSettings(**association)
+    )
+    P = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
+    matching = associate(tracks, P, np.broadcast_to(expected, n), observed(found, probability), settings)
+    return sorted(zip(matching.track.tolist(), matching.detection.tolist(), strict=True))
+
+
+def test_classes_keep_to_themselves():
+    assert pairs(boxes([0.0, 10.0], ["car", "bus"]), boxes([10.0, 0.0], ["car", "bus"])) == []
+    assert pairs(boxes([0.0, 10.0], ["car", "bus"]), boxes([0.1, 10.2], ["car", "bus"])) == [(0, 0), (1, 1)]
+
+
+def test_without_a_density_all_that_is_inside_the_gate_is_matched():
+    assert pairs(boxes([0.0]), boxes([3.5]), probability=0.01, expected=0.01) == [(0, 0)]
+    assert pairs(boxes([0.0]), boxes([9.0])) == []
+
+
+def test_a_track_that_nobody_believes_in_takes_no_detection_from_afar():
+    for expected, matched in ((0.8, [(0, 0)]), (0.01, [])):
+        assert pairs(boxes([0.0]), boxes([3.0]), expected=expected, false_density=1e-3, existence_weight=1.0) == matched
+    assert pairs(boxes([0.0]), boxes([0.5]), expected=0.01, false_density=1e-3, existence_weight=1.0) == [(0, 0)]
+
+
+def test_the_stronger_of_two_detections_is_preferred_where_scores_count():
+    found = boxes([0.5, -0.6])
+    assert pairs(boxes([0.0]), found, [0.1, 0.9], false_density=1e-3, score_weight=0.0) == [(0, 0)]
+    assert pairs(boxes([0.0]), found, [0.1, 0.9], false_density=1e-3, score_weight=1.0) == [(0, 1)]
+
+
+def test_the_decision_is_that_of_the_likelihood_ratio():
+    """At face value a pair is matched where the track explains the detection better than a miss and a false alarm."""
+    p, r, density, S = 0.7, 0.6, 2e-3, 1.0 + 0.09
+    limit = np.sqrt(2 * S * np.log(r / (1 - r) * p / (1 - p) / (2 * np.pi * density * S)))
+    for x, matched in ((limit - 0.01, [(0, 0)]), (limit + 0.01, [])):
+        told = {"false_density": density, "existence_weight": 1.0, "score_weight": 1.0}
+        assert pairs(boxes([0.0]), boxes([x]), p, r, **told) == matched
+
+
+def test_overlap_decides_between_detections_equally_far():
+    turned = boxes([0.0, 0.0], yaw=[0.0, np.pi / 2], y=[1.0, -1.0])
+    for weight in (0.0, 20.0):
+        classes = {"default": ClassSettings(max_distance=20.0, overlap_weight=weight)}
+        chosen = pairs(boxes([0.0], y=-0.01), turned, classes=classes)
+        assert chosen == ([(0, 0)] if weight else [(0, 1)])
+
+
+@pytest.mark.parametrize(("method", "chosen"), [("hungarian", [(0, 0), (1, 1)]), ("greedy", [(1, 0)])])
+def test_greed_takes_the_nearest_pair_first(method, chosen):
+    assert pairs(boxes([0.0, 3.0]), boxes([2.0, 6.0]), method=method) == chosen
+
+
+def test_greedy_assignment_in_the_order_of_cost():
+    cost = np.array([[1.0, 2.0], [1.5, 9.0]])
+    rows, columns = assign_greedily(cost, np.ones((2, 2), dtype=bool), 5.0)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0)]
+    rows, columns = assign_greedily(cost, np.ones((2, 2), dtype=bool), 10.0)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0), (1, 1)]
+    nothing = assign_greedily(np.zeros((0, 3)), np.zeros((0, 3), dtype=bool), 5.0)
+    assert [len(n) for n in nothing] == [0, 0]
