@@ -10,9 +10,11 @@ from typing import Literal
 
 from pipelines.configuration import load_settings, read_settings
 from pipelines.tracking import OnlineTracker
+from saga_fg.node import ConstantVelocity
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.settings import settings_group
 from saga_fg.tracking import EstimatorName, GreedySettings, GreedyTracker, Tracker, TrackerSettings
+from saga_fg.tracking.settings import settings_of
 
 Method = Literal["saga", "kf", "centerpoint"]
 Family = Literal["nuscenes", "kitti", "simulated", "file"]
@@ -33,6 +35,14 @@ class TrackConfig:
         tracker = self.tracker
         tracker = replace(tracker, estimator=estimator or tracker.estimator, lag=tracker.lag if lag is None else lag)
         return replace(self, tracker=tracker)
+
+    def with_acceleration_noise(self, noise: Mapping[str, float]) -> TrackConfig:
+        """The same with constant velocity and this noise (m^2/s^3) for each class; `default` serves the rest."""
+        classes = dict(self.tracker.classes)
+        for label, q in noise.items():
+            motion = ConstantVelocity(acceleration_noise=q)
+            classes[label] = replace(settings_of(classes, label), motion=motion)
+        return replace(self, tracker=replace(self.tracker, classes=classes))
 
     def new_tracker(self, method: Method) -> OnlineTracker:
         """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre)."""

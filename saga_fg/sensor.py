@@ -76,6 +76,12 @@ class FieldOfView:
                 f"max_azimuth: expected at least min_azimuth {self.min_azimuth:g}, got {self.max_azimuth:g}"
             )
 
+    def holds(self, distance: FloatArray, azimuth: FloatArray) -> BoolArray:
+        """Which places (N,), m and rad, lie in it; one that is not known (NaN) does."""
+        middle, half = (self.min_azimuth + self.max_azimuth) / 2, (self.max_azimuth - self.min_azimuth) / 2
+        aside = np.abs(wrap_angle(azimuth - middle))
+        return np.asarray(~(distance > self.max_range) & ~(aside > half + 1e-9))
+
 
 @dataclass(frozen=True)
 class Extrinsics:
@@ -203,12 +209,15 @@ class Sensor:
         """Which positions (N, 2), world, lie in the field of view; all of them where the pose is unknown."""
         if world_T_ego is None:
             return np.ones(len(position), dtype=bool)
+        return self.field_of_view.holds(*self.polar(position, world_T_ego))
+
+    def polar(self, position: FloatArray, world_T_ego: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Range (N,), m, and azimuth (N,), rad, of positions (N, 2), world, NaN where the pose is unknown."""
+        if world_T_ego is None:
+            return np.full(len(position), np.nan), np.full(len(position), np.nan)
         sensor_T_world = inverse_transform(world_T_ego @ self.extrinsics.ego_T_sensor)
         local = position @ sensor_T_world[:2, :2].T + sensor_T_world[:2, 3]
-        view = self.field_of_view
-        middle, half = (view.min_azimuth + view.max_azimuth) / 2, (view.max_azimuth - view.min_azimuth) / 2
-        azimuth = np.abs(wrap_angle(np.arctan2(local[:, 1], local[:, 0]) - middle))
-        return np.asarray((np.hypot(*local.T) <= view.max_range) & (azimuth <= half + 1e-9))
+        return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
 
 
 def _by_class(label: StrArray, value: Callable[[str], float]) -> FloatArray:

@@ -10,7 +10,7 @@ bootstraps over scenes.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,12 +20,9 @@ from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import track_scene
 from saga_fg.dataset import Annotations
-from saga_fg.learning import Sightings, fit_acceleration_noise
-from saga_fg.node import ConstantVelocity
-from saga_fg.sensor import DEFAULT
+from saga_fg.learning import Sightings, fit_acceleration_noise_by_class
 
 METHODS: tuple[Method, Method] = ("kf", "saga")
-FEWEST_OBJECTS = 10  # a class with fewer has the noise of all objects together
 
 Progress = Callable[[str, int, int], None]
 
@@ -62,8 +59,8 @@ def occlusion(
             objects.setdefault(label, []).extend(found.values())
         if progress is not None:
             progress("fitting", done + 1, total)
-    noise = _fitted(objects)
-    config = with_acceleration_noise(config, noise)
+    noise = fit_acceleration_noise_by_class(objects)
+    config = config.with_acceleration_noise(noise)
     occluded: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}
     hidden: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}
     for done, seed in enumerate(seeds):
@@ -96,21 +93,3 @@ def until_last_seen(moments: Sequence[Annotations]) -> tuple[Annotations, ...]:
 def _pooled(metrics: dict[Method, list[SceneMetrics]]) -> tuple[dict[Method, SceneMetrics], Interval]:
     kf, saga = ([m.carried.square_sums for m in metrics[method]] for method in METHODS)
     return {method: SceneMetrics.pool(metrics[method]) for method in METHODS}, paired_bootstrap(saga, kf)
-
-
-def with_acceleration_noise(config: TrackConfig, noise: dict[str, float]) -> TrackConfig:
-    """The configuration with constant velocity and this noise (m^2/s^3) for each class; `default` serves the rest."""
-    classes = dict(config.tracker.classes)
-    for label, q in noise.items():
-        motion = ConstantVelocity(acceleration_noise=q)
-        classes[label] = replace(classes.get(label, classes[DEFAULT]), motion=motion)
-    return replace(config, tracker=replace(config.tracker, classes=classes))
-
-
-def _fitted(objects: dict[str, list[Sightings]]) -> dict[str, float]:
-    everything = [found for same in objects.values() for found in same]
-    noise = {DEFAULT: fit_acceleration_noise(everything)}
-    for label, same in sorted(objects.items()):
-        if len(same) >= FEWEST_OBJECTS:
-            noise[label] = fit_acceleration_noise(same)
-    return noise

@@ -11,6 +11,7 @@ from pipelines.cli.bench import bench_app
 from pipelines.cli.config import config
 from pipelines.cli.demo import demo
 from pipelines.cli.evaluate import evaluate_app
+from pipelines.cli.learn import learn_app
 from pipelines.cli.reporting import ReportingGroup
 from pipelines.cli.serve import serve, status
 from pipelines.cli.simulate import simulate
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 app.add_typer(track_app, name="track")
 app.add_typer(evaluate_app, name="evaluate")
+app.add_typer(learn_app, name="learn")
 app.add_typer(bench_app, name="bench")
 app.add_typer(slam_app, name="slam")
 app.command()(simulate)

@@ -8,15 +8,20 @@ error decomposition; Harvey 1989, section 3.4). All objects are filtered side by
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from saga_fg.arrays import FloatArray, checked
+from saga_fg.arrays import FloatArray, IntArray, checked
 from saga_fg.errors import InputError
 from saga_fg.node import ConstantVelocity
+from saga_fg.sensor import DEFAULT
+
+FEWEST_OBJECTS = 10  # a class with fewer has the noise of all objects together
+WRONG_REACH = 4.0  # m
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,32 +62,70 @@ def fit_acceleration_noise(
     return float(np.exp(found.x))
 
 
+def fit_acceleration_noise_by_class(objects: Mapping[str, Sequence[Sightings]]) -> dict[str, float]:
+    """The acceleration noise, m^2/s^3, of each class with at least ten objects, and of all together as `default`.
+
+    Raises `InputError` when no object was seen at least three times.
+    """
+    noise = {DEFAULT: fit_acceleration_noise([found for same in objects.values() for found in same])}
+    for label, same in sorted(objects.items()):
+        if sum(len(found) >= 3 for found in same) >= FEWEST_OBJECTS:
+            noise[label] = fit_acceleration_noise(same)
+    return noise
+
+
 def log_likelihood(objects: Sequence[Sightings], acceleration_noise: float, birth_speed: float = 10.0) -> float:
     """Log-likelihood of all sightings but each object's first, under independent constant-velocity motion."""
     order = sorted(objects, key=len, reverse=True)
-    count = np.array([len(o) for o in order])
+    columns = [np.concatenate([getattr(o, name) for o in order]) for name in ("time", "position", "R")]
+    return innovation_likelihood(
+        np.array([len(o) for o in order]), columns[0], columns[1], columns[2], acceleration_noise, birth_speed
+    )
+
+
+def innovation_likelihood(
+    lengths: IntArray,
+    time: FloatArray,
+    position: FloatArray,
+    R: FloatArray,
+    acceleration_noise: float,
+    birth_speed: float,
+    wrong: float = 0.0,
+) -> float:
+    """Log-likelihood of all sightings but each object's first, of objects of these lengths (n,), the longest first.
+
+    time (N,), position (N, 2) and R (N, 2, 2) hold one object after another. wrong: share of sightings that are of
+    something else, anywhere within `WRONG_REACH`; a sighting that is more likely one of those is not taken in.
+    """
+    start = np.concatenate([[0], np.cumsum(lengths)[:-1]])
     diffusion = ConstantVelocity(acceleration_noise).diffusion[2:, 2:]
-    mean = np.zeros((len(order), 4))
-    mean[:, :2] = [o.position[0] for o in order]
-    P = np.zeros((len(order), 4, 4))
-    P[:, :2, :2] = [o.R[0] for o in order]
+    mean = np.zeros((len(lengths), 4))
+    mean[:, :2] = position[start]
+    P = np.zeros((len(lengths), 4, 4))
+    P[:, :2, :2] = R[start]
     P[:, 2:, 2:] = birth_speed**2 * np.eye(2)
+    anything = wrong / (math.pi * WRONG_REACH**2)
     total = 0.0
-    for k in range(1, int(count[0])):
-        n = int((count > k).sum())  # objects seen again: the longest come first
-        dt = np.array([o.time[k] - o.time[k - 1] for o in order[:n]])[:, None, None]
-        z, R = np.array([o.position[k] for o in order[:n]]), np.array([o.R[k] for o in order[:n]])
+    for k in range(1, int(lengths[0])):
+        n = int((lengths > k).sum())  # objects seen again: the longest come first
+        at = start[:n] + k
+        dt = (time[at] - time[at - 1])[:, None, None]
         F = np.tile(np.eye(4), (n, 1, 1))
         F[:, :2, 2:] = dt * np.eye(2)
         Q = np.zeros((n, 4, 4))
         Q[:, :2, :2], Q[:, 2:, 2:] = dt**3 / 3 * diffusion, dt * diffusion
         Q[:, :2, 2:] = Q[:, 2:, :2] = dt**2 / 2 * diffusion
         m, P_n = (F @ mean[:n, :, None])[..., 0], F @ P[:n] @ np.swapaxes(F, 1, 2) + Q
-        S = P_n[:, :2, :2] + R
-        innovation = z - m[:, :2]
+        S = P_n[:, :2, :2] + R[at]
+        innovation = position[at] - m[:, :2]
         gain = np.swapaxes(np.linalg.solve(S, P_n[:, :2, :]), 1, 2)
         whitened = np.linalg.solve(S, innovation[:, :, None])[..., 0]
-        total -= 0.5 * float((innovation * whitened).sum() + np.log(np.linalg.det(S)).sum() + 2 * n * np.log(2 * np.pi))
+        log_density = -0.5 * ((innovation * whitened).sum(axis=1) + np.log(np.linalg.det(S)) + 2 * np.log(2 * np.pi))
+        if wrong:
+            right = math.log(1 - wrong) + log_density
+            gain[right < math.log(anything)] = 0.0
+            log_density = np.logaddexp(right, math.log(anything))
+        total += float(log_density.sum())
         mean[:n] = m + (gain @ innovation[:, :, None])[..., 0]
         P[:n] = P_n - gain @ P_n[:, :2, :]
     return total

@@ -1,7 +1,7 @@
 r"""Scores that compare: the logistic model of the chance that a detection with a given score is true.
 
     logit P(true) = offset + slope s,   s the logit of the score        maximum likelihood, with two weak priors:
-    slope ~ N(1, 1), offset ~ N(0, 3^2)                                 that decide where a class was hardly seen
+    slope ~ N(1, 1), offset ~ N(0, 1.5^2)                               that decide where a class was hardly seen
 
 Source: Platt, Probabilistic outputs for support vector machines, 1999. Solved by Newton's method.
 """
@@ -14,7 +14,7 @@ from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.sensor import ScoreCalibration
 
 PRIOR_MEAN = np.array([0.0, 1.0])  # offset, slope
-PRIOR_PRECISION = np.array([1 / 9.0, 1.0])
+PRIOR_PRECISION = np.array([1 / 1.5**2, 1.0])
 LEAST_SLOPE = 0.05  # a detector whose scores say the reverse is told from one whose scores say nothing by nobody
 
 

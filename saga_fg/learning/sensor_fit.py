@@ -1,4 +1,4 @@
-"""A sensor's model from what recordings show of it: noise, score calibration, detection probability, class by class.
+"""A sensor's model from what recordings show of it: noise, calibration, chance and field of view, class by class.
 
 A class that was seldom seen takes what was found of all classes together.
 """
@@ -14,9 +14,11 @@ import numpy as np
 from saga_fg.learning.detection_sample import DetectionSample
 from saga_fg.learning.measurement_noise import FEWEST, fit_position_noise, robust_deviation
 from saga_fg.learning.score_calibration import fit_score_calibration
-from saga_fg.sensor import DEFAULT, NoiseModel, ScoreCalibration, Sensor
+from saga_fg.sensor import DEFAULT, FieldOfView, NoiseModel, ScoreCalibration, Sensor
 
 FEWEST_CHANCES = 20  # to see an object of a class, for a detection probability of its own
+FEWEST_DETECTIONS = 200  # to tell where a sensor does not look
+BLIND = math.radians(45)  # a sector as wide as this without any detection is out of view
 PRIOR_CHANCES = 4.0  # as many chances as the expected probability counts for
 
 
@@ -27,10 +29,28 @@ def fit_sensor(sample: DetectionSample, base: Sensor, gate: float) -> Sensor:
     for label in labels:
         part = sample.of_class(label)
         calibration[label] = fit_score_calibration(part.logit, part.true, calibration[DEFAULT])
-    model = replace(base, calibration=calibration)
+    model = replace(base, calibration=calibration, field_of_view=fit_field_of_view(sample, base.field_of_view))
+    in_view = model.field_of_view.holds(sample.object_range, sample.object_azimuth)
+    sample = sample.select(np.ones(len(sample), dtype=bool), in_view)
     overall, by_class = detection_probabilities(sample, base.detection_probability)
     noise = fit_noise(sample, model, gate)
     return replace(model, noise=noise, detection_probability=overall, class_detection=by_class)
+
+
+def fit_field_of_view(sample: DetectionSample, known: FieldOfView) -> FieldOfView:
+    """`known`, or where that looks all around, the sector and the range that the detections come from."""
+    if known.max_azimuth - known.min_azimuth < 2 * np.pi - 1e-6:
+        return known
+    azimuth = np.sort(sample.azimuth[np.isfinite(sample.azimuth)])
+    if len(azimuth) < FEWEST_DETECTIONS:
+        return known
+    reach = min(known.max_range, 1.02 * float(sample.range[np.isfinite(sample.range)].max()))
+    gap = np.diff(azimuth, append=azimuth[0] + 2 * np.pi)
+    widest = int(gap.argmax())
+    if gap[widest] < BLIND:
+        return replace(known, max_range=reach)
+    first = azimuth[(widest + 1) % len(azimuth)]
+    return FieldOfView(float(first), float(first + 2 * np.pi - gap[widest]), reach)
 
 
 def fit_noise(sample: DetectionSample, sensor: Sensor, gate: float) -> dict[str, NoiseModel]:

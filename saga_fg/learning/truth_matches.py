@@ -1,7 +1,7 @@
 """Which true object each detection of a recording is of: one to one, least distances, within a gate.
 
-True places between two annotated moments are interpolated. An object was to be seen where the annotations call it
-visible and the sensor's model has it in the field of view.
+True places between two annotated moments are interpolated. An object was there to be seen where the annotations call it
+visible.
 """
 
 from __future__ import annotations
@@ -73,10 +73,10 @@ def sample_with_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float =
 def _sample(matched: MatchedFrame, sensor: Sensor) -> DetectionSample:
     boxes, truth = matched.detections.boxes, matched.annotations.boxes
     n, d, t = len(boxes), matched.detection, matched.truth
-    origin = np.zeros(2) if matched.origin is None else matched.origin
-    sight = boxes.position[:, :2] - origin
-    distance = np.hypot(*sight.T)
-    u = sight[d] / np.maximum(distance[d], 1e-9)[:, None]
+    pose = matched.frame.world_T_ego
+    distance, azimuth = sensor.polar(boxes.position[:, :2], pose)
+    sight = boxes.position[d, :2] - (np.nan if matched.origin is None else matched.origin)
+    u = sight / np.maximum(distance[d], 1e-9)[:, None]
     error = boxes.position[d] - truth.position[t]
     along, across, velocity, yaw, height = (np.full(shape, np.nan) for shape in (n, n, (n, 2), n, n))
     along[d] = (error[:, :2] * u).sum(axis=1)
@@ -84,24 +84,25 @@ def _sample(matched: MatchedFrame, sensor: Sensor) -> DetectionSample:
     velocity[d] = boxes.velocity[d] - truth.velocity[t]
     yaw[d] = wrap_angle(2 * (boxes.yaw[d] - truth.yaw[t])) / 2
     height[d] = error[:, 2]
-    true = np.zeros(n, dtype=bool)
-    true[d] = True
-    detected = np.zeros(len(truth), dtype=bool)
-    detected[t] = True
-    expected = matched.annotations.visible & sensor.sees(truth.position[:, :2], matched.frame.world_T_ego)
-    logit = sensor.logit(matched.detections.score)
+    true, detected = np.zeros(n, dtype=bool), np.zeros(len(truth), dtype=bool)
+    true[d], detected[t] = True, True
+    there = matched.annotations.visible
+    object_range, object_azimuth = sensor.polar(truth.position[:, :2], pose)
     return DetectionSample(
         boxes.label,
-        logit,
+        sensor.logit(matched.detections.score),
         distance,
+        azimuth,
         true,
         along,
         across,
         velocity,
         yaw,
         height,
-        truth.label[expected],
-        detected[expected],
+        truth.label[there],
+        object_range[there],
+        object_azimuth[there],
+        detected[there],
     )
 
 

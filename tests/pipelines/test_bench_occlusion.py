@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.bench.occlusion import until_last_seen, with_acceleration_noise
+from pipelines.bench.occlusion import until_last_seen
 from pipelines.cli.main import app
 from pipelines.config import load_config
 from saga_fg import Annotations, Boxes
@@ -30,7 +30,7 @@ def test_an_object_that_is_never_seen_again_has_left() -> None:
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
     config = load_config("simulated")
-    fitted = with_acceleration_noise(config, {"default": 0.5, "truck": 0.25})
+    fitted = config.with_acceleration_noise({"default": 0.5, "truck": 0.25})
     classes = fitted.tracker.classes
     assert classes["truck"].motion.acceleration_noise == 0.25
     assert classes["default"].motion.acceleration_noise == 0.5

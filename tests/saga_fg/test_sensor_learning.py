@@ -16,7 +16,8 @@ from saga_fg.learning import (
     match_to_truth,
     sample_with_truth,
 )
-from saga_fg.sensor import Extrinsics, NoiseModel, ScoreCalibration
+from saga_fg.learning.sensor_fit import fit_field_of_view
+from saga_fg.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 
 
 def errors(rng, noise, n, wrong=0.0, gate=4.0):
@@ -76,12 +77,27 @@ def test_detection_probability_is_the_share_of_chances_taken():
     sample = replace(
         DetectionSample.empty(),
         object_label=np.repeat(["car", "bus"], [400, 5]),
+        object_range=np.full(405, 20.0),
+        object_azimuth=np.zeros(405),
         detected=np.concatenate([np.arange(400) % 4 > 0, np.zeros(5, dtype=bool)]),
     )
     model = fit_sensor(sample, Sensor(), gate=4.0)
     assert model.class_detection["car"] == pytest.approx(0.75, abs=0.01)
     assert "bus" not in model.class_detection  # seldom in view: the share of all classes serves
     assert model.noise == Sensor().noise
+
+
+def test_where_a_sensor_never_detects_anything_it_does_not_look():
+    rng = np.random.default_rng(5)
+    sample = replace(DetectionSample.empty(), azimuth=rng.uniform(2.5, 4.5, 1000), range=rng.uniform(2.0, 40.0, 1000))
+    view = fit_field_of_view(sample, FieldOfView())
+    assert (view.min_azimuth, view.max_azimuth) == pytest.approx((2.5, 4.5), abs=0.02)
+    assert view.max_range == pytest.approx(40.8, abs=0.5)
+    assert (
+        fit_field_of_view(replace(sample, azimuth=rng.uniform(-np.pi, np.pi, 1000)), FieldOfView()).max_azimuth == np.pi
+    )
+    known = FieldOfView(-1.0, 1.0, 50.0)
+    assert fit_field_of_view(sample, known) == known
 
 
 def recording():

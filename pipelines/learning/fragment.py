@@ -1,0 +1,40 @@
+"""What was learned, as a piece of configuration for `--config`: YAML that holds nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import yaml
+
+from pipelines.learning.noise import LearnedNoise
+from saga_fg.tracking.settings import settings_of
+
+LEARNED = ("noise", "calibration", "detection_probability", "class_detection", "field_of_view")
+DIGITS = 4
+
+
+def learned_fragment(learned: LearnedNoise, origin: str) -> str:
+    """The YAML text; `origin` says in its first line what it was learned from."""
+    sensors = {}
+    for name in learned.detections:
+        values = asdict(learned.config.sensors[name])
+        sensors[name] = {key: _rounded(values[key]) for key in LEARNED if values[key] != {}}
+    data: dict[str, Any] = {"sensors": sensors}
+    if learned.classes:
+        classes = learned.config.tracker.classes
+        data["tracker"] = {
+            "classes": {
+                label: {"motion": {"kind": "constant_velocity", **_rounded(asdict(settings_of(classes, label).motion))}}
+                for label in learned.classes
+            }
+        }
+    text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
+    return f"# Learned by saga-fg learn noise from {origin}; pass it to --config.\n{text}"
+
+
+def _rounded(value: Any) -> Any:
+    """Plain numbers of a few digits."""
+    if isinstance(value, dict):
+        return {key: _rounded(part) for key, part in value.items()}
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value

@@ -1,0 +1,142 @@
+"""Sensors' models and process noise from recordings, with ground truth or without.
+
+With ground truth, detections are compared with the true objects next to them. Without, the tracker says what belongs
+together, by the settings that are there; what is learned so replaces these settings, and the tracker says it again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data_tools.sightings import sightings
+from pipelines.config import TrackConfig
+from saga_fg.dataset import Dataset, Scene
+from saga_fg.errors import InputError
+from saga_fg.learning import (
+    GATE,
+    DetectionSample,
+    Sightings,
+    Trail,
+    fit_acceleration_noise_by_class,
+    fit_sensor,
+    fit_trail_noise,
+    follow,
+    sample_with_truth,
+)
+from saga_fg.node import ConstantVelocity
+from saga_fg.sensor import DEFAULT, NoiseModel, Sensor, sensor_model
+from saga_fg.tracking import Tracker
+from saga_fg.tracking.settings import settings_of
+
+ROUNDS = 2  # of following by what the round before learned
+FEWEST_TRAILS = 5  # a class with fewer has the noise of all trails together
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedNoise:
+    """config: with what was learned; detections: how many of each sensor that rests on; classes: with process noise."""
+
+    config: TrackConfig
+    detections: dict[str, int]
+    classes: tuple[str, ...]
+
+
+def learn_noise(
+    dataset: Dataset, scenes: Sequence[str], config: TrackConfig, with_truth: bool, progress: Progress | None = None
+) -> LearnedNoise:
+    """Learn from some scenes of a dataset, starting from `config`.
+
+    Raises `InputError` for scenes that lack ground truth where it is asked for, or in which no sensor sees anything.
+    """
+    learned = LearnedNoise(config, {}, ())
+    rounds = 1 if with_truth else ROUNDS
+    for k in range(rounds):
+        reported = _reported(dataset, scenes, f" {k + 1}/{rounds}" if rounds > 1 else "", progress)
+        learned = _from_truth(reported, learned.config) if with_truth else _from_trails(reported, learned.config)
+    if not any(learned.detections.values()):
+        raise InputError(f"{', '.join(scenes)}: expected detections to learn from, there is none")
+    return learned
+
+
+def _reported(dataset: Dataset, names: Sequence[str], suffix: str, progress: Progress | None) -> Iterable[Scene]:
+    for done, name in enumerate(names):
+        yield dataset.scene(name)
+        if progress is not None:
+            progress(f"learning{suffix}", done + 1, len(names))
+
+
+def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
+    samples: dict[str, list[DetectionSample]] = {}
+    kept = list(scenes)
+    for scene in kept:
+        for name, sample in sample_with_truth(scene, config.sensors).items():
+            samples.setdefault(name, []).append(sample)
+    pooled = {name: DetectionSample.pool(parts) for name, parts in samples.items()}
+    learned = {name: fit_sensor(sample, sensor_model(config.sensors, name), GATE) for name, sample in pooled.items()}
+    config = replace(config, sensors={**config.sensors, **learned})
+    objects: dict[str, list[Sightings]] = {}
+    for scene in kept:
+        for label, found in sightings(scene, config.sensors).items():
+            objects.setdefault(label, []).extend(found.values())
+    noise = fit_acceleration_noise_by_class(objects) if _enough(objects) else {}
+    return _with_process_noise(config, noise, pooled)
+
+
+def _from_trails(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
+    trails: list[Trail] = []
+    samples: dict[str, list[DetectionSample]] = {}
+    for scene in scenes:
+        tracker = config.new_tracker("kf")
+        assert isinstance(tracker, Tracker)
+        found, of_sensors = follow(scene, tracker, config.sensors)
+        trails += found
+        for name, sample in of_sensors.items():
+            samples.setdefault(name, []).append(sample)
+    pooled = {name: DetectionSample.pool(parts) for name, parts in samples.items()}
+    noise, process = _trail_noise(trails, config)
+    sensors: dict[str, Sensor] = {}
+    for name, sample in pooled.items():
+        base = sensor_model(config.sensors, name)
+        sensors[name] = fit_sensor(sample, replace(base, noise={**base.noise, **noise.get(name, {})}), GATE)
+    return _with_process_noise(replace(config, sensors={**config.sensors, **sensors}), process, pooled)
+
+
+def _trail_noise(
+    trails: Sequence[Trail], config: TrackConfig
+) -> tuple[dict[str, dict[str, NoiseModel]], dict[str, float]]:
+    """Sensor -> class -> noise, and class -> acceleration noise, of the classes followed often enough and `default`."""
+    labels, count = np.unique([trail.label for trail in trails], return_counts=True)
+    groups = {DEFAULT: trails} if trails else {}
+    for label in labels[count >= FEWEST_TRAILS].tolist():
+        groups[label] = [trail for trail in trails if trail.label == label]
+    noise: dict[str, dict[str, NoiseModel]] = {}
+    process: dict[str, float] = {}
+    for label, group in groups.items():
+        settings = settings_of(config.tracker.classes, label)
+        q = settings.motion.acceleration_noise if isinstance(settings.motion, ConstantVelocity) else 1.0
+        of_sensors, process[label] = fit_trail_noise(group, config.sensors, label, q, settings.birth_speed)
+        for name, model in of_sensors.items():
+            noise.setdefault(name, {})[label] = model
+    return noise, process
+
+
+def _enough(objects: dict[str, list[Sightings]]) -> bool:
+    return any(len(found) >= 3 for same in objects.values() for found in same)
+
+
+def _with_process_noise(
+    config: TrackConfig, noise: dict[str, float], samples: dict[str, DetectionSample]
+) -> LearnedNoise:
+    """The process noise of the classes that move at constant velocity; others keep theirs."""
+    of_class = {
+        label: q
+        for label, q in noise.items()
+        if isinstance(settings_of(config.tracker.classes, label).motion, ConstantVelocity)
+    }
+    counts = {name: len(sample) for name, sample in samples.items()}
+    return LearnedNoise(config.with_acceleration_noise(of_class), counts, tuple(of_class))
