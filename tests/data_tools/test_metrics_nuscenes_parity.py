@@ -5,10 +5,9 @@ The official development kit needs NumPy 1, so it lives in another environment: 
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from itertools import count
@@ -22,33 +21,21 @@ from nuscenes_random_drive import VERSION, write_random_drive
 from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscenes_tracking_metrics
 from data_tools.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
 from data_tools.nuscenes.scored_scenes import read_scored_scenes
-from saga_fg import Annotations, Boxes, Tracks
+from pipelines.bench.devkit import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
+from saga_fg import Annotations, Boxes, InputError, Tracks
 
 
 @pytest.fixture(scope="session")
 def devkit() -> str:
-    python = os.environ.get("SAGA_FG_DEVKIT_PYTHON", "")
+    python = os.environ.get(PYTHON_VARIABLE, "")
     if not python:
-        pytest.skip("no official development kit: set SAGA_FG_DEVKIT_PYTHON to a python that has nuscenes-devkit")
+        pytest.skip(f"no official development kit: set {PYTHON_VARIABLE} to a python that has nuscenes-devkit")
     return python
 
 
-def official(python: str, result: Path, dataroot: Path, split: str) -> dict[str, Any]:
-    script = Path(__file__).with_name("nuscenes_devkit_figures.py")
-    run = subprocess.run(
-        [python, str(script), str(result), str(dataroot), VERSION, split], capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stderr[-2000:]
-    return dict(json.loads(run.stdout))
-
-
 def assert_equal(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> None:
-    for field in fields(TrackingFigures):
-        if field.name != "gt":  # over all classes the official figure is a mean, ours a sum
-            assert getattr(ours.overall, field.name) == pytest.approx(theirs[field.name], abs=1e-6), field.name
-        for label, value in theirs["label_metrics"][field.name].items():
-            got = getattr(ours.per_class[label], field.name)
-            assert got == pytest.approx(value, abs=1e-6, nan_ok=True), (label, field.name)
+    apart = {name: value for name, value in differences(ours, theirs) if value > 1e-6}
+    assert not apart
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -57,7 +44,30 @@ def test_random_drives(devkit: str, tmp_path: Path, seed: int) -> None:
     ours = nuscenes_tracking_metrics(list(read_scored_scenes(result, tmp_path / "drive", VERSION).values()))
     assert ours.overall.ids > 0
     assert math.isnan(ours.per_class["trailer"].amota)
-    assert_equal(ours, official(devkit, result, tmp_path / "drive", "drive"))
+    assert_equal(ours, official_figures(devkit, result, tmp_path / "drive", VERSION, "drive").figures)
+
+
+def test_a_simulated_scene(devkit: str, tmp_path: Path) -> None:
+    result = tracked_simulation(tmp_path / "simulated", scenes=1)
+    outcome = parity(devkit, result, tmp_path / "simulated", VERSION, "all")
+    assert outcome.amota > 0.3
+    assert outcome.difference <= 1e-6, outcome.where
+
+
+def test_a_difference_is_found() -> None:
+    ours = NuScenesTrackingMetrics(TrackingFigures(*np.arange(17.0)), per_class={}, curves={})
+    names = [field.name for field in fields(TrackingFigures)]
+    theirs = dict(zip(names, np.arange(17.0), strict=True)) | {"label_metrics": {name: {} for name in names}}
+    assert max(value for _, value in differences(ours, theirs)) == 0
+    assert dict(differences(ours, theirs | {"ids": 12.5}))["ids"] == 0.5
+    assert dict(differences(ours, theirs | {"lgd": math.nan}))["lgd"] == math.inf
+
+
+def test_a_kit_that_fails_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected a python that has nuscenes-devkit"):
+        official_figures(str(tmp_path / "python"), tmp_path, tmp_path, VERSION, "all")
+    with pytest.raises(InputError, match=r"the development kit failed: .*Error"):
+        official_figures(sys.executable, tmp_path, tmp_path, VERSION, "all")
 
 
 def test_a_recording(devkit: str, recordings: Path, tmp_path: Path) -> None:
@@ -70,7 +80,7 @@ def test_a_recording(devkit: str, recordings: Path, tmp_path: Path) -> None:
     write_tracking_results(tmp_path / "result.json", tracked, ResultMeta(use_lidar=True))
     ours = nuscenes_tracking_metrics(list(read_scored_scenes(tmp_path / "result.json", root, VERSION, names).values()))
     assert ours.overall.ids > 0
-    assert_equal(ours, official(devkit, tmp_path / "result.json", root, "camera"))
+    assert_equal(ours, official_figures(devkit, tmp_path / "result.json", root, VERSION, "camera").figures)
 
 
 def noisy_tracks(truth: Sequence[Annotations], rng: np.random.Generator) -> list[Tracks]:
