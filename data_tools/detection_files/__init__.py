@@ -41,6 +41,15 @@ position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coas
 
 from data_tools.detection_files.dataset import DetectionFile, read_detections
 from data_tools.detection_files.track_rows import TrackRows, read_tracks
-from data_tools.detection_files.tracks import write_tracks
+from data_tools.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
 
-__all__ = ["DetectionFile", "TrackRows", "read_detections", "read_tracks", "write_tracks"]
+__all__ = [
+    "TRACK_COLUMNS",
+    "DetectionFile",
+    "TrackRows",
+    "read_detections",
+    "read_tracks",
+    "track_rows",
+    "write_rows",
+    "write_tracks",
+]

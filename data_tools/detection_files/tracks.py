@@ -31,24 +31,32 @@ def write_tracks(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks
     numbers are written in full. Raises `InputError` for another suffix, a path that is not writable, and tracks that
     do not fit the scene.
     """
+    write_rows(path, TRACK_COLUMNS, track_rows(str(path), scenes))
+
+
+def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[Any]]) -> None:
+    """Write a table to .csv, .ndjson or .jsonl; None is left empty (CSV) or out (JSON).
+
+    Raises `InputError` for another suffix and a path that is not writable.
+    """
     suffix = Path(path).suffix.lower()
     if suffix not in (".csv", ".ndjson", ".jsonl"):
         raise InputError(f"{path}: expected a file name that ends in .csv, .ndjson, .jsonl")
     with atomic_file(path) as binary:
         file = io.TextIOWrapper(binary, encoding="utf-8", newline="", write_through=True)
-        rows = _rows(str(path), scenes)
         if suffix == ".csv":
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(TRACK_COLUMNS)
+            writer.writerow(columns)
             writer.writerows(rows)
         else:
             for row in rows:
-                known = {name: value for name, value in zip(TRACK_COLUMNS, row, strict=True) if value is not None}
+                known = {name: value for name, value in zip(columns, row, strict=True) if value is not None}
                 file.write(json.dumps(known, allow_nan=False) + "\n")
         file.detach()
 
 
-def _rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
+def track_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
+    """The rows of `TRACK_COLUMNS`, None for what is unknown; `path` is named where tracks do not fit their scene."""
     for scene, moments in scenes:
         with located(f"{path}: scene {scene.name}"):
             if len(moments) != len(scene):

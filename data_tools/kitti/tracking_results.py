@@ -63,20 +63,29 @@ def write_kitti_results(
 
 
 def kitti_result_text(
-    scene: Scene, moments: Sequence[Tracks], calibration: Calibration, image_size: tuple[int, int] = IMAGE_SIZE
+    scene: Scene,
+    moments: Sequence[Tracks],
+    calibration: Calibration,
+    image_size: tuple[int, int] = IMAGE_SIZE,
+    with_score: bool = True,
 ) -> str:
-    """The lines of one sequence."""
+    """The lines of one sequence; without the score they are those of a label file."""
     if len(moments) != len(scene):
         raise InputError(f"expected tracks for {len(scene)} frames, got {len(moments)}")
     imu_T_camera = inverse_transform(calibration.camera_T_imu)
     lines: list[str] = []
     for frame, (tracks, world_T_imu) in enumerate(zip(moments, scene.world_T_ego, strict=True)):
-        lines += _lines(frame, tracks, world_T_imu @ imu_T_camera, calibration, image_size)
+        lines += _lines(frame, tracks, world_T_imu @ imu_T_camera, calibration, image_size, with_score)
     return "".join(lines)
 
 
 def _lines(
-    frame: int, tracks: Tracks, world_T_camera: FloatArray, calibration: Calibration, image_size: tuple[int, int]
+    frame: int,
+    tracks: Tracks,
+    world_T_camera: FloatArray,
+    calibration: Calibration,
+    image_size: tuple[int, int],
+    with_score: bool,
 ) -> list[str]:
     types = [_type(frame, label) for label in tracks.boxes.label.tolist()]
     unmeasured = ~np.isfinite(tracks.boxes.size).all(axis=1) | ~np.isfinite(tracks.boxes.yaw)
@@ -85,9 +94,8 @@ def _lines(
         raise InputError(f"frame {frame}: track {id_}: expected a known size and heading, the format requires them")
     boxes = world_boxes_to_camera(tracks.boxes, world_T_camera)
     bbox = image_boxes(boxes, calibration.projection, image_size)
-    numbers = np.column_stack(
-        [observation_angles(boxes), bbox, boxes.size, boxes.location, boxes.rotation_y, tracks.score]
-    )
+    columns = [observation_angles(boxes), bbox, boxes.size, boxes.location, boxes.rotation_y]
+    numbers = np.column_stack([*columns, tracks.score] if with_score else columns)
     return [
         f"{frame} {id_} {type_} 0 0 {' '.join(f'{x:.6f}' for x in row)}\n"
         for id_, type_, row, shows in zip(

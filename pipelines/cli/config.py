@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from pipelines.cli.options import Verbose
+from saga_fg.errors import InputError
 
 
 def config(
@@ -16,6 +17,7 @@ def config(
         typer.Option("--for", help="The kind of data whose shipped defaults to print."),
     ] = "file",
     simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,
+    smoothing: Annotated[bool, typer.Option("--smoothing", help="Those of `saga-fg smooth` instead.")] = False,
     file: Annotated[
         Path | None, typer.Option("--config", help="Print the settings this YAML file leads to.", metavar="FILE")
     ] = None,
@@ -30,14 +32,20 @@ def config(
     Examples:
       saga-fg config > mine.yaml                      # everything, to edit
       saga-fg config --for kitti --config mine.yaml   # what mine.yaml makes of the defaults for KITTI
+      saga-fg config --smoothing --for nuscenes       # settings of `saga-fg smooth`
       saga-fg config --simulator                      # settings of `saga-fg simulate`
     """
     from data_tools.simulator import SimulatorSettings
     from pipelines.config import TrackConfig, load_config
     from pipelines.configuration import load_settings, settings_reference, write_settings
+    from pipelines.smoothing import SmoothConfig, load_smooth_config
 
+    if simulator and smoothing:
+        raise InputError("expected one of --simulator and --smoothing")
     if markdown:
-        text = settings_reference(SimulatorSettings if simulator else TrackConfig)
+        text = settings_reference(SimulatorSettings if simulator else SmoothConfig if smoothing else TrackConfig)
+    elif smoothing:
+        text = write_settings(load_smooth_config(kind, file))
     elif simulator:
         text = write_settings(load_settings(SimulatorSettings, file) if file else SimulatorSettings())
     else:

@@ -16,6 +16,7 @@ from pipelines.cli.reporting import ReportingGroup
 from pipelines.cli.serve import serve, status
 from pipelines.cli.simulate import simulate
 from pipelines.cli.slam import slam_app
+from pipelines.cli.smooth import smooth_app
 from pipelines.cli.track import track_app
 
 app = typer.Typer(
@@ -27,6 +28,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.add_typer(track_app, name="track")
+app.add_typer(smooth_app, name="smooth")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(learn_app, name="learn")
 app.add_typer(bench_app, name="bench")

@@ -1,6 +1,16 @@
 """From recordings to labels: the online pass, the rounds of smoothing, the boxes."""
 
 from pipelines.smoothing.config import SmoothConfig, load_smooth_config
-from pipelines.smoothing.scene import SmoothedScene, smooth_scene
+from pipelines.smoothing.output import write_kitti_run, write_labels, write_nuscenes_run
+from pipelines.smoothing.scene import SmoothedScene, smooth_dataset, smooth_scene
 
-__all__ = ["SmoothConfig", "SmoothedScene", "load_smooth_config", "smooth_scene"]
+__all__ = [
+    "SmoothConfig",
+    "SmoothedScene",
+    "load_smooth_config",
+    "smooth_dataset",
+    "smooth_scene",
+    "write_kitti_run",
+    "write_labels",
+    "write_nuscenes_run",
+]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
@@ -13,7 +14,7 @@ from pipelines.smoothing.config import SmoothConfig
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import smooth_objects
 from pipelines.tracking import Progress
-from saga_fg.dataset import Scene
+from saga_fg.dataset import Dataset, Scene
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
 from saga_fg.track import Tracks
 
@@ -54,3 +55,15 @@ def smooth_scene(
         counts = count_labels(evidence, objects, labels, scene.timestamps)
         seconds = time.perf_counter() - start
     return SmoothedScene(scene, labels, counts, len(scene.frames), seconds)
+
+
+def smooth_dataset(
+    dataset: Dataset,
+    config: SmoothConfig,
+    method: Method = "saga",
+    scenes: Iterable[str] | None = None,
+    progress: Progress | None = None,
+) -> Iterator[SmoothedScene]:
+    """Smooth some recordings (default: all), one at a time as they are asked for."""
+    for name in dataset.scenes if scenes is None else scenes:
+        yield smooth_scene(dataset.scene(name), config, method, progress)

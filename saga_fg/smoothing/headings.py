@@ -20,6 +20,7 @@ from saga_fg.smoothing.random_walk import ScalarReadings, previous_rows, scalar_
 from saga_fg.smoothing.states import Lives, StateTable
 
 TELLING_PATH = 2.0  # m
+CLEAR = 3.0  # standard deviations by which a motion is no estimation error
 COURSE_NOISE = 0.1  # standard deviation between heading and direction of motion, rad
 
 
@@ -43,7 +44,7 @@ def smooth_headings(
     across = np.stack([-np.sin(course), np.cos(course)], axis=-1)
     variance_across = np.einsum("ri,rij,rj->r", across, states.covariance[:, 2:, 2:], across)
     course_variance = variance_across / np.maximum(speed, 1e-9) ** 2 + COURSE_NOISE**2
-    telling = np.flatnonzero(speed >= moving[owner])
+    telling = np.flatnonzero((speed >= moving[owner]) & (speed > CLEAR * np.sqrt(variance_across)))
     readings = [ScalarReadings(telling, course[telling], course_variance[telling])]
     yaw, known = evidence.boxes.yaw[detection], np.isfinite(evidence.boxes.yaw[detection])
     mine = detection[known]
@@ -51,7 +52,8 @@ def smooth_headings(
     axis, variance = smooth_walks(states, growth, readings, period=np.pi)
     before = previous_rows(states)
     dt = np.where(before >= 0, evidence.times[states.moment] - evidence.times[states.moment[before]], 0.0)
-    path = np.bincount(owner, speed * dt * np.cos(course - np.nan_to_num(axis)), minlength=len(lives))
+    forward = (speed * dt * np.cos(course - np.nan_to_num(axis)))[telling]
+    path = np.bincount(owner[telling], forward, minlength=len(lives))
     seen = evidence.probability[detection] * np.cos(np.where(known, yaw - axis[row], np.pi / 2))
     votes = np.bincount(owner[row], np.nan_to_num(seen), minlength=len(lives))
     backwards = np.where(np.abs(path) >= TELLING_PATH, path, votes) < 0

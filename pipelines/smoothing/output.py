@@ -1,0 +1,69 @@
+"""What a run of smoothing leaves: a folder of labels.
+
+labels.csv       a row per box (or .ndjson, .parquet)
+summary.json     how many boxes of each scene were observed, filled, extended and dropped
+tracking.json    nuScenes: the official tracking result
+VERSION/         nuScenes: tables whose annotations are the labels
+label_02/        KITTI: text as of ground truth
+results/         KITTI: the same with scores, as evaluators take it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from data_tools.atomic_files import atomic_directory
+from data_tools.kitti import KittiTracking, write_kitti_results
+from data_tools.label_files import write_kitti_labels, write_label_table, write_nuscenes_labels
+from data_tools.nuscenes import ResultMeta, write_tracking_results
+from pipelines.figures import write_figures
+from pipelines.smoothing.scene import SmoothedScene
+from saga_fg.smoothing import LabelCounts
+
+
+def write_labels(
+    directory: str | Path, runs: Iterable[SmoothedScene], suffix: str = ".csv"
+) -> tuple[SmoothedScene, ...]:
+    """Write the table of boxes and the summary; the folder is checked before the first run is asked for."""
+    with atomic_directory(directory) as folder:
+        done = tuple(runs)
+        _write_common(folder, done, suffix)
+    return done
+
+
+def write_nuscenes_run(
+    directory: str | Path,
+    runs: Iterable[SmoothedScene],
+    dataroot: str | Path,
+    version: str,
+    meta: ResultMeta,
+    suffix: str = ".csv",
+) -> tuple[SmoothedScene, ...]:
+    """Write the table, the summary, the tracking result and the annotation tables of nuScenes scenes."""
+    with atomic_directory(directory) as folder:
+        done = tuple(runs)
+        _write_common(folder, done, suffix)
+        write_tracking_results(folder / "tracking.json", [(run.scene, run.tracks) for run in done], meta)
+        write_nuscenes_labels(folder, dataroot, version, [(run.scene, run.labels) for run in done])
+    return done
+
+
+def write_kitti_run(
+    directory: str | Path, runs: Iterable[SmoothedScene], dataset: KittiTracking, suffix: str = ".csv"
+) -> tuple[SmoothedScene, ...]:
+    """Write the table, the summary, label files and results of KITTI sequences."""
+    with atomic_directory(directory) as folder:
+        done = tuple(runs)
+        _write_common(folder, done, suffix)
+        write_kitti_labels(folder / "label_02", dataset, [(run.scene, run.labels) for run in done])
+        write_kitti_results(folder / "results", dataset, [(run.scene, run.tracks) for run in done])
+    return done
+
+
+def _write_common(folder: Path, runs: Sequence[SmoothedScene], suffix: str) -> None:
+    write_label_table(folder / f"labels{suffix}", [(run.scene, run.labels) for run in runs])
+    total = LabelCounts.sum(run.counts for run in runs)
+    scenes = {run.scene.name: {**asdict(run.counts), "seconds": round(run.seconds, 3)} for run in runs}
+    write_figures(folder / "summary.json", {"total": asdict(total), "scenes": scenes})
