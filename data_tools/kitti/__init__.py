@@ -7,11 +7,13 @@ from data_tools.kitti.image_boxes import image_boxes, observation_angles
 from data_tools.kitti.labels import KittiObjects, has_box, read_kitti_labels
 from data_tools.kitti.oxts import read_poses
 from data_tools.kitti.tracking_results import kitti_result_text, write_kitti_results
+from data_tools.kitti.velodyne import KittiScans
 
 __all__ = [
     "Calibration",
     "CameraBoxes",
     "KittiObjects",
+    "KittiScans",
     "KittiTracking",
     "camera_boxes_to_world",
     "has_box",

@@ -14,6 +14,7 @@ from rich.table import Table
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_service import service
+from pipelines.cli.bench_slam import slam
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 
@@ -25,6 +26,7 @@ Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to 
 bench_app.command()(estimators)
 bench_app.command()(service)
 bench_app.command()(metrics)
+bench_app.command()(slam)
 
 
 @bench_app.callback()

@@ -1,0 +1,139 @@
+"""Scan registration: point-to-plane ICP against a local map of surfels.
+
+    minimise over T   sum_i rho( n_i . (T p_i - m_i) ),        rho(r) = s^2/2 log(1 + r^2 / s^2)      (Cauchy)
+
+p_i points of the scan, m_i and n_i mean and normal of the nearest flat surfel of the map. Each iteration pairs anew and
+takes one Gauss-Newton step x = (rotation, translation) in the scan's own frame, T <- T exp(x), with the weights
+w = 1 / (1 + r^2 / s^2) of the present residuals:
+
+    J_i = [ (p_i x R^T n_i)^T,  (R^T n_i)^T ],      (sum w J^T J) x = - sum w r J^T
+
+The covariance of x is the sandwich of robust regression, with points of one surfel, whose residuals go together, as one
+observation c:
+
+    P = H^-1 ( sum_c g_c g_c^T ) H^-1,      H = sum_i w J^T J,   g_c = sum_{i in c} w r J^T
+
+Sources: Chen and Medioni, Object modelling by registration of multiple range images, 1992; Huber and Ronchetti, Robust
+Statistics, 2nd ed. 2009, section 6.3; Liang and Zeger, Biometrika 73 (1986).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from data_tools.lidar.surfels import SurfelMap, Surfels
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import SagaError
+from saga_fg.geometry import transform_points
+from saga_fg.settings import require_positive, setting
+
+LEAST_PAIRS = 12  # twice the unknowns
+OPEN = 1e-3  # smallest share of the best-known direction's information in the worst-known one's
+
+
+class RegistrationError(SagaError):
+    """The scan does not overlap the map, or what overlaps does not fix the pose."""
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """When to stop."""
+
+    iterations: int = setting(30, "at most so many")
+    translation: float = setting(1e-3, "step below which the pose is reached, m")
+    rotation: float = setting(1e-4, "the same for the rotation, rad")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "iterations", "translation", "rotation")
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Where a scan lies in the map.
+
+    map_T_scan  (4, 4)
+    covariance  (6, 6) of (rotation, translation) in the scan's frame, rad^2 and m^2
+    residual    mean distance of the paired points from their surfels, m
+    pairs       number of them
+    iterations  it took
+    converged   whether the last step was short enough
+    """
+
+    map_T_scan: FloatArray
+    covariance: FloatArray
+    residual: float
+    pairs: int
+    iterations: int
+    converged: bool
+
+
+def register(
+    points: FloatArray,
+    surfels: SurfelMap,
+    map_T_scan: FloatArray,
+    farthest: float,
+    scale: float,
+    settings: RegistrationSettings,
+) -> Registration:
+    """Register points (N, 3) of a scan, m, in its sensor's frame, with a map.
+
+    map_T_scan  (4, 4) where the search starts
+    farthest    from a point to the mean of its surfel, above which it has none, m
+    scale       s, residual from which a point loses weight, m
+
+    Raises `RegistrationError` where fewer points than `LEAST_PAIRS` have a surfel, or their normals leave a direction
+    open.
+    """
+    T = _rigid(map_T_scan)
+    span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
+    converged, step = False, 0
+    while not converged and step < settings.iterations:
+        step += 1
+        rows, paired = surfels.nearest(transform_points(T, points), farthest)
+        J, r, w = _linearised(points[rows], paired, T, scale)
+        x = _solved(J.T @ (w[:, None] * J), -J.T @ (w * r), span)
+        T = _rigid(T @ gtsam.Pose3.Expmap(x).matrix())
+        converged = bool(np.linalg.norm(x[3:]) < settings.translation and np.linalg.norm(x[:3]) < settings.rotation)
+    J, r, w = _linearised(points[rows], paired, T, scale)
+    return Registration(T, _covariance(J, r, w, paired.voxel), float(np.abs(r).mean()), len(r), step, converged)
+
+
+def _linearised(
+    points: FloatArray, paired: Surfels, T: FloatArray, scale: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Jacobian (N, 6), residual (N,) and weight (N,) of the pairs."""
+    if len(points) < LEAST_PAIRS:
+        raise RegistrationError(f"registration: expected {LEAST_PAIRS} points near the map at least, got {len(points)}")
+    r = np.einsum("ni,ni->n", transform_points(T, points) - paired.mean, paired.normal)
+    normal = paired.normal @ T[:3, :3]
+    return np.hstack([np.cross(points, normal), normal]), r, 1 / (1 + (r / scale) ** 2)
+
+
+def _solved(H: FloatArray, g: FloatArray, span: float) -> FloatArray:
+    """The step; `span`, a typical distance of the points, m, makes rotations compare with translations."""
+    scale = np.array([span, span, span, 1.0, 1.0, 1.0])
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    if values[0] < OPEN * values[-1]:
+        raise RegistrationError("registration: the surfaces seen leave a direction of motion open")
+    return np.asarray(vectors @ ((vectors.T @ (g / scale)) / values) / scale)
+
+
+def _covariance(J: FloatArray, r: FloatArray, w: FloatArray, group: IntArray) -> FloatArray:
+    inverse = np.linalg.inv(J.T @ (w[:, None] * J))
+    _, row = np.unique(group, return_inverse=True)
+    scores = np.zeros((row.max() + 1, 6))
+    np.add.at(scores, row, (w * r)[:, None] * J)
+    groups = len(scores)
+    P = inverse @ (scores.T @ scores) @ inverse * (groups / max(groups - 6, 1))
+    return np.asarray((P + P.T) / 2)
+
+
+def _rigid(T: FloatArray) -> FloatArray:
+    """The rigid transform nearest to T: products of many drift off, and feeding them back lets that grow."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    rigid = T.copy()
+    rigid[:3, :3] = U @ Vt
+    return rigid

@@ -1,0 +1,51 @@
+"""One sweep of a LiDAR: points as the sensor gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """N points of one sweep, in the sensor's frame (x ahead, y left, z up).
+
+    points     (N, 3) m
+    intensity  (N,) strength of the echo in the sensor's own unit, NaN where it says none
+    time       (N,) s from the moment the scan is dated at, negative before it; None where the sensor says nothing
+
+    Raises `InputError` for arrays of other shapes and positions that are not finite.
+    """
+
+    points: FloatArray
+    intensity: FloatArray
+    time: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        points = checked("points", self.points, (None, 3))
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "intensity", checked("intensity", self.intensity, (len(points),), "finite-or-nan"))
+        if self.time is not None:
+            object.__setattr__(self, "time", checked("time", self.time, (len(points),)))
+
+    @classmethod
+    def of(cls, points: FloatArray) -> Self:
+        """A scan of points alone."""
+        return cls(points, np.full(len(points), np.nan))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, rows: BoolArray | IntArray) -> Self:
+        """The points of a mask or of row indices."""
+        time = None if self.time is None else self.time[rows]
+        return replace(self, points=self.points[rows], intensity=self.intensity[rows], time=time)
+
+    def within(self, nearest: float, farthest: float) -> Self:
+        """The points from `nearest` to `farthest` m away: no echoes of the vehicle itself, no lone far ones."""
+        square = np.einsum("ni,ni->n", self.points, self.points)
+        return self.select((square >= nearest**2) & (square <= farthest**2))

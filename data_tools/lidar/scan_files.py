@@ -1,0 +1,119 @@
+"""Scans from files, by the ending of their name.
+
+    .bin      KITTI: float32 x, y, z, intensity of each point, without a header
+    .pcd.bin  nuScenes: float32 x, y, z, intensity, ring of each point, without a header
+    .pcd      Point Cloud Library, read by Open3D; the field `intensity` is kept
+    .ply      polygon file format, read by Open3D; the property `intensity` is kept
+    .npy      an array (N, 3) or wider: x, y, z and, in a fourth column, intensity
+    .npz      arrays `points` (N, 3), and optionally `intensity` (N,) and `time` (N,)
+
+Points are metres in the sensor's frame. Points that are not finite mean "no echo" in PCD files and are left out there;
+elsewhere they are errors. Sources: development kits of KITTI (https://www.cvlibs.net/datasets/kitti) and nuScenes
+(https://github.com/nutonomy/nuscenes-devkit, LidarPointCloud).
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.lidar.scan import Scan
+from data_tools.located import located
+from data_tools.open3d_loader import load_open3d
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+
+
+def read_scan(path: str | Path) -> Scan:
+    """Read one scan. Raises `InputError` naming the file and what was expected of it."""
+    path = Path(path)
+    name = path.name.lower()
+    ending = next((ending for ending in _READERS if name.endswith(ending)), None)
+    if ending is None:
+        raise InputError(f"{path}: expected a name that ends in {', '.join(_READERS)}")
+    if not path.is_file():
+        raise InputError(f"{path}: cannot be read: there is no such file")
+    with located(str(path)):
+        return _READERS[ending](path)
+
+
+def _kitti(path: Path) -> Scan:
+    return _of_columns(_records(path, 4))
+
+
+def _nuscenes(path: Path) -> Scan:
+    return _of_columns(_records(path, 5))
+
+
+def _records(path: Path, columns: int) -> FloatArray:
+    content = _bytes(path)
+    size = 4 * columns
+    if len(content) % size:
+        raise InputError(f"expected records of {size} bytes ({columns} float32 a point), got {len(content)} bytes")
+    return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}") from error
+
+
+def _array(path: Path) -> Scan:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"expected an array of numbers: {error}") from error
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+        raise InputError(f"expected numbers (N, 3) or wider, got {array.dtype} {array.shape}")
+    return _of_columns(np.asarray(array, dtype=np.float64))
+
+
+def _arrays(path: Path) -> Scan:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            columns = {name: file[name] for name in ("points", "intensity", "time") if name in file}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"expected an archive of arrays: {error}") from error
+    if "points" not in columns:
+        raise InputError("expected the array points (N, 3)")
+    scan = Scan.of(columns["points"])
+    return Scan(scan.points, columns.get("intensity", scan.intensity), columns.get("time"))
+
+
+def _cloud(path: Path) -> Scan:
+    open3d = load_open3d()
+    if not _bytes(path).strip():
+        raise InputError("expected a point cloud, the file is empty")
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        try:
+            cloud = open3d.t.io.read_point_cloud(str(path))
+        except RuntimeError as error:
+            raise InputError(f"expected a point cloud that Open3D can read: {str(error).splitlines()[-1]}") from error
+    if "positions" not in cloud.point:
+        raise InputError("expected a point cloud that Open3D can read, with x, y, z of each point")
+    points = cloud.point["positions"].numpy().astype(np.float64)
+    scan = Scan.of(points[np.isfinite(points).all(axis=1)])
+    if "intensity" not in cloud.point:
+        return scan
+    intensity = cloud.point["intensity"].numpy().astype(np.float64).reshape(len(points))
+    return Scan(scan.points, intensity[np.isfinite(points).all(axis=1)])
+
+
+def _of_columns(columns: FloatArray) -> Scan:
+    intensity = columns[:, 3] if columns.shape[1] > 3 else np.full(len(columns), np.nan)
+    return Scan(columns[:, :3], intensity)
+
+
+_READERS: dict[str, Callable[[Path], Scan]] = {
+    ".pcd.bin": _nuscenes,
+    ".bin": _kitti,
+    ".pcd": _cloud,
+    ".ply": _cloud,
+    ".npy": _array,
+    ".npz": _arrays,
+}

@@ -1,0 +1,58 @@
+"""How sharp is the map that a trajectory makes of its scans? A measure that needs no true trajectory.
+
+A scan is laid over the others around it: each of its points q has k nearest neighbours in their map, with mean c and
+normal n (of the least spread); its residual is | n . (q - c) |. Where poses are wrong, surfaces are double or thick and
+residuals grow. The scan itself is not part of the map, so that no scan explains itself. Compare Razlaw et al.,
+Evaluation of registration methods for sparse 3D laser scans, ECMR 2015 (mean plane variance).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from data_tools.lidar.voxels import voxel_downsample
+from saga_fg.arrays import FloatArray
+from saga_fg.geometry import transform_points
+
+NEIGHBOURS = 8
+SPACING = 0.2  # m, of the map's points
+THINNED = 0.5  # m, of the scan's
+NEAREST_WITHIN = 0.5  # m; a point without a neighbour so near is seen for the first time
+FARTHEST = 50.0  # m from the sensor: beyond, rings are too far apart for planes
+
+
+def scan_to_map_residual(
+    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, around: int = 10, every: int = 5
+) -> float:
+    """Mean residual, m, of every fifth scan in the map of the ten before it and the ten after it; NaN for one scan.
+
+    clouds         K scans without skew, points (N, 3) in the sensor's frame
+    world_T_lidar  (K, 4, 4)
+    """
+    thin = [cloud[voxel_downsample(cloud, SPACING)] for cloud in clouds]
+    residuals = [np.empty(0)]
+    for k in range(0, len(thin), every):
+        others = [j for j in range(max(0, k - around), min(len(thin), k + around + 1)) if j != k]
+        if others:
+            map_points = np.concatenate([transform_points(world_T_lidar[j], thin[j]) for j in others])
+            residuals.append(_residuals(thin[k], map_points, world_T_lidar[k]))
+    found = np.concatenate(residuals)
+    return float(found.mean()) if len(found) else float("nan")
+
+
+def _residuals(scan: FloatArray, map_points: FloatArray, world_T_lidar: FloatArray) -> FloatArray:
+    scan = scan[np.linalg.norm(scan, axis=1) <= FARTHEST]
+    points = transform_points(world_T_lidar, scan[voxel_downsample(scan, THINNED)])
+    map_points = map_points[voxel_downsample(map_points, SPACING)]
+    if len(map_points) < NEIGHBOURS:
+        return np.empty(0)
+    distance, row = cKDTree(map_points).query(points, k=NEIGHBOURS)
+    near = distance[:, 0] <= NEAREST_WITHIN
+    around = map_points[row[near]]
+    mean = around.mean(axis=1)
+    off = around - mean[:, None]
+    normal = np.linalg.eigh(off.swapaxes(1, 2) @ off)[1][:, :, 0]
+    return np.asarray(np.abs(np.einsum("ni,ni->n", points[near] - mean, normal)))

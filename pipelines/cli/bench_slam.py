@@ -1,0 +1,73 @@
+"""`saga-fg bench slam`: LiDAR odometry beside KISS-ICP."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.cli.options import Verbose
+from pipelines.cli.reporting import progress_bar
+
+if TYPE_CHECKING:
+    from pipelines.bench.slam import SlamRow
+
+
+def slam(
+    dataroot: Annotated[Path, typer.Option("--dataroot", help="KITTI tracking: training/, or oxts/ and velodyne/.")],
+    sequence: Annotated[str, typer.Option("--sequence", help="A sequence with LiDAR scans.")] = "0000",
+    scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
+    kiss: Annotated[
+        bool, typer.Option("--kiss/--no-kiss", help="With KISS-ICP, of the extra bench, or ours alone.")
+    ] = True,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
+    ] = None,
+    verbose: Verbose = False,
+) -> None:
+    """LiDAR odometry against KISS-ICP, on the same scans in turn.
+
+    RPE is the error over 10 m against GPS/IMU, which is itself not exact; the residual of scans in the map of their
+    neighbours needs no reference. Both are printed for the scans as recorded and for de-skewed ones.
+
+    \b
+    Example:
+      saga-fg bench slam --dataroot data/kitti --sequence 0000
+    """
+    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.kitti import KittiScans
+    from pipelines.bench.slam import bench_slam
+
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress)
+    _print(rows, sequence)
+    if json_file is not None:
+        write_text(json_file, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+
+def _print(rows: list[SlamRow], sequence: str) -> None:
+    columns = ("scans", "method", "RPE, m per 10 m", "RPE, deg per 10 m", "end, m", "residual, mm", "ms a scan")
+    table = Table(*columns, title=f"sequence {sequence}: odometry against GPS/IMU", title_justify="left")
+    for row in rows:
+        e = row.errors
+        figures = (e.relative_translation, 57.29578 * e.relative_rotation, e.end_error, 1e3 * row.residual)
+        table.add_row(row.case, row.contender, *(f"{x:.3f}" for x in figures), f"{row.milliseconds:.1f}")
+    console = Console()
+    Console(width=max(console.width, 110)).print(table)
+    for ours, theirs in itertools.pairwise(rows):
+        if ours.case == theirs.case:
+            worse = 100 * (ours.errors.relative_translation - theirs.errors.relative_translation)
+            duller = 100 * (ours.residual / theirs.residual - 1)
+            share = ours.milliseconds / theirs.milliseconds
+            typer.echo(
+                f"{ours.case}: RPE {worse:+.1f} cm per 10 m, residual {duller:+.1f} %, "
+                f"time {share:.2f} of {theirs.contender}'s"
+            )

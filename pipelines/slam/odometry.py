@@ -1,0 +1,144 @@
+"""LiDAR odometry: where the sensor moves to, scan by scan.
+
+    predict    T- = T_(k-1) exp(dt xi_(k-1))                     the velocity of the step before goes on
+    de-skew    by xi_(k-1), where the points have times
+    register   T = point-to-plane ICP of a thinned scan against the local map of surfels, started at T-
+    adapt      e_k = || trans D || + 2 r sin(angle(D) / 2),  D = (T-)^-1 T,  r a typical range
+               sigma_k = root mean square of the e so far, not below a floor
+    extend     the map, by scans that moved on since the last that did (keyframes)
+
+A point may lie as far from the mean of its surfel as a voxel is wide, and three sigma more; residuals above
+max(floor, sigma) lose weight. The scheme (constant velocity, adaptive threshold, local voxel map) is that of Vizzo et
+al., KISS-ICP, RA-L 2023; planes in place of points need fewer of them, and give the covariance of the pose.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from data_tools.lidar import (
+    Registration,
+    RegistrationError,
+    RegistrationSettings,
+    Scan,
+    SurfelMap,
+    constant_velocity,
+    deskewed,
+    register,
+    voxel_downsample,
+)
+from data_tools.trajectories import rotation_angle
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.settings import require_positive, setting, settings_group
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """Sizes for a vehicle among houses; halve `surfel` indoors."""
+
+    nearest: float = setting(3.0, "points nearer than this are the vehicle's own, m")
+    reach: float = setting(100.0, "points and surfels farther than this are left out, m")
+    surfel: float = setting(1.0, "voxel of the local map, m")
+    map_spacing: float = setting(0.25, "a scan is thinned to this before it goes into the map, m")
+    scan_spacing: float = setting(1.5, "and to this before it is registered, m")
+    first_deviation: float = setting(1.0, "of the first motion from standing still, m")
+    deviation_floor: float = setting(0.1, "sigma is never below this, m")
+    keyframe_distance: float = setting(0.5, "a scan this far from the last keyframe is the next, m")
+    keyframe_rotation: float = setting(0.05, "or turned by this, rad")
+    lost_deviation: float = setting(1.0, "standard deviation of a motion that was only predicted, m and rad")
+    registration: RegistrationSettings = settings_group(RegistrationSettings, "of a scan with the map")
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self, "nearest", "reach", "surfel", "map_spacing", "scan_spacing", "first_deviation", "deviation_floor",
+            "keyframe_distance", "keyframe_rotation", "lost_deviation",
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryStep:
+    """One scan placed.
+
+    timestamp    s
+    map_T_lidar  (4, 4); the map's frame is the sensor's of the first scan
+    covariance   (6, 6) of the motion since the scan before, (rotation, translation) in the scan's frame, rad^2 and m^2
+    scan         without skew, points too near and too far left out
+    keyframe     whether it went into the map
+    registration None for the first scan, and for one that could not be registered and lies where it was predicted
+    """
+
+    timestamp: float
+    map_T_lidar: FloatArray
+    covariance: FloatArray
+    scan: Scan
+    keyframe: bool
+    registration: Registration | None
+
+
+class LidarOdometry:
+    """Takes scans in order of time and says where each was taken."""
+
+    def __init__(self, settings: OdometrySettings | None = None) -> None:
+        self.settings = settings or OdometrySettings()
+        self._map = SurfelMap(self.settings.surfel, self.settings.reach)
+        self._last: OdometryStep | None = None
+        self._keyframe = np.eye(4)
+        self._velocity = np.zeros(6)  # rad/s, m/s, in the sensor's frame
+        self._squares, self._count = self.settings.first_deviation**2, 1
+
+    @property
+    def deviation(self) -> float:
+        """Sigma: how far a typical point lies from where the constant velocity says, m."""
+        return max(self.settings.deviation_floor, float(np.sqrt(self._squares / self._count)))
+
+    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+        """Place the next scan. Raises `InputError` for one that is not later than the one before."""
+        s, last = self.settings, self._last
+        scan = scan.within(s.nearest, s.reach)
+        if scan.time is not None:
+            scan = deskewed(scan, self._velocity)
+        if last is None:
+            placed = OdometryStep(timestamp, np.eye(4), np.zeros((6, 6)), scan, True, None)
+        else:
+            if not timestamp > last.timestamp:
+                raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
+            placed = self._placed(last, scan, timestamp)
+        self._last = placed
+        if placed.keyframe:
+            self._keyframe = placed.map_T_lidar
+            points = scan.points[voxel_downsample(scan.points, s.map_spacing)]
+            self._map.add(transform_points(placed.map_T_lidar, points), placed.map_T_lidar[:3, 3])
+        return placed
+
+    def _placed(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
+        s, dt = self.settings, timestamp - last.timestamp
+        motion = gtsam.Pose3.Expmap(self._velocity * dt).matrix()
+        predicted = last.map_T_lidar @ motion
+        points = scan.points[voxel_downsample(scan.points, s.scan_spacing)]
+        sigma = self.deviation
+        try:
+            found = register(points, self._map, predicted, s.surfel + 3 * sigma, 0.1, s.registration)
+        except RegistrationError as error:
+            _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
+            return OdometryStep(timestamp, predicted, np.eye(6) * s.lost_deviation**2, scan, False, None)
+        self._adapt(inverse_transform(predicted) @ found.map_T_scan, points)
+        self._velocity = constant_velocity(inverse_transform(last.map_T_lidar) @ found.map_T_scan, dt)
+        moved = inverse_transform(self._keyframe) @ found.map_T_scan
+        keyframe = bool(
+            np.linalg.norm(moved[:3, 3]) >= s.keyframe_distance or rotation_angle(moved[:3, :3]) >= s.keyframe_rotation
+        )
+        return OdometryStep(timestamp, found.map_T_scan, found.covariance, scan, keyframe, found)
+
+    def _adapt(self, deviation: FloatArray, points: FloatArray) -> None:
+        span = float(np.median(np.linalg.norm(points, axis=1)))
+        angle = float(rotation_angle(deviation[:3, :3]))
+        self._squares += (float(np.linalg.norm(deviation[:3, 3])) + 2 * span * np.sin(angle / 2)) ** 2
+        self._count += 1

@@ -1,0 +1,60 @@
+"""A street for tests: houses on both sides, parked cars, poles, kerbs, and a drive along it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_tools.lidar import Scan, constant_velocity
+from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
+from saga_fg.boxes import Boxes
+from saga_fg.geometry import inverse_transform, yaw_transform
+
+SENSOR_HEIGHT = 1.8
+SMALL = ScannerSettings(rings=24, columns=360)
+
+
+def street(seed: int = 0) -> StandingWorld:
+    """Houses of different depth along a street on the x axis, 16 m wide, and across its end."""
+    rng = np.random.default_rng(seed)
+    label, position, size = [], [], []
+    for side in (-1.0, 1.0):
+        x = -60.0
+        while x < 110.0:
+            length, depth = rng.uniform(8.0, 20.0), rng.uniform(4.0, 8.0)
+            label.append("house")
+            position.append((x + length / 2, side * (8.0 + rng.uniform(0.0, 2.0) + depth / 2), 3.0))
+            size.append((length, depth, 6.0))
+            x += length + rng.uniform(2.0, 6.0)
+        for x in np.arange(-20.0, 60.0, 11.0) + rng.uniform(0.0, 3.0):
+            label.append("car")
+            position.append((float(x), side * 5.0, 0.75))
+            size.append((4.4, 1.8, 1.5))
+    label.append("house")
+    position.append((120.0, 0.0, 3.0))
+    size.append((6.0, 60.0, 6.0))
+    poles = np.array([[x, side * 7.0, 0.15, 5.0] for side in (-1, 1) for x in np.arange(-30.0, 80.0, 17.0) + 4 * side])
+    n = len(label)
+    return StandingWorld(Boxes.of(label, position, size, np.zeros(n), np.zeros((n, 2))), poles)
+
+
+def drive(count: int, speed: float = 8.0, turn_rate: float = 0.05, period: float = 0.1) -> np.ndarray:
+    """world_T_lidar (count, 4, 4) of a sensor at `SENSOR_HEIGHT` that drives a gentle bend."""
+    poses = [yaw_transform(-5.0, -1.5, SENSOR_HEIGHT, 0.0)]
+    for k in range(count - 1):
+        rate = turn_rate * np.sin(2 * np.pi * k / 40)
+        poses.append(poses[-1] @ yaw_transform(speed * period, 0.0, 0.0, rate * period))
+    return np.array(poses)
+
+
+def scans(
+    world: StandingWorld, poses: np.ndarray, seed: int = 0, settings: ScannerSettings = SMALL, skewed: bool = True
+) -> list[Scan]:
+    """One scan at each pose, skewed by the motion to the next."""
+    rng = np.random.default_rng(seed)
+    period = settings.period
+    taken = []
+    for k, pose in enumerate(poses):
+        a, b = min(k, len(poses) - 2), min(k, len(poses) - 2) + 1
+        velocity = constant_velocity(inverse_transform(poses[a]) @ poses[b], period) if skewed else None
+        taken.append(simulate_scan(world, pose, rng, settings, velocity))
+    return taken

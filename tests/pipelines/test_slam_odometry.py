@@ -1,0 +1,123 @@
+"""LiDAR odometry on simulated drives, where the true poses are known, and beside KISS-ICP."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from street import drive, scans, street
+from typer.testing import CliRunner
+
+from data_tools.kitti import KittiScans
+from data_tools.lidar import Scan
+from data_tools.trajectories import Trajectory, trajectory_errors
+from pipelines.bench.slam import bench_slam
+from pipelines.cli import app
+from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+
+PERIOD = 0.1
+
+
+def run(taken: list[Scan]) -> list[OdometryStep]:
+    odometry = LidarOdometry()
+    return [odometry.step(scan, PERIOD * k) for k, scan in enumerate(taken)]
+
+
+def trajectory(poses: FloatArray) -> Trajectory:
+    return Trajectory(PERIOD * np.arange(len(poses)), poses)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_drive_is_followed_to_centimetres(seed: int) -> None:
+    poses = drive(30)
+    steps = run(scans(street(seed), poses, seed))
+    estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
+    errors = trajectory_errors(trajectory(estimate), trajectory(poses))
+    assert errors.relative_translation < 0.03
+    assert errors.relative_rotation < 0.002
+    assert all(step.registration is not None and step.registration.converged for step in steps[1:])
+    assert steps[0].keyframe
+    assert sum(step.keyframe for step in steps) == len(steps)
+    for step in steps[1:]:
+        assert np.linalg.eigvalsh(step.covariance)[0] > 0
+
+
+def test_poses_stay_rigid_however_long_the_chain() -> None:
+    """A rotation a little off, fed back through the predicted motion, would be off by everything within forty scans."""
+    world, poses = street(0), np.repeat(drive(2, speed=0.5)[:1], 45, axis=0)
+    last = run(scans(world, poses, skewed=False))[-1].map_T_lidar
+    np.testing.assert_allclose(last[:3, :3] @ last[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(last, np.eye(4), atol=0.02)
+
+
+def test_a_scan_without_points_lies_where_it_was_predicted(caplog: pytest.LogCaptureFixture) -> None:
+    poses = drive(8)
+    taken = scans(street(0), poses)
+    taken[5] = Scan.of(np.empty((0, 3)))
+    with caplog.at_level(logging.WARNING):
+        steps = run(taken)
+    assert "the motion of the one before goes on" in caplog.text
+    assert steps[5].registration is None
+    assert not steps[5].keyframe
+    assert np.linalg.eigvalsh(steps[5].covariance)[0] > 0.1
+    estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
+    assert np.linalg.norm(estimate[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.1
+
+
+def test_time_runs_forwards_and_settings_are_checked() -> None:
+    odometry = LidarOdometry()
+    scan = scans(street(0), drive(2))[0]
+    odometry.step(scan, 1.0)
+    with pytest.raises(InputError, match=r"timestamp: expected one after 1\.0"):
+        odometry.step(scan, 1.0)
+    with pytest.raises(InputError, match="surfel: expected"):
+        OdometrySettings(surfel=0.0)
+
+
+class SimulatedScans:
+    """A drive as the benchmark takes it."""
+
+    def __init__(self, count: int) -> None:
+        self.world_T_ego: FloatArray = drive(count)
+        self.timestamps: FloatArray = PERIOD * np.arange(count)
+        self.ego_T_lidar: FloatArray = np.eye(4)
+        self._scans = scans(street(2), self.world_T_ego, 2)
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def __getitem__(self, row: int) -> Scan:
+        return self._scans[row]
+
+
+def test_the_benchmark_measures_both_on_the_same_scans() -> None:
+    pytest.importorskip("kiss_icp", reason="kiss-icp comes with the extra bench")
+    rows = bench_slam(SimulatedScans(20))
+    assert [(row.case, row.contender) for row in rows] == [
+        (case, name) for case in ("as recorded", "de-skewed") for name in ("saga-fg", "kiss-icp")
+    ]
+    for row in rows:
+        assert row.errors.poses == 20
+        assert np.isfinite(row.errors.relative_translation)
+        assert 0 < row.residual < 0.1
+        assert row.milliseconds > 0
+    assert all(
+        row.errors.relative_translation < 0.05 for row in rows if row.contender == "saga-fg" and row.case == "de-skewed"
+    )
+
+
+def test_bench_slam_prints_and_writes_the_figures(recordings: Path, tmp_path: Path) -> None:
+    kitti = recordings / "kitti"
+    assert len(KittiScans(kitti, "0000")) == 90
+    result = CliRunner().invoke(
+        app,
+        ["bench", "slam", "--dataroot", str(kitti), "--scans", "30", "--no-kiss", "--json", str(tmp_path / "f.json")],
+    )
+    assert result.exit_code == 0, result.output
+    assert "as recorded" in result.stdout
+    assert "de-skewed" in result.stdout
+    assert (tmp_path / "f.json").read_text().count('"contender": "saga-fg"') == 2
