@@ -15,6 +15,7 @@ from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
+from pipelines.cli.bench_streaming import streaming
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 
@@ -27,6 +28,7 @@ bench_app.command()(estimators)
 bench_app.command()(service)
 bench_app.command()(metrics)
 bench_app.command()(slam)
+bench_app.command()(streaming)
 
 
 @bench_app.callback()

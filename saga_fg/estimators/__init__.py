@@ -13,6 +13,7 @@ from saga_fg.estimators.recording import GaussNewtonSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
 from saga_fg.estimators.sighting import Observations
 from saga_fg.estimators.smoothed import Smoothed
+from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 
 __all__ = [
     "BatchSmoother",
@@ -29,6 +30,8 @@ __all__ = [
     "NodeMotion",
     "Observations",
     "Smoothed",
+    "WindowSettings",
+    "WindowedSmoother",
     "kalman_predict",
     "kalman_update",
     "rts_smooth",

@@ -11,6 +11,11 @@ begin or end. Sources: Bierman, Fixed interval smoothing with discrete measureme
 and Koopman, Time Series Analysis by State Space Methods (2012), section 4.4. It gives the marginals of Rauch, Tung
 and Striebel (1965).
 
+What may still come after the last moment T acts on earlier ones through x_T alone, and moves it by d ~ N(0, D),
+D <= P_T. So it moves the smoothed mean of an earlier moment by P G^T P_T^-1 d, where G is the product of all A and F
+from there to T (its transition to x_T, as corrections leave it), with a covariance of at most P M P, M = G^T P_T^-1 G:
+the recursion of N from M = P_T^-1 instead of 0 and without the terms B^T B.
+
 Components: what is uncorrelated when it is filtered may be joined by a later interaction, and is then correlated
 given the future. Covariances are therefore smoothed over components joined through all moments.
 """
@@ -122,20 +127,39 @@ class MarginalCovariances:
 
 def smoothed_covariances(passes: Sequence[Pass]) -> Iterator[SmoothedCovariance]:
     """Smoothed covariance of every moment, from the last to the first."""
+    return _swept(passes, future_known=False)
+
+
+def future_influence(passes: Sequence[Pass]) -> Iterator[FloatArray]:
+    """For every moment from the last to the first: (D,) standard deviations, of each component of its joint state.
+
+    Nothing that is measured after the last moment can be expected to move a smoothed mean by more.
+    """
+    for reduced in _swept(passes, future_known=True):
+        variance: FloatArray = np.empty(reduced.partition.layout.size)
+        for places, P, M in zip(reduced.partition.groups, reduced.P, reduced.N, strict=True):
+            variance[places] = ((P @ M) * P).sum(axis=2)
+        yield np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _swept(passes: Sequence[Pass], future_known: bool) -> Iterator[SmoothedCovariance]:
+    """N of every moment from the last to the first, or M with `future_known`."""
     partitions = joined_partitions(passes)
     after: BlockDiagonal | None = None  # N of the next moment, before it saw anything, over the nodes carried there
     after_partition: Partition | None = None
     for k in range(len(passes) - 1, -1, -1):
         state, partition = passes[k], partitions[k]
         x = state.filtered.over(partition)
-        if after is None or after_partition is None or state.dynamics is None:
-            N = zeros(partition)
-        else:
+        if after is not None and after_partition is not None and state.dynamics is not None:
             back = state.dynamics.pulled_back(after_partition, after)
             N = _moved(back, after_partition, partition)
+        elif future_known:
+            N = tuple(np.asarray(np.linalg.pinv(P, hermitian=True), dtype=np.float64) for P in x.blocks)
+        else:
+            N = zeros(partition)
         yield SmoothedCovariance(partition, x.blocks, N)
         for gain in reversed(state.gains):
-            N = _before(gain, N, state.filtered, partition)
+            N = _before(gain, N, state.filtered, partition, 0.0 if future_known else 1.0)
         after_partition = partition
         if state.carried < len(partition.layout):
             carried = np.arange(state.carried)
@@ -179,8 +203,8 @@ def _moved(blocks: BlockDiagonal, old: Partition, new: Partition) -> BlockDiagon
     return regrouped(blocks, old, new, np.array([where.get(int(node), -1) for node in old.layout.nodes]))
 
 
-def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition) -> BlockDiagonal:
-    """N before a correction, from N after it."""
+def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition, told: float) -> BlockDiagonal:
+    """N before a correction, from N after it; told: 1 to count what the correction tells, 0 not to."""
     fine = x.partition
     node = np.searchsorted(fine.layout.offsets, gain.places[:, 0], side="right") - 1
     number, rows = int(fine.group[node[0]]), fine.row[node]
@@ -190,7 +214,7 @@ def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition
         N_active = N[number][rows]
         W_N = gain.W @ N_active
         inner = W_N @ np.swapaxes(gain.W, 1, 2)
-        half = B_T @ ((np.eye(B.shape[1]) + inner) @ B / 2 - W_N)
+        half = B_T @ ((told * np.eye(B.shape[1]) + inner) @ B / 2 - W_N)
         changed = N[number].copy()
         changed[rows] = N_active + half + np.swapaxes(half, 1, 2)
         return (*N[:number], changed, *N[number + 1 :])
@@ -201,7 +225,7 @@ def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition
     A[number] = A[number].copy()
     A[number][rows] -= np.swapaxes(gain.W, 1, 2) @ B
     C = list(zeros(fine))
-    C[number][rows] = B_T @ B
+    C[number][rows] = told * (B_T @ B)
     every = np.arange(len(fine.layout))
     A_joined, C_joined = regrouped(tuple(A), fine, partition, every), regrouped(tuple(C), fine, partition, every)
     products = (np.swapaxes(a, 1, 2) @ n @ a + c for a, n, c in zip(A_joined, N, C_joined, strict=True))

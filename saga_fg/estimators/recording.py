@@ -190,6 +190,10 @@ class Recording:
         k = 0
         while k + 1 < len(self._moments) and self._moments[k + 1].time <= time + _SAME_TIME:
             k += 1
+        self.drop(k)
+
+    def drop(self, k: int) -> None:
+        """Drop the first k moments; what they told becomes the prior."""
         if k == 0:
             return
         self.solve()

@@ -1,0 +1,58 @@
+"""`saga-fg bench streaming`: memory and time of smoothing a recording as it goes by."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.cli.options import Verbose
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
+
+
+def streaming(
+    objects: Annotated[int, typer.Option("--objects", min=5, help="Objects at any time.")] = 200,
+    seconds: Annotated[float, typer.Option("--seconds", min=1.0, help="Length of the recording.")] = 300.0,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, help="Frames a second.")] = 10.0,
+    compared: Annotated[
+        float, typer.Option("--compared", min=1.0, help="Seconds of it that are compared with the batch smoother.")
+    ] = 20.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the traffic.")] = 0,
+    json_file: JsonFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """What smoothing a recording without an end takes: memory, time, and what is lost against the whole at once.
+
+    Platoons of cars that come, go and are hidden at times, drawn from the model; sliding windows give out moments as
+    they become final.
+
+    \b
+    Examples:
+      saga-fg bench streaming
+      saga-fg bench streaming --seconds 3600      # an hour
+    """
+    from data_tools.atomic_files import check_writable, write_text
+    from pipelines.bench.streaming import StreamingBenchSettings, bench_streaming
+
+    settings = StreamingBenchSettings(objects, seconds, rate, compared=compared, seed=seed)
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        result = bench_streaming(settings, progress=progress)
+    table = Table("recorded, s", "memory, MB", "moments held", "CPU, s", title=f"{objects} objects at {rate:g} Hz")
+    for row in result.rows:
+        table.add_row(f"{row.recorded:.0f}", f"{row.memory:.0f}", str(row.held), f"{row.cpu:.1f}")
+    Console().print(table)
+    memory = f"peak memory {result.peak:.0f} MB, growth over the second half {result.growth:+.0f} MB"
+    typer.echo(f"{result.moments} moments; {memory}; {result.ratio:.3f} s of CPU time a second")
+    typer.echo(f"RMSE {result.rmse:.3f} m, ANEES {result.anees:.3f}")
+    typer.echo(
+        f"largest difference from the batch smoother in {compared:g} s: {result.largest_difference:.1e} m or m/s"
+    )
+    if json_file is not None:
+        write_text(json_file, json.dumps({"settings": asdict(settings), **asdict(result)}, indent=1) + "\n")
