@@ -13,9 +13,11 @@ from rich.table import Table
 
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_metrics import metrics
+from pipelines.cli.bench_paper import paper
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
 from pipelines.cli.bench_streaming import streaming
+from pipelines.cli.bench_tracking import tracking
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 
@@ -29,6 +31,8 @@ bench_app.command()(service)
 bench_app.command()(metrics)
 bench_app.command()(slam)
 bench_app.command()(streaming)
+bench_app.command()(paper)
+bench_app.command()(tracking)
 
 
 @bench_app.callback()

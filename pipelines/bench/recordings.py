@@ -1,0 +1,180 @@
+"""Sets of recordings to compare trackers on, each with the figures that its kind is judged by."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from data_tools.kitti import KittiTracking, write_kitti_results
+from data_tools.kitti.scored_sequences import read_scored_sequences
+from data_tools.metrics import (
+    KittiTrackingSequence,
+    LabelErrors,
+    SceneMetrics,
+    TrackTable,
+    kitti_tracking_figures,
+    label_errors,
+    nuscenes_tracking_metrics,
+    scene_metrics,
+)
+from data_tools.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from pipelines.config import Family
+from pipelines.evaluation.kitti import CLASSES, kitti_label_errors
+from pipelines.evaluation.nuscenes import nuscenes_label_errors
+from pipelines.evaluation.placed_detections import placed_detections
+from pipelines.tracking import TrackedScene
+from saga_fg.dataset import Dataset
+from saga_fg.errors import InputError
+
+VERSION = "v1.0-mini"
+Runs = Mapping[str, TrackedScene]
+"""A tracker's output by scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """How good a tracker is on a set.
+
+    figures_of  headline figures of some scenes, by their numbers; a number may occur more than once
+    errors      at the labels, scene by scene
+    """
+
+    figures_of: Callable[[Sequence[int]], dict[str, float]]
+    errors: tuple[LabelErrors, ...]
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Headline figures of all scenes."""
+        return self.figures_of(range(len(self.errors)))
+
+
+class RecordingSet(Protocol):
+    """Scenes of one kind, with ground truth."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def family(self) -> Family: ...
+    @property
+    def dataset(self) -> Dataset: ...
+
+    def score(self, runs: Runs) -> Score:
+        """Judge a tracker's output on all scenes."""
+        ...
+
+
+class NuScenesSet:
+    """Scenes in the nuScenes layout, judged by the official metrics."""
+
+    family: Family = "nuscenes"
+
+    def __init__(self, name: str, dataroot: Path, detections: Mapping[str, Path], split: str) -> None:
+        """Raises `InputError` for missing or broken files."""
+        self.name, self._dataroot = name, dataroot
+        scenes = split_scenes(dataroot, VERSION, split)
+        self.dataset = NuScenes(dataroot, VERSION, detections, scenes, ground_truth=True)
+
+    def score(self, runs: Runs) -> Score:
+        """Write the official result, read it back, and score it."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "tracks.json"
+            write_tracking_results(path, ((run.scene, run.tracks) for run in runs.values()), self.dataset.meta)
+            scored = read_scored_scenes(path, self._dataroot, VERSION, tuple(runs))
+        scenes = list(scored.values())
+
+        def figures_of(rows: Sequence[int]) -> dict[str, float]:
+            f = nuscenes_tracking_metrics([scenes[row] for row in rows]).overall
+            return {"AMOTA": f.amota, "AMOTP": f.amotp, "MOTA": f.mota, "IDS": f.ids, "FRAG": f.frag}
+
+        errors = (nuscenes_label_errors(scene, placed_detections(runs[name].scene)) for name, scene in scored.items())
+        return Score(figures_of, tuple(errors))
+
+
+class KittiSet:
+    """KITTI sequences, judged by the 3D metrics averaged over recall."""
+
+    family: Family = "kitti"
+
+    def __init__(self, name: str, dataroot: Path, detections: Path, sequences: Sequence[str] | None = None) -> None:
+        """Raises `InputError` for missing files."""
+        self.name, self._dataroot, self._detections = name, dataroot, detections
+        self.dataset = KittiTracking(dataroot, detections, sequences, ground_truth=True)
+
+    def score(self, runs: Runs) -> Score:
+        """Write the official results, read them back, and score them."""
+        with tempfile.TemporaryDirectory() as folder:
+            results = Path(folder) / "results"
+            write_kitti_results(results, self.dataset, ((run.scene, run.tracks) for run in runs.values()))
+            scored = read_scored_sequences(results, self._dataroot, tuple(runs), self._detections)
+        pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
+
+        def figures_of(rows: Sequence[int]) -> dict[str, float]:
+            figures: dict[str, float] = {}
+            for label, iou in (*((label, 0.25) for label in CLASSES), ("car", 0.5)):
+                f = kitti_tracking_figures([pairs[row] for row in rows], label, iou)
+                if f is not None:
+                    name = label if iou == 0.25 else f"{label} at {iou:g}"
+                    figures |= {f"{name} sAMOTA": f.samota, f"{name} MOTA": f.mota, f"{name} IDS": float(f.ids)}
+            return figures
+
+        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES, True) for each in scored.values()))
+
+
+class SimulatedSet:
+    """Simulated traffic, judged against its exact truth; hidden objects by the track that last followed them."""
+
+    name = "simulated"
+    family: Family = "simulated"
+
+    def __init__(self, scenes: int, seed: int = 0, settings: SimulatorSettings | None = None) -> None:
+        self.dataset = SimulatedTraffic(settings, scenes, seed)
+
+    def score(self, runs: Runs) -> Score:
+        """Compare with the truth at every moment."""
+        metrics, errors = [], []
+        for run in runs.values():
+            truth = run.scene.ground_truth
+            assert truth is not None
+            metrics.append(scene_metrics(truth, run.tracks))
+            labels = TrackTable.of_annotations(truth, hidden=False)
+            errors.append(label_errors(labels, TrackTable.of_tracks(run.tracks), labels.boxes.velocity))
+
+        def figures_of(rows: Sequence[int]) -> dict[str, float]:
+            m = SceneMetrics.pool(metrics[row] for row in rows)
+            return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
+
+        return Score(figures_of, tuple(errors))
+
+
+def recording_set(name: str, data: Path | None, scenes: int) -> RecordingSet:
+    """A set by name; `data` holds nuscenes/ and kitti/ with their detections, `scenes` simulated ones are made.
+
+    Raises `InputError` for an unknown name or missing recordings.
+    """
+    if name == "simulated":
+        return SimulatedSet(scenes)
+    if name not in SETS:
+        raise InputError(f"unknown set {name!r}: expected some of {', '.join(SETS)}, simulated")
+    if data is None:
+        raise InputError(f"set {name}: expected --data DIR with nuscenes/ and kitti/")
+    return SETS[name](data)
+
+
+def _nuscenes(name: str, split: str, sensor: str, file: str) -> Callable[[Path], RecordingSet]:
+    def build(data: Path) -> RecordingSet:
+        root = data / "nuscenes"
+        return NuScenesSet(name, root, {sensor: root / "detections" / file}, split)
+
+    return build
+
+
+SETS: dict[str, Callable[[Path], RecordingSet]] = {
+    "megvii": _nuscenes("megvii", "mini_train", "lidar", "megvii_lidar.json"),
+    "centerpoint": _nuscenes("centerpoint", "lidar_centerpoint", "lidar", "centerpoint_lidar.json"),
+    "camera": _nuscenes("camera", "camera", "camera", "fastbev_camera.json"),
+    "kitti": lambda data: KittiSet("kitti", data / "kitti", data / "kitti" / "detections" / "pointrcnn"),
+}

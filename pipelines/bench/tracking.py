@@ -1,0 +1,168 @@
+"""The methods, and the graph-aware tracker with each component off, on the same recordings.
+
+Every variant tracks every scene, in turn, so that whatever else the machine does hits all alike; times are CPU times of
+the tracker alone. Differences come with intervals of a paired bootstrap over scenes (`data_tools.metrics.bootstrap`):
+errors at labels from their sums, the figures averaged over recall by scoring each drawn set of scenes anew.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
+from pipelines.bench.coasting import coasting_errors
+from pipelines.bench.recordings import RecordingSet, Score
+from pipelines.bench.variants import METHODS, Variant, variants
+from pipelines.config import TrackConfig
+from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
+from saga_fg.frame import Frame
+from saga_fg.track import Tracks
+
+SAGA, KF, BASELINE = "saga", "kf", "centerpoint"
+LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE")
+
+
+@dataclass(frozen=True)
+class TrackingBenchSettings:
+    """How much is done.
+
+    components  whether to switch components off one by one
+    draws       sets of scenes drawn for the intervals of figures averaged over recall; 0: no intervals of these
+    coasting    whether to measure the coasting error
+    """
+
+    components: bool = True
+    draws: int = 200
+    coasting: bool = True
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class VariantResult:
+    """One variant on one set: headline figures, errors at labels scene by scene, ms of CPU time a frame."""
+
+    variant: Variant
+    score: Score
+    figures: Mapping[str, float]
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class SetResult:
+    """All variants on one set, and what the graph changes: saga less kf (relative for errors), by figure.
+
+    coasting  the coasting error of saga and kf, if it was measured
+    """
+
+    name: str
+    scenes: tuple[str, ...]
+    variants: Mapping[str, VariantResult]
+    differences: Mapping[str, Interval]
+    coasting: Mapping[str, ErrorSample]
+
+    def ratio(self, variant: str) -> float:
+        """Time a frame over that of `centerpoint`."""
+        return self.variants[variant].milliseconds / self.variants[BASELINE].milliseconds
+
+    def errors(self, variant: str) -> LabelErrors:
+        """At the labels of all scenes."""
+        return LabelErrors.pool(self.variants[variant].score.errors)
+
+
+class _Timed:
+    """A tracker with a clock."""
+
+    def __init__(self, tracker: OnlineTracker) -> None:
+        self.seconds, self._tracker = 0.0, tracker
+
+    def step(self, frame: Frame) -> Tracks:
+        begin = time.thread_time()
+        tracks = self._tracker.step(frame)
+        self.seconds += time.thread_time() - begin
+        return tracks
+
+    def tracks(self, timestamp: float) -> Tracks:
+        begin = time.thread_time()
+        tracks = self._tracker.tracks(timestamp)
+        self.seconds += time.thread_time() - begin
+        return tracks
+
+
+def bench_set(
+    recordings: RecordingSet,
+    base: TrackConfig,
+    settings: TrackingBenchSettings | None = None,
+    progress: Progress | None = None,
+) -> SetResult:
+    """Compare on one set."""
+    settings = settings or TrackingBenchSettings()
+    compared = variants(base, settings.components)
+    runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
+    coasting: list[dict[str, ErrorSample]] = []
+    scenes = recordings.dataset.scenes
+    for number, name in enumerate(scenes):
+        scene = recordings.dataset.scene(name)
+        for done, variant in enumerate(compared):
+            timed = _Timed(variant.config(base).new_tracker(variant.method))
+            runs[variant.name][name] = replace(track_scene(scene, timed), seconds=timed.seconds)
+            if progress is not None:
+                progress(f"{recordings.name} {name}", done + 1, len(compared))
+        if settings.coasting:
+            coasting.append(coasting_errors(scene, base, METHODS[:2], settings.seed + number))
+    results = {}
+    for variant in compared:
+        tracked = runs.pop(variant.name)
+        score = recordings.score(tracked)
+        frames, seconds = (sum(getattr(run, what) for run in tracked.values()) for what in ("frames", "seconds"))
+        results[variant.name] = VariantResult(variant, score, score.figures, 1000 * seconds / max(frames, 1))
+    differences = graph_differences(results[SAGA].score, results[KF].score, coasting, settings)
+    carried = {name: ErrorSample.pool(scene[name] for scene in coasting) for name in (SAGA, KF)} if coasting else {}
+    return SetResult(recordings.name, scenes, results, differences, carried)
+
+
+def graph_differences(
+    saga: Score, kf: Score, coasting: Sequence[Mapping[str, ErrorSample]], settings: TrackingBenchSettings
+) -> dict[str, Interval]:
+    """Saga against kf: headline figures as differences, RMSEs as relative changes. Needs two scenes; else empty."""
+    if len(saga.errors) < 2:
+        return {}
+    result = headline_differences(saga, kf, settings.draws, settings.seed) if settings.draws else {}
+    for name in ("position", "velocity", "heading"):
+        a, b = ([errors.sample(name).square_sums for errors in score.errors] for score in (saga, kf))
+        result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
+    if coasting:
+        a, b = ([scene[name].square_sums for scene in coasting] for name in (SAGA, KF))
+        result["coasting RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
+    return result
+
+
+def headline_differences(a: Score, b: Score, draws: int, seed: int, confidence: float = 0.95) -> dict[str, Interval]:
+    """a less b in each headline figure, with the percentile interval over drawn sets of scenes."""
+    rng = np.random.default_rng(seed)
+    count = len(a.errors)
+    drawn: dict[str, list[float]] = {}
+    for _ in range(draws):
+        rows = rng.integers(count, size=count).tolist()
+        first, second = a.figures_of(rows), b.figures_of(rows)
+        for name in first.keys() & second.keys():
+            drawn.setdefault(name, []).append(first[name] - second[name])
+    tail = (1 - confidence) / 2
+    ours, theirs = a.figures, b.figures
+    result = {}
+    for name, values in drawn.items():
+        if name in ours and name in theirs:
+            low, high = np.nanquantile(values, [tail, 1 - tail]).tolist()
+            result[name] = Interval(ours[name] - theirs[name], low, high, confidence)
+    return result
+
+
+def verdict(name: str, difference: Interval) -> str:
+    """`better`, `worse`, or `no difference` where the interval holds 0."""
+    if not difference.excludes(0.0):
+        return "no difference"
+    lower = name.endswith(LOWER_IS_BETTER)
+    return "better" if (difference.estimate < 0) == lower else "worse"

@@ -1,0 +1,83 @@
+"""The tracking benchmark as tables, and as figures for programs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from data_tools.metrics import Interval, calibration, error_figures, errors_by_class
+from pipelines.bench.tracking import SetResult, verdict
+from pipelines.figures import FigureTable, cell
+
+_SHARES = ("sAMOTA", "MOTA")
+
+
+def tables(result: SetResult) -> list[FigureTable]:
+    """For people: the variants, what the graph changes, how honest the covariances are."""
+    return [_variants(result), *_differences(result), *_calibrations(result)]
+
+
+def figures(result: SetResult) -> dict[str, Any]:
+    """For programs."""
+    return {
+        "scenes": result.scenes,
+        "variants": {
+            name: {
+                "figures": each.figures,
+                "errors": {label: error_figures(e) for label, e in errors_by_class(result.errors(name)).items()},
+                "milliseconds_per_frame": each.milliseconds,
+                "ratio_to_centerpoint": result.ratio(name),
+            }
+            for name, each in result.variants.items()
+        },
+        "saga_against_kf": {
+            name: {"difference": interval, "verdict": verdict(name, interval)}
+            for name, interval in result.differences.items()
+        },
+        "coasting_rmse": {name: sample.rmse for name, sample in result.coasting.items()},
+        "calibration": {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()},
+    }
+
+
+def _variants(result: SetResult) -> FigureTable:
+    names = list(next(iter(result.variants.values())).figures)
+    columns = ("variant", *names, "position", "velocity", "... moving", "ms / frame", "/ centerpoint")
+    rows = []
+    for name, each in result.variants.items():
+        errors = error_figures(result.errors(name))
+        headline = (_headline(figure, value) for figure, value in each.figures.items())
+        rest = (cell(errors.position), cell(errors.velocity), cell(errors.velocity_moving))
+        rows.append((name, *headline, *rest, cell(each.milliseconds, 2), cell(result.ratio(name), 1)))
+    title = f"{result.name}: {len(result.scenes)} scenes; RMSE of position in m, of velocity in m/s"
+    return FigureTable(title, columns, tuple(rows))
+
+
+def _headline(name: str, value: float) -> str:
+    if name.endswith("IDS") or name == "FRAG":
+        return cell(value, 0)
+    return cell(100 * value, 2) if name.endswith(_SHARES) and name not in _SHARES else cell(value)
+
+
+def _differences(result: SetResult) -> list[FigureTable]:
+    if not result.differences:
+        return []
+    rows = tuple((name, *_interval(name, each), verdict(name, each)) for name, each in result.differences.items())
+    title = f"{result.name}: what the graph changes, saga less kf (RMSE: relative), 95 % intervals over scenes"
+    return [FigureTable(title, ("figure", "difference", "from", "to", "saga is"), rows)]
+
+
+def _interval(name: str, difference: Interval) -> tuple[str, ...]:
+    values = (difference.estimate, difference.low, difference.high)
+    if name.endswith("RMSE") and not name.startswith("hidden"):
+        return tuple(f"{100 * value:+.2f} %" for value in values)
+    return tuple(f"{value:+.4g}" for value in values)
+
+
+def _calibrations(result: SetResult) -> list[FigureTable]:
+    classes = {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()}
+    rows = tuple(
+        (label, cell(c.objects), cell(c.boxes), cell(c.anees, 2), *(cell(100 * share, 1) for share in c.held.values()))
+        for label, c in classes.items()
+        if c.judged
+    )
+    columns = ("class", "objects", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
+    return [FigureTable(f"{result.name}: errors within saga's ellipses, in %", columns, rows)] if rows else []

@@ -1,0 +1,71 @@
+"""What the tracking benchmark compares: the methods, and the graph-aware tracker with one component switched off.
+
+A component is a named change of settings, written as dotted names and values over the shipped configuration; `*` stands
+for every entry of a mapping. A value may be a function of the old value. One that is off as shipped is not compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
+from typing import Any
+
+from pipelines.config import Method, TrackConfig
+from saga_fg.edge_rules import EdgeRule, Following, Neighbours
+from saga_fg.errors import InputError
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A method, and what is changed in its settings."""
+
+    name: str
+    method: Method = "saga"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def config(self, base: TrackConfig) -> TrackConfig:
+        """The configuration with the changes."""
+        for name, value in self.changes.items():
+            base = changed(base, name, value)
+        return base
+
+
+def _without(kind: type) -> Callable[[tuple[EdgeRule, ...]], tuple[EdgeRule, ...]]:
+    return lambda edges: tuple(edge for edge in edges if not isinstance(edge, kind))
+
+
+METHODS = (Variant("saga"), Variant("kf", "kf"), Variant("centerpoint", "centerpoint"))
+COMPONENTS = (
+    Variant("without following", changes={"tracker.edges": _without(Following)}),
+    Variant("without neighbours", changes={"tracker.edges": _without(Neighbours)}),
+    Variant("without explained noise", changes={"tracker.explained_noise": 0.0}),
+    Variant("without duplicate suppression", changes={"tracker.classes.*.duplicate_distance": 0.0}),
+    Variant("without existence of tracks", changes={"tracker.existence.lifetime": float("inf")}),
+    Variant("without output while coasting", changes={"tracker.report_coasting": 0.0}),
+    Variant("heading drifts freely", changes={"tracker.classes.*.yaw_drift": 3.0}),
+)
+
+
+def changed(settings: Any, name: str, value: Any) -> Any:
+    """`settings` with the dotted `name` set to `value`. Raises `InputError` for a name that does not exist."""
+    head, _, rest = name.partition(".")
+    if isinstance(settings, Mapping):
+        keys = list(settings) if head == "*" else [head]
+        if not all(key in settings for key in keys):
+            raise InputError(f"{name}: expected one of {', '.join(settings)}")
+        return {**settings, **{key: _next(settings[key], rest, value) for key in keys}}
+    if not is_dataclass(settings) or isinstance(settings, type) or head not in settings.__dataclass_fields__:
+        raise InputError(f"{name}: expected the name of a setting")
+    return replace(settings, **{head: _next(getattr(settings, head), rest, value)})
+
+
+def _next(old: Any, rest: str, value: Any) -> Any:
+    if rest:
+        return changed(old, rest, value)
+    return value(old) if callable(value) else value
+
+
+def variants(base: TrackConfig, components: bool = True) -> tuple[Variant, ...]:
+    """The methods and, if wanted, each component that the configuration has switched on."""
+    on = tuple(variant for variant in COMPONENTS if variant.config(base) != base) if components else ()
+    return METHODS + on

@@ -1,0 +1,69 @@
+"""`saga-fg bench tracking`: the methods and the components of the tracker, on the same recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.cli.options import Config, Verbose, names
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile, show_tables
+
+
+def tracking(
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them.")
+    ] = None,
+    sets: Annotated[
+        str | None,
+        typer.Option(
+            "--sets",
+            help="Of megvii, centerpoint, camera, kitti and simulated, with commas.  [default: all that can be]",
+        ),
+    ] = None,
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
+    components: Annotated[bool, typer.Option(help="Switch the components off one by one as well.")] = True,
+    coasting: Annotated[bool, typer.Option(help="Measure the coasting error as well.")] = True,
+    draws: Annotated[int, typer.Option("--draws", min=0, help="Drawn sets of scenes for intervals; 0: none.")] = 200,
+    config: Config = None,
+    json_file: JsonFile = None,
+    markdown: Annotated[
+        Path | None, typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE")
+    ] = None,
+    verbose: Verbose = False,
+) -> None:
+    """Track the same recordings by every method, and with every component off; compare accuracy and time.
+
+    The file of --config changes the shipped settings of every kind of data.
+
+    \b
+    Examples:
+      saga-fg bench tracking --sets simulated --scenes 4 --draws 0
+      saga-fg bench tracking --data data --json figures.json --markdown tables.md
+      saga-fg bench tracking --data data --sets kitti --no-components --no-coasting
+    """
+    from data_tools.atomic_files import check_writable, write_text
+    from pipelines.bench.recordings import SETS, recording_set
+    from pipelines.bench.tracking import TrackingBenchSettings, bench_set
+    from pipelines.bench.tracking_tables import figures, tables
+    from pipelines.config import load_config
+    from pipelines.figures import write_figures
+
+    for path in (json_file, markdown):
+        if path is not None:
+            check_writable(path)
+    everything = (*SETS, "simulated") if data is not None else ("simulated",)
+    chosen = [recording_set(name, data, scenes) for name in (names("--sets", sets) if sets else everything)]
+    settings = TrackingBenchSettings(components, draws, coasting)
+    results = []
+    with progress_bar(unit="variants") as progress:
+        for recordings in chosen:
+            results.append(bench_set(recordings, load_config(recordings.family, config), settings, progress))
+    shown = [table for result in results for table in tables(result)]
+    show_tables(shown)
+    if json_file is not None:
+        write_figures(json_file, {result.name: figures(result) for result in results})
+    if markdown is not None:
+        write_text(markdown, "\n".join(table.markdown() for table in shown))

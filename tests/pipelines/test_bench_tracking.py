@@ -1,0 +1,149 @@
+"""The tracking benchmark: variants by named settings, hidden objects, intervals, and the commands from end to end."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.metrics import ErrorSample, Interval, LabelErrors
+from data_tools.simulator import SimulatorSettings, simulate_scene
+from pipelines.bench.coasting import HIDDEN, NEVER_GIVEN_UP, coasting_errors, kept_alive
+from pipelines.bench.recordings import Score, SimulatedSet
+from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
+from pipelines.bench.variants import COMPONENTS, METHODS, changed, variants
+from pipelines.cli.main import app
+from pipelines.config import Family, load_config
+from saga_fg import InputError
+from saga_fg.edge_rules import Following
+
+FAMILIES: tuple[Family, ...] = ("nuscenes", "kitti", "simulated", "file")
+SHORT = replace(SimulatorSettings(), duration=6.0, warm_up=5.0)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_component_is_a_setting_of_every_kind_of_data(family: Family) -> None:
+    base = load_config(family)
+    for variant in COMPONENTS:
+        variant.config(base)
+    for name, value in NEVER_GIVEN_UP.items():
+        changed(base, name, value)
+    names = [variant.name for variant in variants(base)]
+    assert len(set(names)) == len(names)
+    assert names[:3] == ["saga", "kf", "centerpoint"]
+    assert all(variant.config(base) != base for variant in variants(base)[3:])
+    assert variants(base, components=False) == METHODS
+
+
+def test_settings_are_changed_by_their_dotted_names() -> None:
+    base = load_config("nuscenes")
+    every = changed(base, "tracker.classes.*.gate", 0.5)
+    assert {each.gate for each in every.tracker.classes.values()} == {0.5}
+    one = changed(base, "tracker.classes.car.gate", 0.5)
+    assert one.tracker.classes["car"].gate == 0.5
+    assert one.tracker.classes["default"] == base.tracker.classes["default"]
+    without = next(v for v in COMPONENTS if v.name == "without following").config(load_config("simulated"))
+    assert not any(isinstance(edge, Following) for edge in without.tracker.edges)
+    for name in ("tracker.nothing", "tracker.classes.plane.gate", "tracker.report_coasting.more"):
+        with pytest.raises(InputError, match="expected"):
+            changed(base, name, 0.0)
+
+
+def test_hidden_objects_are_coasted_and_nothing_else_is_judged() -> None:
+    scene = simulate_scene(SHORT, seed=3)
+    errors = coasting_errors(scene, load_config("simulated"), METHODS[:2], seed=0)
+    assert set(errors) == {"saga", "kf"}
+    assert len(errors["kf"]) == len(errors["saga"]) > HIDDEN * 10
+    assert 0.0 < errors["kf"].median < errors["kf"].values.max() <= 10.0
+    again = coasting_errors(scene, load_config("simulated"), METHODS[:1], seed=0)
+    np.testing.assert_array_equal(again["saga"].values, errors["saga"].values)
+    assert kept_alive(load_config("simulated")).tracker.report_coasting >= HIDDEN
+
+
+def label_errors(velocity: float) -> LabelErrors:
+    n = 5
+    column = np.full(n, 1.0)
+    fields = {"detection": column, "position": column, "heading": column, "nees": column}
+    return LabelErrors(
+        np.full(n, "car"), np.arange(n), column, np.ones(n, bool), velocity=np.full(n, velocity), **fields
+    )
+
+
+def test_differences_and_their_verdicts() -> None:
+    errors = tuple(label_errors(v) for v in (1.0, 2.0, 3.0))
+    better = tuple(label_errors(0.5 * v) for v in (1.0, 2.0, 3.0))
+    saga = Score(lambda rows: {"MOTA": 0.5 + 0.01 * sum(rows), "IDS": 2.0 * len(rows)}, better)
+    kf = Score(lambda rows: {"MOTA": 0.4 + 0.01 * sum(rows), "IDS": 1.0 * len(rows)}, errors)
+    coasting = [{"saga": ErrorSample(np.array([1.0])), "kf": ErrorSample(np.array([1.0]))}] * 3
+    differences = graph_differences(saga, kf, coasting, TrackingBenchSettings(draws=20))
+    assert differences["MOTA"].estimate == pytest.approx(0.1)
+    assert differences["velocity RMSE"].estimate == pytest.approx(-0.5)
+    found = {name: verdict(name, each) for name, each in differences.items()}
+    assert found["MOTA"] == found["velocity RMSE"] == "better"
+    assert found["IDS"] == "worse"
+    assert found["coasting RMSE"] == found["position RMSE"] == "no difference"
+    assert verdict("AMOTP", Interval(-0.1, -0.2, -0.05, 0.95)) == "better"
+    assert graph_differences(replace(saga, errors=errors[:1]), kf, [], TrackingBenchSettings()) == {}
+
+
+def test_a_set_is_tracked_by_every_variant() -> None:
+    settings = TrackingBenchSettings(draws=5, coasting=False)
+    result = bench_set(SimulatedSet(2, settings=replace(SHORT, duration=3.0)), load_config("simulated"), settings)
+    assert result.ratio("centerpoint") == 1.0
+    assert {"saga", "kf", "centerpoint", "without following"} <= set(result.variants)
+    assert set(result.variants["saga"].figures) == {"MOTA", "IDS", "hidden RMSE"}
+    assert all(each.milliseconds > 0 for each in result.variants.values())
+    assert len(result.errors("saga")) == len(result.errors("kf"))
+    assert "velocity RMSE" in result.differences
+
+
+def saga_fg(*arguments: str | Path) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_the_commands_on_recordings_in_the_nuscenes_layout(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    (tmp_path / "short.yaml").write_text("duration: 4.0\nwarm_up: 5.0\n")
+    root = data / "nuscenes"
+    data.mkdir()
+    saga_fg("simulate", "-o", root, "--scenes", "2", "--config", tmp_path / "short.yaml")
+    (root / "detections" / "lidar.json").rename(root / "detections" / "centerpoint_lidar.json")
+    splits = root / "v1.0-mini" / "splits.json"
+    splits.write_text(json.dumps({"lidar_centerpoint": ["scene-0001", "scene-0002"]}))
+    json_file, markdown = tmp_path / "figures.json", tmp_path / "tables.md"
+    outputs = ("--json", json_file, "--markdown", markdown)
+    printed = saga_fg(
+        "bench", "tracking", "--data", data, "--sets", "centerpoint", "--no-components", "--draws", "3", *outputs
+    )
+    assert "what the graph changes" in printed
+    assert "| saga |" in markdown.read_text()
+    figures = json.loads(json_file.read_text())["centerpoint"]
+    assert set(figures["variants"]) == {"saga", "kf", "centerpoint"}
+    assert figures["variants"]["centerpoint"]["ratio_to_centerpoint"] == 1.0
+    assert figures["variants"]["saga"]["figures"]["AMOTA"] > 0.2
+    assert figures["saga_against_kf"]["AMOTA"]["verdict"] in ("better", "worse", "no difference")
+    assert figures["coasting_rmse"]["kf"] > 0
+
+    detections = root / "detections"
+    files = ("--camera", detections / "camera.json", "--lidar", detections / "centerpoint_lidar.json")
+    printed = saga_fg("bench", "paper", "--dataroot", root, "--split", "lidar_centerpoint", *files, "--json", json_file)
+    figures = json.loads(json_file.read_text())
+    assert set(figures["measured"]) == set(figures["paper"]) == {"camera", "lidar", "fusion"}
+    assert figures["measured"]["fusion"]["saga"]["amota"] > 0.2
+    assert "53.82" in printed  # SAGA-KF on LiDAR, as published
+
+
+def test_mistakes_are_one_line() -> None:
+    for arguments, expected in (
+        (("--sets", "moon"), "unknown set 'moon'"),
+        (("--sets", "kitti"), "expected --data DIR"),
+    ):
+        result = CliRunner().invoke(app, ["bench", "tracking", *arguments])
+        assert result.exit_code == 2
+        assert expected in result.stderr
