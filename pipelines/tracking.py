@@ -37,32 +37,41 @@ class OnlineTracker(Protocol):
 class TrackedScene:
     """A scene and its tracks, one table for each of its timestamps.
 
-    frames   frames taken in
-    seconds  time spent in the tracker
+    milliseconds  that the tracker took for each frame
     """
 
     scene: Scene
     tracks: tuple[Tracks, ...]
-    frames: int
-    seconds: float
+    milliseconds: tuple[float, ...]
+
+    @property
+    def frames(self) -> int:
+        """How many frames were taken in."""
+        return len(self.milliseconds)
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in the tracker."""
+        return sum(self.milliseconds) / 1e3
 
 
 def track_scene(scene: Scene, tracker: OnlineTracker, progress: Progress | None = None) -> TrackedScene:
     """Track one scene with a fresh tracker. Frames after the last timestamp of the scene are left out."""
     wanted: list[Tracks] = []
+    milliseconds: list[float] = []
     done, latest, total = 0, None, len(scene.frames)
     # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
     with threadpool_limits(limits=1, user_api="blas"):
-        start = time.perf_counter()
         for moment in scene.timestamps.tolist():
             while done < total and scene.frames[done].timestamp <= moment:
+                start = time.perf_counter()
                 latest = tracker.step(scene.frames[done])
+                milliseconds.append(1e3 * (time.perf_counter() - start))
                 done += 1
                 if progress is not None:
                     progress(scene.name, done, total)
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
-        seconds = time.perf_counter() - start
-    return TrackedScene(scene, tuple(wanted), done, seconds)
+    return TrackedScene(scene, tuple(wanted), tuple(milliseconds))
 
 
 def track_dataset(

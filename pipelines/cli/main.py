@@ -12,6 +12,7 @@ from pipelines.cli.config import config
 from pipelines.cli.demo import demo
 from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.learn import learn_app
+from pipelines.cli.report import report_app
 from pipelines.cli.reporting import ReportingGroup
 from pipelines.cli.serve import serve, status
 from pipelines.cli.simulate import simulate
@@ -31,6 +32,7 @@ app.add_typer(track_app, name="track")
 app.add_typer(smooth_app, name="smooth")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(learn_app, name="learn")
+app.add_typer(report_app, name="report")
 app.add_typer(bench_app, name="bench")
 app.add_typer(slam_app, name="slam")
 app.command()(simulate)

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import typer
 
+from pipelines.config import TrackConfig
+from pipelines.configuration import write_settings
+from pipelines.report.run_record import RunRecord, write_run_record
 from pipelines.tracking import TrackedScene
 
 
@@ -21,6 +24,7 @@ class Summary:
     boxes: int = 0
     seconds: float = 0.0
     tracks: set[tuple[str, int]] = field(default_factory=set)
+    milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
         """The same runs, counted."""
@@ -28,9 +32,15 @@ class Summary:
             self.scenes += 1
             self.frames += run.frames
             self.seconds += run.seconds
+            self.milliseconds[run.scene.name] = run.milliseconds
             self.boxes += sum(len(tracks) for tracks in run.tracks)
             self.tracks.update((run.scene.name, id_) for tracks in run.tracks for id_ in tracks.id.tolist())
             yield run
+
+    def write_record(self, method: str, settings: TrackConfig) -> None:
+        """Write the record of the run beside its result, for reports."""
+        rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
+        write_run_record(self.output, RunRecord(method, write_settings(settings, comments=False), rounded))
 
     def show(self) -> None:
         """Print the line on stdout."""

@@ -83,6 +83,7 @@ def nuscenes(
     with progress_bar(len(chosen)) as progress:
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
         write_tracking_results(output, ((run.scene, run.tracks) for run in runs), dataset.meta)
+    summary.write_record(method, settings)
     summary.show()
 
 
@@ -126,6 +127,7 @@ def kitti(
     with progress_bar(len(dataset.scenes)) as progress:
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
         write_kitti_results(output, dataset, ((run.scene, run.tracks) for run in runs))
+    summary.write_record(method, settings)
     summary.show()
 
 
@@ -187,4 +189,5 @@ def file(
     with progress_bar(len(chosen)) as progress:
         runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), chosen, progress))
         write_tracks(output, ((run.scene, run.tracks) for run in runs))
+    summary.write_record(method, settings)
     summary.show()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +12,6 @@ from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.comparison import COLUMNS, Comparison, compare, table_rows
 from pipelines.config import load_config
-from pipelines.demo.page import demo_page
 from pipelines.demo.run import METHODS, hardest_moment, latest_detections, run_demo
 from saga_fg import InputError, Scene
 
@@ -80,25 +76,6 @@ def test_latest_detections_are_those_of_every_sensors_last_frame(comparison: Com
         frames = [f for f in scene.frames if f.sensor == sensor and f.timestamp <= scene.timestamps[k]]
         expected += len(frames[-1])
     assert len(latest_detections(scene, k)) == expected
-
-
-def test_the_page_holds_all_it_needs(comparison: Comparison) -> None:
-    picture = b"\x89PNG not really"
-    runs = {method: comparison.runs[method][0] for method in METHODS}
-    page = demo_page(COLUMNS, [("<b>&", *COLUMNS[1:])], picture, runs)
-    assert "<td>&lt;b&gt;&amp;</td>" in page
-    assert base64.b64encode(picture).decode() in page
-    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", page)
-    data = json.loads(re.search(r"^const data = (.*);$", page, flags=re.M)[1])  # type: ignore[index]
-    assert data["methods"] == list(METHODS)
-    assert len(data["moments"]) == len(data["times"]) == len(runs["saga"].scene)
-    last = data["moments"][-1]
-    tracks = runs["saga"].tracks[-1]
-    assert [row[5] for row in last["t"]["saga"]] == tracks.id.tolist()
-    origin = runs["saga"].scene.world_T_ego[0, :2, 3]
-    np.testing.assert_allclose(
-        [row[:2] for row in last["t"]["saga"]], tracks.boxes.position[:, :2] - origin, atol=0.006
-    )
 
 
 def test_the_demo_writes_a_picture_and_a_page(tmp_path: Path) -> None:

@@ -1,0 +1,36 @@
+"""Makes the pictures of the documentation: python docs/make_pictures.py (needs a Chromium for the page's)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from pipelines.config import load_config
+from pipelines.demo import run_demo
+
+HERE = Path(__file__).parent
+
+
+def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
+    """A picture of a page's upper left corner, taken in a browser without a window."""
+    chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    assert chromium is not None, "no Chromium on the path, nor in the variable CHROMIUM"
+    with tempfile.TemporaryDirectory() as profile:
+        options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=5000"]
+        options += [f"--user-data-dir={profile}", f"--window-size={width},{height}", f"--screenshot={picture}"]
+        subprocess.run([chromium, *options, page.resolve().as_uri()], check=True, capture_output=True)
+
+
+def main() -> None:
+    """The pictures of the demonstration."""
+    with tempfile.TemporaryDirectory() as folder:
+        result = run_demo(Path(folder) / "demo", load_config("simulated"))
+        shutil.copy(result.picture, HERE / "birds_eye.png")
+        screenshot(result.page, HERE / "report.png", 1300, 920)
+
+
+if __name__ == "__main__":
+    main()

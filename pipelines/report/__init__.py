@@ -1,0 +1,23 @@
+"""Reports: one HTML page with a player of the scenes, figures, charts and the settings; it needs no network.
+
+result + recordings -> `ReportScene`s, tables, charts -> `report_page` -> one file
+"""
+
+from pipelines.report.charts import Chart, Series, accuracy_charts, latency_chart
+from pipelines.report.page import Report, report_page
+from pipelines.report.run_record import RunRecord, read_run_record, record_path
+from pipelines.report.scenes import ReportScene, scene_of_run
+
+__all__ = [
+    "Chart",
+    "Report",
+    "ReportScene",
+    "RunRecord",
+    "Series",
+    "accuracy_charts",
+    "latency_chart",
+    "read_run_record",
+    "record_path",
+    "report_page",
+    "scene_of_run",
+]

@@ -1,0 +1,49 @@
+"""What a run of the tracker was: written beside its result, so that a report can tell how the result came about.
+
+{"method": "saga", "version": "0.1.0", "configuration": YAML, "milliseconds": {scene: [of each frame]}}
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from data_tools.atomic_files import write_text
+from saga_fg.errors import InputError
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """method; version of saga-fg; configuration, YAML; milliseconds in the tracker for every frame, by scene."""
+
+    method: str
+    configuration: str
+    milliseconds: Mapping[str, Sequence[float]]
+    version: str = version("saga-fg")
+
+
+def record_path(result: Path) -> Path:
+    """Where the record of a result is: beside a file, or in a folder of results."""
+    return result / "run.json" if result.is_dir() else result.with_name(f"{result.stem}.run.json")
+
+
+def write_run_record(result: Path, record: RunRecord) -> None:
+    """Write the record of a result that has just been written."""
+    write_text(record_path(result), json.dumps(asdict(record)) + "\n")
+
+
+def read_run_record(result: Path) -> RunRecord | None:
+    """The record of a result, None if it has none. Raises `InputError` for one that is broken."""
+    path = record_path(result)
+    if not path.is_file():
+        return None
+    try:
+        raw: Any = json.loads(path.read_text(encoding="utf-8"))
+        milliseconds = {str(name): [float(ms) for ms in times] for name, times in raw["milliseconds"].items()}
+        return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: expected the record of a run: {error}") from error

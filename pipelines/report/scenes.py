@@ -1,0 +1,154 @@
+"""Scenes as the page's player wants them: rows of whole numbers, centimetres and milliradians, about the scene's start.
+
+    scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
+             "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]]}},
+             "truth": [[object, ...]], "detections": [[detection, ...]]}
+    track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
+    object     [class, x, y, length, width, yaw, visible]
+    detection  [class, x, y, length, width, yaw, score]
+
+Lengths in cm, yaw in mrad, velocities in cm/s, scores and rates in thousandths, covariances in cm^2, coasting in ms;
+null is unknown. `ids`, `labels` are counted from 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from data_tools.metrics import TrackTable
+from pipelines.report.edges import edges_of_moments
+from pipelines.tracking import TrackedScene
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.boxes import Boxes
+from saga_fg.dataset import Scene
+from saga_fg.edge_rules import EdgeRule
+from saga_fg.frame import Frame
+from saga_fg.geometry import yaw_of
+from saga_fg.sensor import Sensor, sensor_model
+
+Rows = list[list[int | None]]
+UNMEASURED = 1.0  # side of the square an object of unknown size is drawn as, m
+
+
+@dataclass(frozen=True, eq=False)
+class ReportScene:
+    """A scene and what one or several trackers made of it.
+
+    scene     with its detections, and ground truth where there is one
+    tracks    by the tracker's name
+    coasting  by the tracker's name, s since the last detection, (N,) of its tracks; may be left out
+    rules     the edges drawn are those that these rules find between the tracks of a moment
+    sensors   models by name: where their detections are in the world
+    """
+
+    scene: Scene
+    tracks: Mapping[str, TrackTable]
+    coasting: Mapping[str, FloatArray]
+    rules: Sequence[EdgeRule] = ()
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+
+
+def scene_of_run(
+    runs: Mapping[str, TrackedScene], rules: Sequence[EdgeRule], sensors: Mapping[str, Sensor]
+) -> ReportScene:
+    """A scene that has just been tracked, by the trackers' names."""
+    return ReportScene(
+        next(iter(runs.values())).scene,
+        {name: TrackTable.of_tracks(run.tracks) for name, run in runs.items()},
+        {name: np.concatenate([np.empty(0), *(t.coasting for t in run.tracks)]) for name, run in runs.items()},
+        rules,
+        sensors,
+    )
+
+
+def scene_data(report: ReportScene) -> dict[str, Any]:
+    """The scene as the module's docstring says, ready for JSON."""
+    scene = report.scene
+    origin = scene.world_T_ego[0, :2, 3] if len(scene) else np.zeros(2)
+    shown = _latest_detections(scene, report.sensors)
+    truth = [t.boxes for t in scene.ground_truth] if scene.ground_truth is not None else None
+    names = [table.boxes.label for table in report.tracks.values()] + [b.label for b in (*(truth or ()), *shown[0])]
+    labels = np.unique(np.concatenate([np.empty(0, dtype="<U1"), *names]))
+    ego = np.column_stack([scene.world_T_ego[:, :2, 3] - origin, yaw_of(scene.world_T_ego[:, :3, :3])])
+    return {
+        "name": scene.name,
+        "times": (scene.timestamps - scene.timestamps[:1]).round(3).tolist(),
+        "ego": _whole(ego * [100, 100, 1000]),
+        "labels": labels.tolist(),
+        "methods": {
+            name: _method(table, report.coasting.get(name), labels, origin, len(scene), report.rules)
+            for name, table in report.tracks.items()
+        },
+        "truth": None
+        if truth is None or scene.ground_truth is None
+        else [
+            _whole(np.column_stack([_box_columns(boxes, labels, origin), t.visible]))
+            for boxes, t in zip(truth, scene.ground_truth, strict=True)
+        ],
+        "detections": [
+            _whole(np.column_stack([_box_columns(boxes, labels, origin), 1000 * score]))
+            for boxes, score in zip(*shown, strict=True)
+        ],
+    }
+
+
+def _method(
+    table: TrackTable,
+    coasting: FloatArray | None,
+    labels: StrArray,
+    origin: FloatArray,
+    moments: int,
+    rules: Sequence[EdgeRule],
+) -> dict[str, Any]:
+    ids, number = np.unique(table.id, return_inverse=True)
+    covariance = table.position_covariance
+    columns = [
+        number,
+        _box_columns(table.boxes, labels, origin),
+        100 * table.boxes.velocity,
+        1000 * table.score,
+        1e4 * np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=-1),
+        1000 * (np.full(len(table), np.nan) if coasting is None else coasting),
+    ]
+    rows = _whole(np.column_stack(columns))
+    starts = np.searchsorted(table.moment, np.arange(moments + 1)).tolist()
+    return {
+        "ids": ids.tolist(),
+        "moments": [rows[a:b] for a, b in pairwise(starts)],
+        "edges": [
+            _whole(np.column_stack([number[target], number[source], 1000 * rate]))
+            for target, source, rate in edges_of_moments(table, moments, rules)
+        ],
+    }
+
+
+def _box_columns(boxes: Boxes, labels: StrArray, origin: FloatArray) -> FloatArray:
+    """(N, 6): class, x, y, length, width, yaw."""
+    size = np.where(np.isfinite(boxes.size[:, :2]), boxes.size[:, :2], UNMEASURED)
+    place = 100 * (boxes.position[:, :2] - origin)
+    return np.column_stack([np.searchsorted(labels, boxes.label), place, 100 * size, 1000 * np.nan_to_num(boxes.yaw)])
+
+
+def _latest_detections(scene: Scene, sensors: Mapping[str, Sensor]) -> tuple[list[Boxes], list[FloatArray]]:
+    """Of each moment: the boxes of all frames since the moment before, and their scores."""
+    times = np.array([frame.timestamp for frame in scene.frames])
+    at = np.searchsorted(scene.timestamps, times - 1e-6)
+    boxes, scores = [], []
+    for k in range(len(scene)):
+        frames = [sensor_model(sensors, f.sensor).in_world(f) for f in _at(scene.frames, np.flatnonzero(at == k))]
+        boxes.append(Boxes.concatenate([each.boxes for each in frames]))
+        scores.append(np.concatenate([np.empty(0), *(each.score for each in frames)]))
+    return boxes, scores
+
+
+def _at(frames: Sequence[Frame], rows: IntArray) -> list[Frame]:
+    return [frames[i] for i in rows.tolist()]
+
+
+def _whole(rows: FloatArray) -> Rows:
+    return [[None if x != x else round(x) for x in row] for row in rows.tolist()]
