@@ -41,7 +41,7 @@ def test_the_wheel_holds_exactly_the_four_packages(wheel: zipfile.ZipFile) -> No
 
 def test_the_wheel_holds_every_source_file_and_only_those(wheel: zipfile.ZipFile) -> None:
     inside = {name for name in wheel.namelist() if ".dist-info/" not in name}
-    suffixes = {".py", ".yaml", ".html", ".typed"}
+    suffixes = {".py", ".yaml", ".html", ".css", ".js", ".typed"}
     expected = {
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES
@@ -61,7 +61,7 @@ def test_the_wheel_names_licence_command_and_pythons(wheel: zipfile.ZipFile) -> 
 
 
 def test_what_the_wheel_holds_works_on_its_own(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
-    """Configurations and the page of the demo are found where the packages are, not where the sources are."""
+    """Configurations and the page of reports are found where the packages are, not where the sources are."""
     wheel.extractall(tmp_path)
     code = (
         "from importlib.resources import files\n"
@@ -69,7 +69,7 @@ def test_what_the_wheel_holds_works_on_its_own(wheel: zipfile.ZipFile, tmp_path:
         "import pipelines\n"
         "for family in ('nuscenes', 'kitti', 'simulated', 'file'):\n"
         "    load_config(family)\n"
-        "assert (files('pipelines.demo') / 'page.html').is_file()\n"
+        "assert (files('pipelines.report') / 'page.html').is_file()\n"
         "print(pipelines.__file__)\n"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)

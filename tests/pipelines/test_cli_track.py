@@ -154,7 +154,12 @@ def test_kitti_recordings(recordings: Path, tmp_path: Path, method: str) -> None
         "--sequences", "0000,0017", "--method", method, "--output", tmp_path / "out",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0000.txt", "0017.txt"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "0000.txt",
+        "0017.txt",
+        "run.json",
+        "tracks.csv",
+    ]
     lines = (tmp_path / "out" / "0000.txt").read_text().splitlines()
     assert len(lines) > 100
     assert all(len(line.split()) == 18 for line in lines)
