@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -102,13 +102,15 @@ def bench_set(
     settings = settings or TrackingBenchSettings()
     compared = variants(base, settings.components)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
+    seconds = dict.fromkeys(runs, 0.0)
     coasting: list[dict[str, ErrorSample]] = []
     scenes = recordings.dataset.scenes
     for number, name in enumerate(scenes):
         scene = recordings.dataset.scene(name)
         for done, variant in enumerate(compared):
             timed = _Timed(variant.config(base).new_tracker(variant.method))
-            runs[variant.name][name] = replace(track_scene(scene, timed), seconds=timed.seconds)
+            runs[variant.name][name] = track_scene(scene, timed)
+            seconds[variant.name] += timed.seconds
             if progress is not None:
                 progress(f"{recordings.name} {name}", done + 1, len(compared))
         if settings.coasting:
@@ -117,8 +119,9 @@ def bench_set(
     for variant in compared:
         tracked = runs.pop(variant.name)
         score = recordings.score(tracked)
-        frames, seconds = (sum(getattr(run, what) for run in tracked.values()) for what in ("frames", "seconds"))
-        results[variant.name] = VariantResult(variant, score, score.figures, 1000 * seconds / max(frames, 1))
+        frames = sum(run.frames for run in tracked.values())
+        milliseconds = 1000 * seconds[variant.name] / max(frames, 1)
+        results[variant.name] = VariantResult(variant, score, score.figures, milliseconds)
     differences = graph_differences(results[SAGA].score, results[KF].score, coasting, settings)
     carried = {name: ErrorSample.pool(scene[name] for scene in coasting) for name in (SAGA, KF)} if coasting else {}
     return SetResult(recordings.name, scenes, results, differences, carried)
