@@ -18,7 +18,7 @@ import importlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -26,6 +26,7 @@ import numpy as np
 from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
 from data_tools.trajectories import Trajectory, TrajectoryErrors, trajectory_errors
 from pipelines.bench.measuring import one_thread
+from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray
@@ -33,17 +34,6 @@ from saga_fg.errors import MissingExtraError
 from saga_fg.geometry import inverse_transform
 
 OURS, KISS = "saga-fg", "kiss-icp"
-
-
-class ScanSequence(Protocol):
-    """Recorded scans with reference poses, such as `data_tools.kitti.KittiScans`."""
-
-    timestamps: FloatArray
-    world_T_ego: FloatArray
-    ego_T_lidar: FloatArray
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, row: int) -> Scan: ...
 
 
 @dataclass(frozen=True)

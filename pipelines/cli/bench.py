@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.cli.bench_estimators import estimators
+from pipelines.cli.bench_lidar import lidar
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_paper import paper
 from pipelines.cli.bench_service import service
@@ -29,6 +30,7 @@ Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to 
 bench_app.command()(estimators)
 bench_app.command()(service)
 bench_app.command()(metrics)
+bench_app.command()(lidar)
 bench_app.command()(slam)
 bench_app.command()(streaming)
 bench_app.command()(paper)

@@ -1,0 +1,138 @@
+"""Detections without a detector: what stands on the ground, apart from the rest, as oriented boxes.
+
+Points above the ground are joined from above; parts as high as walls, or longer than any vehicle, are no objects. The
+box of a part has the heading theta for which its points lie close to the box's sides: with c1, c2 the coordinates of a
+point along and across theta, and d its distance from the nearer of the sides that bound c1 and c2,
+
+    theta = argmax over [0, pi/2)  sum_i 1 / max(d_i, d0)         (closeness; Zhang et al., IV 2017)
+
+Of a vehicle one or two sides are seen. Its box is completed to the least size of its class, away from the sensor. Its
+class its size says, and its score the share that it has of the points of a car at its distance.
+
+Source: Zhang, Xu, Dong, Dolan, Efficient L-shape fitting for vehicle detection using laser scanners, IV 2017.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.lidar.components import connected_from_above
+from data_tools.lidar.ground import segment_ground
+from saga_fg.arrays import FloatArray
+from saga_fg.boxes import Boxes
+from saga_fg.frame import Detections
+from saga_fg.settings import require_positive, setting, settings_group
+
+_HEADINGS = np.radians(np.arange(0.0, 90.0, 2.0))
+_CLOSE = 0.1  # m, d0
+
+
+@dataclass(frozen=True)
+class ObjectSize:
+    """Sizes that a class of objects may show, m, and the least that its boxes have."""
+
+    length: tuple[float, float] = setting((0.0, 6.0), "shown along the longer side, from - to, m")
+    width: tuple[float, float] = setting((0.0, 2.6), "shown along the shorter, m")
+    height: tuple[float, float] = setting((0.7, 2.6), "above the ground, m")
+    complete: tuple[float, float] = setting((4.2, 1.75), "length and width that a box is completed to, m")
+
+
+def _sizes() -> dict[str, ObjectSize]:
+    return {
+        "pedestrian": ObjectSize((0.15, 1.0), (0.1, 0.9), (1.0, 2.1), (0.7, 0.6)),
+        "cyclist": ObjectSize((1.0, 2.1), (0.2, 0.95), (1.2, 2.1), (1.8, 0.7)),
+        "car": ObjectSize((1.4, 7.0), (0.2, 2.6), (1.2, 2.6), (4.2, 1.75)),
+    }
+
+
+@dataclass(frozen=True)
+class ClusterSettings:
+    """How points become boxes; the first class whose sizes fit is taken."""
+
+    cell: float = setting(0.3, "of the grid on which points are joined, m")
+    lowest: float = setting(0.25, "height above the ground from which points count, m")
+    highest: float = setting(2.6, "and up to which, m")
+    reach: float = setting(40.0, "from the sensor, m")
+    foot: float = setting(0.6, "height above the ground that the lowest point must not exceed, m")
+    points: int = setting(10, "least points")
+    classes: Mapping[str, ObjectSize] = settings_group(_sizes, "sizes by class")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "cell", "lowest", "highest", "reach", "foot", "points")
+
+
+def detect_clusters(points: FloatArray, settings: ClusterSettings | None = None) -> Detections:
+    """Boxes of what stands on the ground in a scan (N, 3), m; in the sensor's frame, with classes and scores."""
+    s = settings or ClusterSettings()
+    ground = segment_ground(points)
+    near = np.hypot(points[:, 0], points[:, 1]) <= s.reach
+    above = near & (ground.height >= s.lowest)
+    points, height = points[above], ground.height[above]
+    part = connected_from_above(points, s.cell)
+    order = np.argsort(part, kind="stable")
+    bounds = np.concatenate([[0], np.flatnonzero(np.diff(part[order])) + 1, [len(order)]])
+    rows = []
+    for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        chosen = order[start:end]
+        if len(chosen) >= s.points and height[chosen].max() <= s.highest and height[chosen].min() <= s.foot:
+            rows.append(_detection(points[chosen], float(height[chosen].max()), s))
+    found = [row for row in rows if row is not None]
+    if not found:
+        return Detections.empty()
+    label, position, size, yaw, score = zip(*found, strict=True)
+    boxes = Boxes.of(list(label), np.array(position), np.array(size), np.array(yaw))
+    return Detections(boxes, np.array(score))
+
+
+def _detection(
+    points: FloatArray, top: float, s: ClusterSettings
+) -> tuple[str, FloatArray, FloatArray, float, float] | None:
+    yaw = l_shape_heading(points[:, :2])
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    local = points[:, :2] @ axes.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    shown = high - low
+    if shown[1] > shown[0]:  # the longer side is the length
+        yaw += np.pi / 2
+        low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
+        axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+        shown = high - low
+    label = next((name for name, size in s.classes.items() if _fits(shown, top, size)), None)
+    if label is None:
+        return None
+    least = np.array(s.classes[label].complete)
+    if label == "car" and shown[0] < least[1] + 0.3:
+        least = least[::-1]  # only its rear or front is seen, and the length lies behind
+    size = np.maximum(shown, least)
+    centre = (low + high) / 2
+    away = np.sign(centre)  # the sensor is at 0: what is missing lies behind what is seen
+    centre = centre + away * (size - shown) / 2
+    if size[1] > size[0]:
+        yaw, size = yaw + np.pi / 2, size[::-1]
+    centre = axes.T @ centre
+    bottom = float(points[:, 2].max()) - top
+    position = np.array([*centre, bottom + top / 2])
+    return label, position, np.array([*size, top]), float(yaw), _score(len(points), float(np.hypot(*centre)))
+
+
+def l_shape_heading(points: FloatArray) -> float:
+    """The heading (rad, from 0 to pi/2) of the rectangle whose sides points (N, 2) lie closest to."""
+    along = np.stack([np.cos(_HEADINGS), np.sin(_HEADINGS)])
+    c1, c2 = points @ along, points @ np.stack([-along[1], along[0]])
+    d1 = np.minimum(c1.max(axis=0) - c1, c1 - c1.min(axis=0))
+    d2 = np.minimum(c2.max(axis=0) - c2, c2 - c2.min(axis=0))
+    closeness = (1.0 / np.maximum(np.minimum(d1, d2), _CLOSE)).sum(axis=0)
+    return float(_HEADINGS[closeness.argmax()])
+
+
+def _fits(shown: FloatArray, top: float, size: ObjectSize) -> bool:
+    ranges = zip((*shown, top), (size.length, size.width, size.height), strict=True)
+    return all(low <= value <= high for value, (low, high) in ranges)
+
+
+def _score(points: int, distance: float) -> float:
+    """Between 0 and 1: points against the 3000 / distance that a vehicle has at least, of a sensor of 64 rings."""
+    return float(min(1.0, 0.2 + 0.8 * points * distance / 3000.0))

@@ -1,0 +1,151 @@
+"""Planes in a scan: walls, and the ground under the vehicle.
+
+A plane is n . x + d = 0 in the sensor's frame, n of length 1 pointing to the side of the sensor (d > 0). Fitted to
+points, or to means of surfels, c their centre and a <= b <= e the eigenvalues of S = sum (p - c)(p - c)^T, n is the
+eigenvector of a and d = - n . c. With a noise of sigma across the plane, and k points,
+
+    var(tilt) = sigma^2 / b        (the worse of the two directions),        var(d) = sigma^2 / k + |c|^2 var(tilt)
+
+where the last term is the lever of the centre on the distance at the sensor. Walls are found by consensus: of all
+upright flat surfels the one with the most others in its plane makes a wall with those of them that hang together; then
+again among the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from data_tools.lidar.surfels import surfels_of
+from data_tools.lidar.voxels import voxel_downsample
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.settings import require_positive, setting
+
+
+@dataclass(frozen=True)
+class PlaneSettings:
+    """What counts as a wall; lengths in m."""
+
+    surfel: float = setting(1.0, "voxel of the surfels, m")
+    reach: float = setting(50.0, "from the sensor, m")
+    upright: float = setting(0.15, "largest share of z in the normal of a wall")
+    aligned: float = setting(0.97, "least cosine between normals of one wall")
+    thickness: float = setting(0.15, "of a wall, to either side, m")
+    gap: float = setting(3.0, "largest gap within a wall, m")
+    surfels: int = setting(8, "least surfels of a wall")
+    length: float = setting(3.0, "least length of a wall, m")
+    noise: float = setting(0.03, "of a surfel across its wall: ranges, bricks, windows, m")
+    ground_noise: float = setting(0.02, "of the ground's surfels, m")
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self,
+            "surfel",
+            "reach",
+            "upright",
+            "aligned",
+            "thickness",
+            "gap",
+            "surfels",
+            "length",
+            "noise",
+            "ground_noise",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane and the piece of it that was seen, in the sensor's frame.
+
+    coefficients  (4,) n and d, d > 0
+    covariance    (3, 3) of two tilts of n (rad^2) and of d (m^2); no correlations, the tilts alike
+    centre        (3,) of what was seen, m
+    extent        (2, 3) its ends: for a wall lowest point of one end and highest of the other; for the ground corners
+    """
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    centre: FloatArray
+    extent: FloatArray
+
+
+def fit_plane(points: FloatArray, noise: float) -> Plane:
+    """The plane of points (N, 3), m, N >= 3, each with `noise` m across it."""
+    centre = points.mean(axis=0)
+    off = points - centre
+    values, vectors = np.linalg.eigh(off.T @ off)
+    normal, d = vectors[:, 0], float(-vectors[:, 0] @ centre)
+    if d < 0:
+        normal, d = -normal, -d
+    tilt = noise**2 / max(float(values[1]), 1e-9)
+    covariance = np.diag([tilt, tilt, noise**2 / len(points) + float(centre @ centre) * tilt])
+    along = off @ vectors[:, 2]
+    ends = np.stack([points[along.argmin()], points[along.argmax()]])
+    ends[0, 2], ends[1, 2] = points[:, 2].min(), points[:, 2].max()
+    return Plane(np.append(normal, d), covariance, centre, ends)
+
+
+def near_walls(places: FloatArray, walls: Sequence[Plane], distance: float) -> BoolArray:
+    """Which places (N, 3), m, lie within `distance` m of the seen piece of a wall, from above."""
+    near = np.zeros(len(places), dtype=np.bool_)
+    for wall in walls:
+        along = np.array([-wall.coefficients[1], wall.coefficients[0]])
+        ends = np.sort(wall.extent[:, :2] @ along)
+        u = places[:, :2] @ along
+        across = np.abs(places @ wall.coefficients[:3] + wall.coefficients[3])
+        near |= (across <= distance) & (u >= ends[0] - distance) & (u <= ends[1] + distance)
+    return near
+
+
+def fit_ground(ground: FloatArray, settings: PlaneSettings | None = None, reach: float = 15.0) -> Plane | None:
+    """The plane of the ground points (N, 3) within `reach` m; None if there are too few."""
+    s = settings or PlaneSettings()
+    near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
+    near = near[voxel_downsample(near, s.surfel)]
+    for _ in range(3):
+        if len(near) < 3 * s.surfels:
+            return None
+        plane = fit_plane(near, s.ground_noise)
+        off = np.abs(near @ plane.coefficients[:3] + plane.coefficients[3])
+        near = near[off <= max(2.5 * float(np.median(off)), 0.01)]
+    return plane
+
+
+def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> list[Plane]:
+    """The walls among points (N, 3), m, of a scan without its ground, the largest first."""
+    s = settings or PlaneSettings()
+    points = points[np.hypot(points[:, 0], points[:, 1]) <= s.reach]
+    surfels = surfels_of(points, s.surfel)
+    surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= s.upright))
+    mean, normal = surfels.mean, surfels.normal
+    coplanar = np.abs(normal @ normal.T) >= s.aligned
+    across = np.abs(normal @ mean.T - np.einsum("ni,ni->n", normal, mean)[:, None])
+    coplanar &= (across <= s.thickness) & (s.thickness >= across.T)
+    walls: list[Plane] = []
+    left = np.ones(len(mean), dtype=np.bool_)
+    while left.any():
+        support = coplanar[:, left].sum(axis=1) * left
+        best = int(support.argmax())
+        if support[best] < s.surfels:
+            break
+        rows = _joined(mean, np.flatnonzero(coplanar[best] & left), best, s.gap)
+        left[rows] = left[best] = False
+        if len(rows) < s.surfels:
+            continue
+        wall = fit_plane(mean[rows], s.noise)
+        if np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= s.length and abs(wall.coefficients[2]) <= s.upright:
+            walls.append(wall)
+    return walls
+
+
+def _joined(mean: FloatArray, rows: IntArray, seed: int, gap: float) -> IntArray:
+    """Those of the rows that hang together with `seed` by gaps of at most `gap` m."""
+    pairs = cKDTree(mean[rows]).query_pairs(gap, output_type="ndarray")
+    links = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
+    _, part = connected_components(links, directed=False)
+    return np.asarray(rows[part == part[np.flatnonzero(rows == seed)[0]]])

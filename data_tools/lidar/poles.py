@@ -1,0 +1,100 @@
+"""Poles in a scan: masts, posts and trunks.
+
+Points above the ground are joined from above (`connected_from_above`), on cells as small as a pole. A part is a pole if
+it is thin, tall, filled from its foot to its top, and stands alone: few points in the ring around it at its own height.
+Its place is the mean of its points, moved away from the sensor by what a cylinder hides: seen from one side, the
+points of a circle of radius r lie on average pi/4 r in front of its centre. r comes from the width w across the line
+of sight, r = w / 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from data_tools.lidar.components import connected_from_above
+from data_tools.lidar.planes import Plane, near_walls
+from saga_fg.arrays import FloatArray
+from saga_fg.settings import require_positive, setting
+
+
+@dataclass(frozen=True)
+class PoleSettings:
+    """What counts as a pole; lengths in m."""
+
+    cell: float = setting(0.2, "of the grid on which points are joined, m")
+    reach: float = setting(40.0, "from the sensor, m")
+    lowest: float = setting(0.3, "height above the ground from which points count, m")
+    height: float = setting(1.2, "least height from the lowest to the highest point, m")
+    width: float = setting(0.6, "largest extent from above, m")
+    points: int = setting(8, "least points")
+    filled: float = setting(0.5, "least share of half-metre steps of the height that hold points")
+    alone: float = setting(0.6, "nothing else within this distance of the axis, m")
+    noise: float = setting(0.03, "of the axis where it is seen well: ranges, bent trunks, m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "cell", "reach", "lowest", "height", "width", "points", "filled", "alone", "noise")
+
+
+@dataclass(frozen=True, eq=False)
+class Pole:
+    """An upright pole, in the sensor's frame.
+
+    foot        (3,) lowest point of its axis that was seen, m
+    top         height of the highest, m
+    radius      m
+    covariance  (2, 2) of the axis' place, x and y, m^2
+    """
+
+    foot: FloatArray
+    top: float
+    radius: float
+    covariance: FloatArray
+
+
+def extract_poles(
+    points: FloatArray, height: FloatArray, walls: Sequence[Plane] = (), settings: PoleSettings | None = None
+) -> list[Pole]:
+    """The poles among points (N, 3), m, with their `height` (N,) above the ground, m; none along the `walls`."""
+    s = settings or PoleSettings()
+    points = points[(height >= s.lowest) & (np.hypot(points[:, 0], points[:, 1]) <= s.reach)]
+    points = points[~near_walls(points, walls, s.alone)]
+    part = connected_from_above(points, s.cell)
+    order = np.argsort(part, kind="stable")
+    grouped = points[order]
+    bounds = np.concatenate([[0], np.flatnonzero(np.diff(part[order])) + 1, [len(order)]])
+    tree = cKDTree(points[:, :2]) if len(points) else None
+    poles = []
+    for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        candidate = grouped[start:end]
+        if tree is None or not _slender(candidate, s):
+            continue
+        pole = _pole(candidate, s)
+        around = points[tree.query_ball_point(pole.foot[:2], s.alone)]
+        level = (around[:, 2] >= pole.foot[2]) & (around[:, 2] <= pole.top)
+        if level.sum() <= 1.2 * len(candidate):
+            poles.append(pole)
+    return poles
+
+
+def _slender(points: FloatArray, s: PoleSettings) -> bool:
+    if len(points) < s.points:
+        return False
+    size = np.ptp(points, axis=0)
+    if max(size[0], size[1]) > s.width or size[2] < s.height:
+        return False
+    steps = np.floor((points[:, 2] - points[:, 2].min()) / 0.5)
+    return bool(len(np.unique(steps)) >= s.filled * np.ceil(size[2] / 0.5))
+
+
+def _pole(points: FloatArray, s: PoleSettings) -> Pole:
+    mean = points[:, :2].mean(axis=0)
+    sight = mean / max(float(np.hypot(*mean)), 1e-9)
+    across = points[:, :2] @ np.array([-sight[1], sight[0]])
+    radius = float(np.ptp(across)) / 2
+    axis = mean + np.pi / 4 * radius * sight
+    covariance = np.cov(points[:, :2].T) / len(points) + s.noise**2 * np.eye(2)
+    return Pole(np.append(axis, points[:, 2].min()), float(points[:, 2].max()), radius, covariance)
