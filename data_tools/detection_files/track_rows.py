@@ -14,7 +14,7 @@ from data_tools.detection_files.tracks import TRACK_COLUMNS
 from saga_fg.arrays import FloatArray, StrArray, from_upper_triangle
 from saga_fg.boxes import Boxes
 
-_REQUIRED = ("timestamp", "id", "x", "y")
+REQUIRED = ("timestamp", "id", "x", "y")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,11 @@ class TrackRows:
 
 def read_tracks(path: str | Path) -> TrackRows:
     """Read a table of tracks, .csv, .ndjson or .jsonl. Raises `InputError` naming file, row and column."""
-    raw = read_raw_table(Path(path), Layout(TRACK_COLUMNS, _REQUIRED))
+    return track_rows_of(read_raw_table(Path(path), Layout(TRACK_COLUMNS, REQUIRED)))
+
+
+def track_rows_of(raw: RawTable) -> TrackRows:
+    """The tracks in a table that may have further columns."""
     found = box_columns(raw, np.zeros(raw.length, dtype=np.bool_))
     timestamp = raw.numbers("timestamp")
     for name, column in (("timestamp", timestamp), ("id", id_ := raw.numbers("id"))):

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.detection_files import TRACK_COLUMNS, TrackRows, read_tracks, track_rows, write_rows
+from data_tools.detection_files import TRACK_COLUMNS, TrackRows, track_rows, write_rows
 from data_tools.detection_files.formats import Layout, read_raw_table
+from data_tools.detection_files.track_rows import REQUIRED, track_rows_of
 from data_tools.label_files.parquet import write_parquet
 from saga_fg.arrays import FloatArray, StrArray
 from saga_fg.dataset import Scene
@@ -57,9 +58,9 @@ def read_label_table(path: str | Path) -> LabelRows:
 
     Raises `InputError` naming file, row and column.
     """
-    raw = read_raw_table(Path(path), Layout(LABEL_COLUMNS, ("timestamp", "id", "x", "y")))
+    raw = read_raw_table(Path(path), Layout(LABEL_COLUMNS, REQUIRED))
     return LabelRows(
-        read_tracks(path), raw.numbers("yaw_variance"), raw.texts("source", "observed"), raw.texts("quality", "low")
+        track_rows_of(raw), raw.numbers("yaw_variance"), raw.texts("source", "observed"), raw.texts("quality", "low")
     )
 
 

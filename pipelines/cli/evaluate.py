@@ -139,6 +139,59 @@ def simulated(
         _report(lambda: evaluate_simulated(dataset, lambda: settings.new_tracker(method), progress), json_file, "")
 
 
+@evaluate_app.command()
+def labels(
+    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg smooth` wrote, or its table of boxes.")],
+    nuscenes_root: Annotated[
+        Path | None, typer.Option("--nuscenes", help="The recordings are nuScenes scenes under this folder.")
+    ] = None,
+    kitti_root: Annotated[
+        Path | None, typer.Option("--kitti", help="The recordings are KITTI sequences under this folder.")
+    ] = None,
+    file: Annotated[Path | None, typer.Option("--file", help="The recordings are this table of detections.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--simulated", min=0, help="The recordings are simulated traffic of this seed.")
+    ] = None,
+    detections: Annotated[
+        list[str] | None,
+        typer.Option("--detections", help="The detections, as for `saga-fg smooth`.", metavar="NAME=FILE"),
+    ] = None,
+    version: Annotated[str, typer.Option("--version", help="nuScenes: name of the folder of tables.")] = "v1.0-mini",
+    simulator: Annotated[
+        Path | None, typer.Option("--simulator", help="Simulated traffic: settings it was made with.", metavar="FILE")
+    ] = None,
+    without_truth: Annotated[
+        bool, typer.Option("--without-truth", help="Self-consistency only, as where nobody has labelled.")
+    ] = False,
+    method: MethodOption = "saga",
+    config: Config = None,
+    json_file: JsonFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """Judge labels beside the online tracks and the detections: recall, errors on the same boxes, calibration.
+
+    The scenes judged are those in the table. Where there is no ground truth, as in a file of one's own: how smooth the
+    labels are and how well they agree with the detections.
+
+    \b
+    Examples:
+      saga-fg evaluate labels labels --nuscenes data/nuscenes --detections lidar=megvii.json
+      saga-fg evaluate labels labels --kitti data/kitti --detections data/kitti/detections/pointrcnn
+      saga-fg evaluate labels labels --simulated 0 --json figures.json
+      saga-fg evaluate labels labels --file detections.csv
+    """
+    from pipelines.cli.labelled_recordings import labelled_recordings
+    from pipelines.evaluation import evaluate_labels
+    from pipelines.smoothing import load_smooth_config
+
+    found = labelled_recordings(
+        result, nuscenes_root, version, kitti_root, file, seed, simulator, detections or [], not without_truth
+    )
+    settings = load_smooth_config(found.family, config)
+    with progress_bar(len(found.dataset.scenes)) as progress:
+        _report(lambda: evaluate_labels(found.table, found.dataset, settings, method, progress), json_file, "")
+
+
 def _report(run: Callable[[], Evaluation], json_file: Path | None, doing: str = "scoring") -> None:
     """Run an evaluation, show its tables, write its figures."""
     from data_tools.atomic_files import check_writable

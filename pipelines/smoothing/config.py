@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
 from pipelines.config import Family, TrackConfig, load_config
 from pipelines.configuration import load_settings, read_settings
+from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.settings import settings_group
 from saga_fg.smoothing import SmoothingSettings
 
@@ -17,6 +19,10 @@ class SmoothConfig:
     """Everything that shapes labels: the online pass by `tracking`, the rest by `smoothing`."""
 
     tracking: TrackConfig = settings_group(TrackConfig, "the online pass: trackers and sensors")
+    sensors: Mapping[str, Sensor] = settings_group(
+        lambda: {DEFAULT: Sensor()},
+        "the sensors' models offline, where noise weighs near against far and need not leave room for association",
+    )
     smoothing: SmoothingSettings = settings_group(SmoothingSettings, "what makes labels of its tracks")
 
 
@@ -26,6 +32,7 @@ def load_smooth_config(family: Family, path: Path | None = None) -> SmoothConfig
     Raises `InputError` naming the file and the dotted key of what is wrong in it.
     """
     shipped = files("pipelines") / "configs" / "smoothing" / f"{family}.yaml"
-    config = SmoothConfig(tracking=load_config(family))
+    tracking = load_config(family)
+    config = SmoothConfig(tracking=tracking, sensors=tracking.sensors)
     config = read_settings(SmoothConfig, shipped.read_text(encoding="utf-8"), shipped.name, config)
     return config if path is None else load_settings(SmoothConfig, path, config)

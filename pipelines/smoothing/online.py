@@ -14,7 +14,7 @@ from saga_fg.smoothing.attribution import attribute
 from saga_fg.smoothing.evidence import Evidence, measured_in_order
 from saga_fg.tracking.settings import ClassSettings, class_values
 
-UPDATED_GATE = 0.9999  # an updated state lies nearer to its detection than the prediction did
+UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
 
 
 def track_evidence(

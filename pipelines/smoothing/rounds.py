@@ -80,7 +80,7 @@ def smooth_objects(
     score = evidence_scores(evidence, object_of, lives, within, settings.prior_time)
     kept = score >= settings.min_score
     object_of = np.where(np.isin(object_of, lives.id[kept]), object_of, -1)
-    standing = standing_states(within, evidence, object_of, settings.standing)
+    standing = standing_states(within, lives, evidence, object_of, settings.standing, settings.classes)
     final = rounds.final(lives.select(kept), object_of, states, standing)
     joined_count = len(tracklets) - len(joined)
     return SmoothedObjects(

@@ -47,9 +47,9 @@ def smooth_scene(
     tracking = config.tracking.of_method(method)
     with threadpool_limits(limits=1, user_api="blas"):  # threads cost more than they bring to small matrices
         start = time.perf_counter()
-        evidence = gather_evidence(scene.frames, scene.timestamps, tracking.sensors, tracking.tracker.classes)
+        evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, tracking.tracker.classes)
         tracker = tracking.new_tracker(method)
-        track_of = track_evidence(scene, tracker, evidence, tracking.sensors, tracking.tracker.classes, progress)
+        track_of = track_evidence(scene, tracker, evidence, config.sensors, tracking.tracker.classes, progress)
         objects = smooth_objects(evidence, track_of, config.smoothing, tracking.tracker)
         labels = label_moments(evidence, track_of, objects, scene.timestamps, config.smoothing)
         counts = count_labels(evidence, objects, labels, scene.timestamps)

@@ -25,11 +25,15 @@ class OfflineClass:
         0.1, "standard deviation of the part of a detector's position errors that lasts over a track, m"
     )
     motion_heading: float = setting(2.0, "speed from which the direction of motion tells the heading, m/s")
+    stand_speed: float = setting(0.5, "smoothed speed below which an object may stand, m/s")
+    stand_drift: float = setting(
+        0.5, "how far measured positions may drift from the beginning to the end of a stand, m"
+    )
     yaw_drift: float = setting(0.2, "how fast the heading changes, standard deviation after one second, rad")
 
     def __post_init__(self) -> None:
         require_positive(self, "acceleration_noise", "motion_heading")
-        require_between(self, 0, math.inf, "lasting_error", "yaw_drift")
+        require_between(self, 0, math.inf, "lasting_error", "stand_speed", "stand_drift", "yaw_drift")
 
     @property
     def motion(self) -> ConstantVelocity:
@@ -54,16 +58,14 @@ class JoiningSettings:
 
 @dataclass(frozen=True)
 class StandingSettings:
-    """When an object is taken to stand still, and how firmly it is pinned."""
+    """Objects that stand still (see the classes for how slow that is), and how firmly they are pinned."""
 
-    max_speed: float = setting(0.5, "smoothed speed below which an object may stand, m/s")
     min_time: float = setting(1.0, "shortest time it stands, s")
-    max_drift: float = setting(0.5, "how far measured positions may drift from the beginning to the end of a stand, m")
     velocity: float = setting(0.02, "standard deviation of its velocity meanwhile, m/s")
     noise: float = setting(1e-4, "factor on the process noise meanwhile")
 
     def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "max_speed", "min_time", "max_drift")
+        require_between(self, 0, math.inf, "min_time")
         require_positive(self, "velocity", "noise")
 
 

@@ -1,31 +1,40 @@
 r"""Objects that stand still, recognised from smoothed states and what was measured of them.
 
-A run of moments is a stand if the smoothed speed stays below `max_speed` for at least `min_time`, and the positions
-measured meanwhile drift no further than chance or a few decimetres would have it: with the weighted regression
+A run of moments is a stand if the smoothed speed stays below the class's `stand_speed` for at least `min_time`, and the
+positions measured meanwhile do not drift: with the weighted regression
 
     z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2
 
-the drift |u*| T over its duration T is below `max_drift`. A parked vehicle is one that stands in all its life.
+the drift |u*| T over its duration T is below the class's `stand_drift`. A parked vehicle stands in all its life.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from saga_fg.arrays import IntArray
 from saga_fg.smoothing.batch_states import Standing
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.settings import StandingSettings
-from saga_fg.smoothing.states import StateTable
+from saga_fg.smoothing.settings import OfflineClass, StandingSettings, offline_values
+from saga_fg.smoothing.states import Lives, StateTable
 
 
 def standing_states(
-    states: StateTable, evidence: Evidence, object_of: IntArray, settings: StandingSettings
+    states: StateTable,
+    lives: Lives,
+    evidence: Evidence,
+    object_of: IntArray,
+    settings: StandingSettings,
+    classes: Mapping[str, OfflineClass],
 ) -> Standing:
     """The states in which objects stand."""
     order = np.lexsort((states.moment, states.id))
     ids, moments = states.id[order], states.moment[order]
-    slow = np.hypot(*states.mean[order, 2:].T) <= settings.max_speed
+    label = lives.label[lives.rows_of(ids)]
+    slow = np.hypot(*states.mean[order, 2:].T) <= offline_values(classes, "stand_speed", label)
+    max_drift = offline_values(classes, "stand_drift", label)
     begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
     ends = np.flatnonzero(slow & np.concatenate([(ids[1:] != ids[:-1]) | ~slow[1:], [True]]))
     times = evidence.times
@@ -38,7 +47,7 @@ def standing_states(
             continue
         mine = slice(np.searchsorted(owner, ids[a]), np.searchsorted(owner, ids[a], side="right"))
         within = rows[mine][(seen_at[mine] >= moments[a]) & (seen_at[mine] <= moments[b])]
-        if len(within) and _drift(evidence, within) <= settings.max_drift:
+        if len(within) and _drift(evidence, within) <= max_drift[a]:
             kept.append(np.arange(a, b + 1))
     chosen = np.concatenate([np.empty(0, dtype=np.int64), *kept])
     return Standing(settings, moments[chosen], ids[chosen])

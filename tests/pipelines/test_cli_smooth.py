@@ -61,3 +61,39 @@ def test_an_output_that_cannot_be_written_is_found_before_the_work(tmp_path: Pat
     run = runner.invoke(app, ["smooth", "simulated", "-o", str(tmp_path / "missing" / "labels")])
     assert run.exit_code == 2
     assert "does not exist" in run.stderr
+
+
+def test_labels_are_judged_beside_online_tracks_and_detections(tmp_path: Path) -> None:
+    run = runner.invoke(app, ["smooth", "simulated", "--scenes", "1", "--seed", "9", "-o", str(tmp_path / "labels"),
+                              "--simulator", str(_short(tmp_path)), "--method", "kf"])  # fmt: skip
+    assert run.exit_code == 0, run.output
+    arguments = ["evaluate", "labels", str(tmp_path / "labels"), "--simulated", "9"]
+    run = runner.invoke(app, [*arguments, "--simulator", str(_short(tmp_path)), "--method", "kf"])
+    assert run.exit_code == 0, run.output
+    for title in ("Precision and recall", "by class", "by range", "by occlusion", "Calibration", "Self-consistency"):
+        assert title in run.output
+    run = runner.invoke(app, [*arguments, "--kitti", "x"])
+    assert run.exit_code == 2
+    assert "expected exactly one of" in run.stderr
+
+
+def test_labels_of_a_file_are_judged_without_truth(tmp_path: Path) -> None:
+    table = tmp_path / "detections.csv"
+    rows = [f"{0.1 * k:.1f},{k}.0,0.0,4.5,1.9,1.6,0.0,car,0.9" for k in range(15)]
+    table.write_text("timestamp,x,y,length,width,height,yaw,label,score\n" + "\n".join(rows) + "\n")
+    run = runner.invoke(app, ["smooth", "file", str(table), "-o", str(tmp_path / "labels")])
+    assert run.exit_code == 0, run.output
+    figures = tmp_path / "figures.json"
+    arguments = ["evaluate", "labels", str(tmp_path / "labels"), "--file", str(table), "--json", str(figures)]
+    run = runner.invoke(app, arguments)
+    assert run.exit_code == 0, run.output
+    found = json.loads(figures.read_text())
+    assert found["precision_recall"] == {}
+    assert found["consistency"]["labels"]["boxes"] == 15
+    assert found["consistency"]["labels"]["jerkiness"] < 1.0
+
+
+def _short(folder: Path) -> Path:
+    path = folder / "simulator.yaml"
+    path.write_text("duration: 3.0\n")
+    return path
