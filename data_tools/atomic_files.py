@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 from saga_fg.errors import InputError
 
-_LEFTOVER = re.compile(r"\..*\.[0-9a-f]{12}\.tmp", re.DOTALL)
+_LEFTOVER = re.compile(r"\.(.*)\.[0-9a-f]{12}\.tmp", re.DOTALL)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -90,10 +90,14 @@ def check_writable(path: str | Path) -> None:
     temporary.unlink()
 
 
-def remove_leftovers(folder: str | Path) -> None:
-    """Remove the temporary files of this module that killed processes have left in a folder; nobody may be writing."""
+def remove_leftovers(folder: str | Path, of: str | None = None) -> None:
+    """Remove the temporary files of this module that killed processes have left in a folder; nobody may be writing.
+
+    of: the name of the file or folder they were to become, None for any.
+    """
     for path in Path(folder).glob(".*.tmp"):
-        if _LEFTOVER.fullmatch(path.name):
+        leftover = _LEFTOVER.fullmatch(path.name)
+        if leftover and of in (None, leftover[1]):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 

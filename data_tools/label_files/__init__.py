@@ -2,13 +2,15 @@
 
 from data_tools.label_files.box_table import LABEL_COLUMNS, LabelRows, read_label_table, write_label_table
 from data_tools.label_files.kitti import write_kitti_labels
-from data_tools.label_files.nuscenes import write_nuscenes_labels
+from data_tools.label_files.nuscenes import merge_label_parts, write_label_part, write_nuscenes_labels
 
 __all__ = [
     "LABEL_COLUMNS",
     "LabelRows",
+    "merge_label_parts",
     "read_label_table",
     "write_kitti_labels",
+    "write_label_part",
     "write_label_table",
     "write_nuscenes_labels",
 ]

@@ -19,13 +19,14 @@ import hashlib
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory, write_text
+from data_tools.atomic_files import atomic_directory, atomic_file, write_text
 from data_tools.json_stream import open_json
 from data_tools.located import located
 from data_tools.nuscenes.tables import read_table, table_folder
@@ -36,6 +37,9 @@ from saga_fg.geometry import yaw_quaternion
 from saga_fg.smoothing import Labels
 
 Record = dict[str, Any]
+
+LabelledObject = tuple[str, list[Record]]
+"""The class of an object, and its annotations in order of time."""
 
 CATEGORY_OF_CLASS = {
     "barrier": "movable_object.barrier",
@@ -62,21 +66,47 @@ def write_nuscenes_labels(
     The tables hold all scenes of the version; those that are not among `scenes` have no annotations. Raises
     `InputError` for tables that are missing, a directory that is not writable, labels that do not fit their scene.
     """
-    source = table_folder(dataroot, version)
-    categories = dict(read_table(source, "category", ("name", "token")))
-    annotations: list[Record] = []
-    instances: list[Record] = []
+    _write_tables(directory, dataroot, version, _objects(str(directory), scenes))
+
+
+def write_label_part(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> None:
+    """Write what `merge_label_parts` needs of some scenes: a line `[class, [annotation, ...]]` an object.
+
+    Raises `InputError` as `write_nuscenes_labels` does.
+    """
+    with atomic_file(path) as file:
+        for one in _objects(str(path), scenes):
+            file.write(json.dumps(one, allow_nan=False).encode() + b"\n")
+
+
+def merge_label_parts(directory: str | Path, dataroot: str | Path, version: str, parts: Iterable[str | Path]) -> None:
+    """The same as `write_nuscenes_labels`, of files that `write_label_part` has written."""
+    _write_tables(directory, dataroot, version, (one for part in parts for one in _read_part(Path(part))))
+
+
+def _read_part(path: Path) -> Iterator[LabelledObject]:
+    with open_json(path) as file:
+        for line in file:
+            label, records = json.loads(line)
+            yield label, records
+
+
+def _objects(where: str, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> Iterator[LabelledObject]:
+    """The objects of some scenes; a class that nuScenes does not have is an `InputError`."""
     for scene, moments in scenes:
-        with located(f"{directory}: scene {scene.name}"):
+        with located(f"{where}: scene {scene.name}"):
             if len(moments) != len(scene):
                 raise InputError(f"expected labels for {len(scene)} samples, got {len(moments)}")
             for label, records in _annotations(scene, moments):
-                name = CATEGORY_OF_CLASS.get(label)
-                if name is None:
+                if label not in CATEGORY_OF_CLASS:
                     raise InputError(f"class {label}: expected one of {', '.join(CATEGORY_OF_CLASS)}")
-                category = categories.setdefault(name, _token("category", name))
-                annotations += records
-                instances.append(_instance(records, category))
+                yield label, records
+
+
+def _write_tables(directory: str | Path, dataroot: str | Path, version: str, objects: Iterable[LabelledObject]) -> None:
+    """Write all tables; those of annotations and instances object by object."""
+    source = table_folder(dataroot, version)
+    categories = dict(read_table(source, "category", ("name", "token")))
     with atomic_directory(directory) as folder:
         tables = folder / version
         tables.mkdir()
@@ -88,6 +118,12 @@ def write_nuscenes_labels(
             if mask.is_file() and Path(name).parts[0] == "maps":
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(mask, folder / name)
+        with _array(tables / "sample_annotation.json") as annotation, _array(tables / "instance.json") as instance:
+            for label, records in objects:
+                name = CATEGORY_OF_CLASS[label]
+                for record in records:
+                    annotation(record)
+                instance(_instance(records, categories.setdefault(name, _token("category", name))))
         with open_json(source / "category.json") as file:
             known: list[Record] = json.load(file)
         there = {record["token"] for record in known}
@@ -96,11 +132,25 @@ def write_nuscenes_labels(
             for name, token in categories.items()
             if token not in there
         ]
-        for table, rows in (("category", known), ("sample_annotation", annotations), ("instance", instances)):
-            write_text(tables / f"{table}.json", json.dumps(rows, allow_nan=False) + "\n")
+        write_text(tables / "category.json", json.dumps(known) + "\n")
 
 
-def _annotations(scene: Scene, moments: Sequence[Labels]) -> list[tuple[str, list[Record]]]:
+@contextmanager
+def _array(path: Path) -> Iterator[Callable[[Record], None]]:
+    """A function that appends a record to the JSON array that the file is."""
+    first = True
+    with path.open("w", encoding="utf-8") as file:
+
+        def append(record: Record) -> None:
+            nonlocal first
+            file.write(("[\n" if first else ",\n") + json.dumps(record, allow_nan=False))
+            first = False
+
+        yield append
+        file.write("[]\n" if first else "\n]\n")
+
+
+def _annotations(scene: Scene, moments: Sequence[Labels]) -> list[LabelledObject]:
     """The class of each object, and its annotations in order of time, linked."""
     of_object: dict[int, list[Record]] = defaultdict(list)
     class_of: dict[int, str] = {}

@@ -9,6 +9,7 @@ import typer
 
 from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_files
 from pipelines.cli.reporting import ReportingGroup, progress_bar
+from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import counted
 from pipelines.cli.tracking_options import MethodOption
 
@@ -44,6 +45,8 @@ def nuscenes(
     scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
     method: MethodOption = "saga",
     table: TableSuffix = "csv",
+    workers: Workers = None,
+    ray: RayAddress = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -53,13 +56,29 @@ def nuscenes(
     Example:
       saga-fg smooth nuscenes --dataroot data/nuscenes --version v1.0-mini --split mini_train \\
           --detections lidar=megvii.json --output labels
+      saga-fg smooth nuscenes --dataroot data/nuscenes --version v1.0-trainval --split train \\
+          --detections lidar=megvii.json --workers 0 --output labels   # all cores
     """
-    from data_tools.nuscenes import NuScenes
+    from data_tools.label_files import merge_label_parts
+    from data_tools.nuscenes import NuScenes, merge_tracking_results
+    from pipelines.scale_out import HeldScene, SmoothTask
     from pipelines.smoothing import load_smooth_config, smooth_dataset, write_nuscenes_run
 
     settings = load_smooth_config("nuscenes", config)
     chosen = chosen_scenes(dataroot, version, split, scenes)
     dataset = NuScenes(dataroot, version, sensor_files(detections), chosen)
+    if at_scale(workers, ray):
+        task = SmoothTask(settings, method, "nuscenes", f".{table}", dataset.meta)
+        inputs = (HeldScene(dataset.scene(name)) for name in chosen)
+
+        def merge() -> None:
+            merge_tracking_results(tracking, (output / task.tracking(name) for name in chosen), dataset.meta)
+            merge_label_parts(output, dataroot, version, (output / task.objects(name) for name in chosen))
+
+        tracking = output / "tracking.json"
+        tracking.unlink(missing_ok=True)
+        run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
+        return
     with progress_bar(len(chosen)) as progress:
         runs = smooth_dataset(dataset, settings, method, chosen, progress)
         done = write_nuscenes_run(output, runs, dataroot, version, dataset.meta, f".{table}")
@@ -78,6 +97,8 @@ def kitti(
     ] = None,
     method: MethodOption = "saga",
     table: TableSuffix = "csv",
+    workers: Workers = None,
+    ray: RayAddress = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -89,10 +110,16 @@ def kitti(
           --sequences 0000,0011 --output labels
     """
     from data_tools.kitti import KittiTracking
+    from pipelines.scale_out import KittiInput, SmoothTask
     from pipelines.smoothing import load_smooth_config, smooth_dataset, write_kitti_run
 
     settings = load_smooth_config("kitti", config)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
+    if at_scale(workers, ray):
+        inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
+        task = SmoothTask(settings, method, "kitti", f".{table}")
+        run_at_scale(inputs, len(dataset.scenes), task, output, workers, ray)
+        return
     with progress_bar(len(dataset.scenes)) as progress:
         runs = smooth_dataset(dataset, settings, method, progress=progress)
         done = write_kitti_run(output, runs, dataset, f".{table}")
@@ -110,6 +137,8 @@ def simulated(
     ] = None,
     method: MethodOption = "saga",
     table: TableSuffix = "csv",
+    workers: Workers = None,
+    ray: RayAddress = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -118,14 +147,20 @@ def simulated(
     \b
     Example:
       saga-fg smooth simulated --scenes 2 --seed 0 --output labels
+      saga-fg smooth simulated --scenes 200 --workers 2 --output labels
     """
     from data_tools.simulator import SimulatedTraffic, SimulatorSettings
     from pipelines.configuration import load_settings
+    from pipelines.scale_out import SimulatedInput, SmoothTask
     from pipelines.smoothing import load_smooth_config, smooth_dataset, write_labels
 
     settings = load_smooth_config("simulated", config)
     traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
     dataset = SimulatedTraffic(traffic, scenes, seed)
+    if at_scale(workers, ray):
+        inputs = (SimulatedInput(traffic, scenes, seed, name) for name in dataset.scenes)
+        run_at_scale(inputs, scenes, SmoothTask(settings, method, "table", f".{table}"), output, workers, ray)
+        return
     with progress_bar(scenes) as progress:
         done = write_labels(output, smooth_dataset(dataset, settings, method, progress=progress), f".{table}")
     _show(output, done)
@@ -133,13 +168,15 @@ def simulated(
 
 @smooth_app.command()
 def file(
-    detections: Annotated[Path, typer.Argument(help="Table of detections: .csv, .ndjson, .jsonl or .npz.")],
+    detections: Detections,
     output: Output,
     scenes: Annotated[
         str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
     ] = None,
     method: MethodOption = "saga",
     table: TableSuffix = "csv",
+    workers: Workers = None,
+    ray: RayAddress = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -150,12 +187,21 @@ def file(
     \b
     Example:
       saga-fg smooth file detections.csv --output labels
+      saga-fg smooth file 's3://fleet/2026-11/*.csv' --workers 0 --output labels
     """
     from data_tools.detection_files import read_detections
+    from data_tools.remote_files import local_copy
+    from pipelines.scale_out import DetectionFileInput, SmoothTask
     from pipelines.smoothing import load_smooth_config, smooth_dataset, write_labels
 
     settings = load_smooth_config("file", config)
-    dataset = read_detections(detections)
+    if at_scale(workers, ray):
+        urls = several(detections, scenes)
+        task = SmoothTask(settings, method, "table", f".{table}")
+        run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray)
+        return
+    with local_copy(only(detections)) as path:
+        dataset = read_detections(path)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
     with progress_bar(len(chosen)) as progress:
         done = write_labels(output, smooth_dataset(dataset, settings, method, chosen, progress), f".{table}")

@@ -9,10 +9,9 @@ import typer
 
 from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_files
 from pipelines.cli.reporting import progress_bar
-from pipelines.cli.scaling import RayAddress, Workers, at_scale, end_of, run_at_scale
+from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import Summary
 from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
-from saga_fg.errors import InputError
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -71,13 +70,13 @@ def nuscenes(
     if at_scale(workers, ray):
         task = TrackTask(settings, method, "nuscenes", dataset.meta)
         inputs = (HeldScene(dataset.scene(name)) for name in chosen)
-        report = run_at_scale(inputs, len(chosen), task, output, workers, ray)
-        merged = output / "tracks.json"
-        if report.failed:
-            merged.unlink(missing_ok=True)
-        else:
+
+        def merge() -> None:
             merge_tracking_results(merged, (output / task.result(name) for name in chosen), dataset.meta)
-        end_of(report)
+
+        merged = output / "tracks.json"
+        merged.unlink(missing_ok=True)
+        run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
         return
     summary = Summary(output)
     with progress_bar(len(chosen)) as progress:
@@ -121,7 +120,7 @@ def kitti(
     if at_scale(workers, ray):
         sequence_inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
         task = TrackTask(settings, method, "kitti")
-        end_of(run_at_scale(sequence_inputs, len(dataset.scenes), task, output, workers, ray))
+        run_at_scale(sequence_inputs, len(dataset.scenes), task, output, workers, ray)
         return
     summary = Summary(output)
     with progress_bar(len(dataset.scenes)) as progress:
@@ -133,13 +132,7 @@ def kitti(
 
 @track_app.command()
 def file(
-    detections: Annotated[
-        list[str],
-        typer.Argument(
-            help="Table of detections: .csv, .ndjson, .jsonl or .npz. In parallel: several of them, patterns, URLs, "
-            "or lists of such in a .txt file."
-        ),
-    ],
+    detections: Detections,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table of tracks to write: .csv, .ndjson or .jsonl.")],
     scenes: Annotated[
         str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
@@ -167,21 +160,17 @@ def file(
       saga-fg track file 's3://fleet/2026-11/*.csv' --workers 0 --output run   # writes run/tracks/NAME.csv
     """
     from data_tools.detection_files import read_detections, write_tracks
-    from data_tools.remote_files import expanded, local_copy
+    from data_tools.remote_files import local_copy
     from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset
 
     settings = configured("file", config, method, estimator, lag)
     if at_scale(workers, ray):
-        if scenes is not None:
-            raise InputError("--scenes: all scenes of a file are done with --workers or --ray")
-        urls = expanded(detections)
+        urls = several(detections, scenes)
         task = TrackTask(settings, method, ".csv" if table == "csv" else ".ndjson")
-        end_of(run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray))
+        run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray)
         return
-    if len(detections) > 1:
-        raise InputError("expected one table of detections, or --workers N and a folder as --output for several")
-    with local_copy(detections[0]) as path:
+    with local_copy(only(detections)) as path:
         apart(output, path)
         dataset = read_detections(path)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)

@@ -6,6 +6,7 @@ from pipelines.scale_out.local_pool import LocalPool
 from pipelines.scale_out.manifest import Manifest, Record, file_name
 from pipelines.scale_out.ray_pool import RayPool
 from pipelines.scale_out.run import Pool, Report, run_scenes
+from pipelines.scale_out.smoothing import SmoothTask
 from pipelines.scale_out.tracking import TrackTask
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "SceneInput",
     "SceneTask",
     "SimulatedInput",
+    "SmoothTask",
     "TrackTask",
     "file_name",
     "perform",

@@ -60,6 +60,7 @@ class Manifest:
 
     def clean(self) -> None:
         """Remove what a killed run left under temporary names."""
+        remove_leftovers(self._output.resolve().parent, self._output.resolve().name)
         for folder in (self._output, *(path for path in self._output.rglob("*") if path.is_dir())):
             remove_leftovers(folder)
 

@@ -53,11 +53,13 @@ def run_scenes(
     output: Path,
     new_pool: Callable[[Path], Pool],
     progress: Callable[[str, int, int], None] | None = None,
+    finish: Callable[[Report], None] | None = None,
 ) -> Report:
     """Do a task with every input, in whichever order; results in `output`, records in `output`/manifest.
 
     new_pool  makes the workers, given a folder for their temporary files
     progress  is called with the name of a scene that is finished, how many are, and `total`
+    finish    is called in the end, while nobody else may write to the folder
 
     Scenes that fail are in the report and in the manifest, and stop no other. Raises `InputError` for two inputs of one
     name, and if another run writes to the folder.
@@ -81,6 +83,8 @@ def run_scenes(
                     progress(outcome.name, report.scenes, total)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
+        if finish is not None:
+            finish(report)
     return report
 
 

@@ -172,5 +172,7 @@ def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     (tmp_path / ".folder.0123456789ab.tmp").mkdir()
     (tmp_path / ".folder.0123456789ab.tmp" / "inside").touch()
+    remove_leftovers(tmp_path, "b.csv")
+    assert (tmp_path / ".a.csv.0123456789ab.tmp").exists()
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"}

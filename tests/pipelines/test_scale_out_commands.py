@@ -108,12 +108,12 @@ def test_mistakes_end_in_one_line(
 
 
 def test_a_killed_run_is_completed_by_the_next(tmp_path: Path) -> None:
-    inputs = write_recordings(tmp_path / "in", 12, rows=60)
+    inputs = write_recordings(tmp_path / "in", 12, rows=40)
     run = ["track", "file", str(tmp_path / "in" / "*.csv"), "--workers", "2", "--output", str(tmp_path / "out")]
     driver = subprocess.Popen([*COMMAND, *run], stdout=subprocess.DEVNULL)
     while len(list(tmp_path.glob("out/manifest/*.json"))) < 3:
         assert driver.poll() is None
-        time.sleep(0.002)
+        time.sleep(0.02)
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
     done = {path: path.stat().st_mtime_ns for path in tmp_path.glob("out/manifest/*.json")}
@@ -163,3 +163,41 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     result = saga_fg("track", "file", tmp_path / "in" / "a00.csv", "--ray", "local", "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert result.stderr == 'error: --ray: Ray is not installed; pip install "saga-fg[ray]"\n'
+
+
+def test_labels_are_those_of_one_process(simulated: Path, tmp_path: Path) -> None:
+    smooth = ["smooth", *nuscenes(simulated)[1:]]
+    assert saga_fg(*smooth, "-o", tmp_path / "serial").exit_code == 0
+    result = saga_fg(*smooth, "-o", tmp_path / "run", "--workers", "2")
+    assert result.exit_code == 0, result.output
+    assert "3 scenes: 3 done, 0 unchanged, 0 failed, " in result.stdout
+    tables = sorted(path.relative_to(tmp_path / "serial") for path in (tmp_path / "serial" / "v1.0-mini").iterdir())
+    assert Path("v1.0-mini/sample_annotation.json") in tables
+    for name in (Path("tracking.json"), *tables):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "serial" / name).read_bytes(), name
+    header, *rows = (tmp_path / "serial" / "labels.csv").read_text().splitlines()
+    assert len(rows) > 20
+    parts = [path.read_text().splitlines() for path in sorted((tmp_path / "run" / "labels").iterdir())]
+    assert [part[0] for part in parts] == [header] * 3
+    assert [row for part in parts for row in part[1:]] == rows
+
+
+def test_simulated_scenes_in_parallel(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text("duration: 1.0\nwarm_up: 2.0\n")
+    smooth = ["smooth", "simulated", "--scenes", "2", "--simulator", tmp_path / "short.yaml"]
+    assert saga_fg(*smooth, "-o", tmp_path / "serial").exit_code == 0
+    assert saga_fg(*smooth, "-o", tmp_path / "run", "--workers", "1").exit_code == 0
+    parts = [path.read_text().splitlines(True) for path in sorted((tmp_path / "run" / "labels").iterdir())]
+    assert "".join([*parts[0], *parts[1][1:]]) == (tmp_path / "serial" / "labels.csv").read_text()
+
+
+def test_kitti_sequences_in_parallel(recordings: Path, tmp_path: Path) -> None:
+    kitti = recordings / "kitti"
+    track = [
+        *("track", "kitti", "--dataroot", kitti, "--detections", kitti / "detections" / "pointrcnn"),
+        *("--sequences", "0000,0017", "--method", "centerpoint"),
+    ]
+    assert saga_fg(*track, "-o", tmp_path / "serial").exit_code == 0
+    assert saga_fg(*track, "-o", tmp_path / "run", "--workers", "2").exit_code == 0
+    for name in ("0000.txt", "0017.txt"):
+        assert (tmp_path / "run" / "tracks" / name).read_bytes() == (tmp_path / "serial" / name).read_bytes()
