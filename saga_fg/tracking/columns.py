@@ -22,6 +22,7 @@ class TrackColumns:
     last_in_view  (n,) when it was last inside a sensor's field of view
     confirmed     (n,) misses no longer end it
     has_moved     (n,) was ever seen moving
+    looks, hits   (n,) how often a sensor looked where it was, and how often it was detected
     accepted      (n,) born from a sensor that is trusted alone, or confirmed since
     """
 
@@ -33,6 +34,8 @@ class TrackColumns:
     last_in_view: FloatArray
     confirmed: BoolArray
     has_moved: BoolArray
+    looks: FloatArray
+    hits: FloatArray
     accepted: BoolArray
 
     @classmethod
@@ -62,6 +65,8 @@ class TrackColumns:
             np.full(k, now),
             confirmed,
             np.zeros(k, dtype=bool),
+            np.ones(k),
+            np.ones(k),
             np.full(k, accepted),
         )
 

@@ -3,6 +3,8 @@ r"""The probability r that a track is a real object, by Bayes' rule.
     miss    r <- r (1 - p_D) / (1 - r p_D) exp(-dt / lifetime)
     match   r / (1 - r) <- r / (1 - r)  p / (1 - p)  (1 - c) / c
 
+    score   p ( hits / (looks + newness) )^w           when detected; without a detection times r and coasting_score
+
 p_D is the chance to be detected where the track is (0 where no sensor looks), p the detection's probability, and c the
 one at which a detection says nothing. Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data Association,
 IEEE Transactions on Automatic Control 39(6), 1994.
@@ -14,7 +16,8 @@ import math
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.tracking.columns import TrackColumns
 from saga_fg.tracking.settings import ExistenceSettings
 
 
@@ -30,3 +33,10 @@ def after_hit(existence: FloatArray, probability: FloatArray, settings: Existenc
     before = np.clip(existence, 1e-3, 1 - 1e-3)
     after = before / (1 - before) * odds
     return np.clip(after / (1 + after), 0.0, 0.999)
+
+
+def reported_score(columns: TrackColumns, coasting: BoolArray, settings: ExistenceSettings) -> FloatArray:
+    """(n,) how sure a track's box is: by its latest detection, by how steadily it is detected, less while coasting."""
+    steadiness = (columns.hits / (columns.looks + settings.newness)) ** settings.steadiness_weight
+    unseen = columns.existence * settings.coasting_score
+    return np.asarray(columns.score * steadiness * np.where(coasting, unseen, 1.0))

@@ -2,13 +2,14 @@ r"""Which detection of a frame belongs to which track, class by class.
 
     cost_ij      = d_ij^2 + log det S_ij - w GIoU_ij
     unmatched_ij = a 2 log( p_D r_i / (1 - p_D r_i) ) + b 2 log( p_j / (1 - p_j) ) - 2 log( 2 pi lambda )
+    lambda       = sum over j of (1 - p_j) / clutter_area
 
 A pair is matched for less than what it costs to leave both alone: with w = 0 and a = b = 1 the difference of the two is
 -2 log of the ratio of likelihoods that the detection is the track's, or that the track was missed and the detection is
-false or of a new object. r_i is the track's existence, p_D the sensor's detection probability, p_j the detection's
-probability, lambda how many false detections and newcomers there are per m^2; a and b below 1 say that r and p are no
-more than indications. So a track that nobody believes in can't take a strong detection from afar, and of two detections
-the stronger one is preferred. Without lambda any pair inside the gate is better than none.
+false. r_i is the track's existence, p_D the sensor's detection probability, p_j the detection's probability; a and b
+below 1 say that they are no more than indications. lambda is how many false detections of the class there are per m^2:
+as many as the frame's own scores admit, so that it fits any detector. A track that nobody believes in can't take a
+strong detection from afar, least of all among many weak ones, and of two detections the stronger one is preferred.
 
 Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
 Generalized Intersection over Union, CVPR 2019.
@@ -26,6 +27,8 @@ from saga_fg.boxes import Boxes
 from saga_fg.overlap import giou_3d
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import AssociationSettings, TrackerSettings, settings_of
+
+LEAST_CLUTTER = 0.05  # false detections to be reckoned with, however sure the detector is
 
 
 def associate(
@@ -61,12 +64,13 @@ def associate(
 
 
 def _unmatched(expected: FloatArray, probability: FloatArray, settings: AssociationSettings) -> FloatArray | None:
-    """(n, m) of the module; None where no density is given."""
-    if settings.false_density == 0:
+    """(n, m) of the module; None where clutter is spread over an infinite area."""
+    if settings.clutter_area == math.inf:
         return None
+    density = max(float((1 - probability).sum()), LEAST_CLUTTER) / settings.clutter_area
     of_track = settings.existence_weight * _log_odds(expected)
     of_detection = settings.score_weight * _log_odds(probability)
-    return 2 * (of_track[:, None] + of_detection - math.log(2 * math.pi * settings.false_density))
+    return 2 * (of_track[:, None] + of_detection - math.log(2 * math.pi * density))
 
 
 def _log_odds(probability: FloatArray) -> FloatArray:

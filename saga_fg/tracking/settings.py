@@ -67,15 +67,16 @@ class AssociationSettings:
     """How detections are matched to tracks, see `saga_fg.tracking.matching`; gates and caps are the classes'."""
 
     method: Literal["hungarian", "greedy"] = setting("hungarian", "least total cost, or the cheapest pair first")
-    false_density: float = setting(
-        0.0, "false detections and newcomers of a class per m^2; 0: any pair inside the gate is better than none"
+    clutter_area: float = setting(
+        math.inf, "what is false in a frame is spread over this area, m^2; .inf: any pair inside the gate is a match"
     )
-    existence_weight: float = setting(0.5, "how much the existence of a track counts, 1 by its face value, 0 not")
+    existence_weight: float = setting(0.3, "how much the existence of a track counts, 1 by its face value, 0 not")
     score_weight: float = setting(0.5, "how much the probability of a detection counts, 1 by its face value, 0 not")
 
     def __post_init__(self) -> None:
         require_one_of(self, "method", ("hungarian", "greedy"))
-        require_between(self, 0, math.inf, "false_density", "existence_weight", "score_weight")
+        require_positive(self, "clutter_area", infinite=True)
+        require_between(self, 0, math.inf, "existence_weight", "score_weight")
 
 
 @dataclass(frozen=True)
@@ -86,11 +87,15 @@ class ExistenceSettings:
     clutter_score: float = setting(0.2, "probability score at which a matched detection neither helps nor hurts")
     report: float = setting(0.0, "tracks are reported from this existence probability on")
     confirm: float = setting(0.9, "from here on a track is confirmed: misses no longer end it, only time does")
+    newness: float = setting(0.0, "looks in vain a new track starts with in the share of looks that saw it")
+    steadiness_weight: float = setting(0.0, "power of that share that a track's score is multiplied by, 0 for none")
+    coasting_score: float = setting(1.0, "what a track's score is worth without a detection, besides its existence")
     give_up: float = setting(0.02, "unconfirmed tracks below this existence probability are removed")
 
     def __post_init__(self) -> None:
         require_positive(self, "lifetime", infinite=True)
-        require_between(self, 0, 1, "clutter_score", "report", "confirm", "give_up")
+        require_between(self, 0, 1, "clutter_score", "report", "confirm", "give_up", "coasting_score")
+        require_between(self, 0, math.inf, "newness", "steadiness_weight")
         if self.clutter_score in (0, 1):
             raise InputError(f"clutter_score: expected a probability inside 0 to 1, got {self.clutter_score!r}")
 

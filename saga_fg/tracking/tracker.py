@@ -25,7 +25,7 @@ from saga_fg.track import Tracks
 from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.columns import TrackColumns
-from saga_fg.tracking.existence import after_hit, after_miss
+from saga_fg.tracking.existence import after_hit, after_miss, reported_score
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.matching import associate
 from saga_fg.tracking.observation import Observed, observe
@@ -180,8 +180,11 @@ class Tracker:
             return
         visible = sensor.sees(self._kinematics().position + self._origin, frame.world_T_ego)
         columns.last_in_view[visible] = self._time
+        columns.looks[visible] += 1
         missed = np.ones(len(columns.id), dtype=bool)
         missed[matching.track] = False
+        columns.looks[~missed & ~visible] += 1
+        columns.hits[matching.track] += 1
         p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
         p, settings = observed.probability[matching.detection], self.settings.existence
         columns.existence[missed] = after_miss(columns.existence[missed], p_detect[missed], elapsed, settings)
@@ -244,7 +247,7 @@ class Tracker:
         rows = np.flatnonzero(shown)
         position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())
         boxes = self._boxes(rows, position, velocity)
-        score = columns.score[rows] * np.where(coasting[rows] > 0, columns.existence[rows], 1.0)
+        score = reported_score(columns, coasting > 0, settings.existence)[rows]
         return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])
 
     # views on the state

@@ -48,21 +48,21 @@ def test_classes_keep_to_themselves():
     assert pairs(boxes([0.0, 10.0], ["car", "bus"]), boxes([0.1, 10.2], ["car", "bus"])) == [(0, 0), (1, 1)]
 
 
-def test_without_a_density_all_that_is_inside_the_gate_is_matched():
+def test_without_an_area_all_that_is_inside_the_gate_is_matched():
     assert pairs(boxes([0.0]), boxes([3.5]), probability=0.01, expected=0.01) == [(0, 0)]
     assert pairs(boxes([0.0]), boxes([9.0])) == []
 
 
 def test_a_track_that_nobody_believes_in_takes_no_detection_from_afar():
     for expected, matched in ((0.8, [(0, 0)]), (0.01, [])):
-        assert pairs(boxes([0.0]), boxes([3.0]), expected=expected, false_density=1e-3, existence_weight=1.0) == matched
-    assert pairs(boxes([0.0]), boxes([0.5]), expected=0.01, false_density=1e-3, existence_weight=1.0) == [(0, 0)]
+        assert pairs(boxes([0.0]), boxes([3.0]), expected=expected, clutter_area=100.0, existence_weight=1.0) == matched
+    assert pairs(boxes([0.0]), boxes([0.5]), expected=0.01, clutter_area=100.0, existence_weight=1.0) == [(0, 0)]
 
 
 def test_the_stronger_of_two_detections_is_preferred_where_scores_count():
     found = boxes([0.5, -0.6])
-    assert pairs(boxes([0.0]), found, [0.1, 0.9], false_density=1e-3, score_weight=0.0) == [(0, 0)]
-    assert pairs(boxes([0.0]), found, [0.1, 0.9], false_density=1e-3, score_weight=1.0) == [(0, 1)]
+    assert pairs(boxes([0.0]), found, [0.1, 0.9], clutter_area=1000.0, score_weight=0.0) == [(0, 0)]
+    assert pairs(boxes([0.0]), found, [0.1, 0.9], clutter_area=1000.0, score_weight=1.0) == [(0, 1)]
 
 
 def test_the_decision_is_that_of_the_likelihood_ratio():
@@ -70,8 +70,16 @@ def test_the_decision_is_that_of_the_likelihood_ratio():
     p, r, density, S = 0.7, 0.6, 2e-3, 1.0 + 0.09
     limit = np.sqrt(2 * S * np.log(r / (1 - r) * p / (1 - p) / (2 * np.pi * density * S)))
     for x, matched in ((limit - 0.01, [(0, 0)]), (limit + 0.01, [])):
-        told = {"false_density": density, "existence_weight": 1.0, "score_weight": 1.0}
+        told = {"clutter_area": (1 - p) / density, "existence_weight": 1.0, "score_weight": 1.0}
         assert pairs(boxes([0.0]), boxes([x]), p, r, **told) == matched
+
+
+def test_among_many_weak_detections_a_match_needs_to_be_nearer():
+    """They say that the detector is wrong often."""
+    crowd = boxes([2.5, *np.arange(50.0, 100.0)])
+    for others, matched in ((0.9, [(0, 0)]), (0.05, [])):
+        told = {"clutter_area": 1000.0, "existence_weight": 1.0, "score_weight": 1.0}
+        assert pairs(boxes([0.0]), crowd, [0.5, *np.full(50, others)], **told) == matched
 
 
 def test_overlap_decides_between_detections_equally_far():
