@@ -7,6 +7,7 @@ Linear families give native `gtsam.JacobianFactor`s, which no solver needs Pytho
 
 from factors.absolute import attitude_factor, position_factor
 from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
+from factors.calibrated_range import calibrated_range_factors
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
@@ -61,6 +62,7 @@ __all__ = [
     "bearing_range_factor",
     "between_factor",
     "box",
+    "calibrated_range_factors",
     "check_dimensions",
     "detection_factor",
     "detection_factors",
