@@ -1,15 +1,18 @@
 """Odometry between consecutive poses in space, with the slow errors of the device as states of their own.
 
-A device that counts wheels or matches scans reports the increment a_T_b = (R_m, d) over dt seconds. Its length is wrong
-by a scale s and its heading turns with a bias b, both of which wander slowly:
+A device that counts wheels or matches scans reports the increment (R_m, d) over dt seconds. Its length is wrong by a
+scale s and its heading turns with a bias b, both of which wander slowly:
 
-    R_b = R_a Exp(b dt e_z) R_m Exp(noise)        t_b = t_a + R_a ((1 + s) d + noise)        (s, b)' = (s, b) + noise
+    R_m = Exp(b dt e_z) R_a^T R_b Exp(noise)      d = (1 + s) R_a^T (t_b - t_a) + noise      (s, b)' = (s, b) + noise
 
 Residuals, in the frame of the first pose (8 rows):
 
-    r_rotation    = Log( (Exp(b dt e_z) R_m)^T R_a^T R_b )
-    r_translation = R_a^T (t_b - t_a) - (1 + s) d
+    r_rotation    = Log( R_m^T Exp(b dt e_z) R_a^T R_b )
+    r_translation = (1 + s) R_a^T (t_b - t_a) - d
     r_error       = (s, b)' - (s, b)
+
+The scale stands at the true motion, not at the measured one: there it would scale the noise of d as well, and be drawn
+to where that is small.
 
 With the errors held at 0 by a prior this is the plain factor between two poses. The bias model is that of a gyroscope
 mounted upright (Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed. 2013,
@@ -69,30 +72,30 @@ class _Odometry:
     dt: FloatArray
 
     def residual(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-        translation = self._moved(a, b) - (1 + before[:, :1]) * self.d
+        translation = (1 + before[:, :1]) * self._moved(a, b) - self.d
         return np.concatenate([rotation_log(self._turned(a, b, before)), translation, after - before], axis=1)
 
     def jacobians(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> Sequence[FloatArray]:
         n = len(self.d)
         Ra, Rb = a[:, :3, :3], b[:, :3, :3]
         E = self._turned(a, b, before)
-        inverse = inverse_right_jacobian(rotation_log(E))
+        inverse, moved, scale = inverse_right_jacobian(rotation_log(E)), self._moved(a, b), 1 + before[:, 0, None, None]
         J_a, J_b, J_before, J_after = (np.zeros((n, 8, d)) for d in (6, 6, 2, 2))
         J_a[:, :3, :3] = -inverse @ Rb.swapaxes(1, 2) @ Ra
         J_b[:, :3, :3] = inverse
         axis = E.swapaxes(1, 2) @ self.R.swapaxes(1, 2) @ _UP
-        J_before[:, :3, 1] = -self.dt[:, None] * (inverse @ axis[:, :, None])[:, :, 0]
-        J_a[:, 3:6, :3] = cross_matrix(self._moved(a, b))
-        J_a[:, 3:6, 3:] = -np.eye(3)
-        J_b[:, 3:6, 3:] = Ra.swapaxes(1, 2) @ Rb
-        J_before[:, 3:6, 0] = -self.d
+        J_before[:, :3, 1] = self.dt[:, None] * (inverse @ axis[:, :, None])[:, :, 0]
+        J_a[:, 3:6, :3] = scale * cross_matrix(moved)
+        J_a[:, 3:6, 3:] = -scale * np.eye(3)
+        J_b[:, 3:6, 3:] = scale * (Ra.swapaxes(1, 2) @ Rb)
+        J_before[:, 3:6, 0] = moved
         J_before[:, 6:] = -np.eye(2)
         J_after[:, 6:] = np.eye(2)
         return [J_a, J_b, J_before, J_after]
 
     def _turned(self, a: FloatArray, b: FloatArray, before: FloatArray) -> FloatArray:
-        expected = rotation_exp((before[:, 1] * self.dt)[:, None] * _UP) @ self.R
-        return np.asarray(expected.swapaxes(1, 2) @ a[:, :3, :3].swapaxes(1, 2) @ b[:, :3, :3])
+        turned = rotation_exp((before[:, 1] * self.dt)[:, None] * _UP)
+        return np.asarray(self.R.swapaxes(1, 2) @ turned @ a[:, :3, :3].swapaxes(1, 2) @ b[:, :3, :3])
 
     def _moved(self, a: FloatArray, b: FloatArray) -> FloatArray:
         return np.asarray((a[:, :3, :3].swapaxes(1, 2) @ (b[:, :3, 3] - a[:, :3, 3])[:, :, None])[:, :, 0])

@@ -127,6 +127,20 @@ class SceneGraph:
         """The same nodes, moving on their own: the classical filter's graph."""
         return SceneGraph(self.nodes, self.types)
 
+    def only(self, nodes: IntArray) -> SceneGraph:
+        """The graph of those of its nodes that are among `nodes` (any ids), with the edges between them."""
+        kept = np.flatnonzero(np.isin(self.nodes, nodes))
+        row = np.full(len(self), -1, dtype=np.int64)
+        row[kept] = np.arange(len(kept))
+        groups = []
+        for group in self.edges:
+            inside = np.flatnonzero((row[group.target] >= 0) & (row[group.source] >= 0))
+            target, source = row[group.target[inside]], row[group.source[inside]]
+            triple = (group.A_self[inside], group.A_other[inside], group.b[inside])
+            groups.append(Edges(group.interaction, target, source, group.rate[inside], *triple))
+        types = tuple(self.types[k] for k in kept.tolist())
+        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept])
+
     @staticmethod
     def of(nodes: Sequence[int] | IntArray, node_type: NodeType, edges: Sequence[Edges] = ()) -> SceneGraph:
         """A graph whose nodes are all of one type."""

@@ -1,6 +1,7 @@
 """Trajectories of a vehicle: KITTI's and TUM's files, alignment, absolute and relative errors."""
 
 from data_tools.trajectories.alignment import Alignment, aligned, rigid_alignment
+from data_tools.trajectories.degraded import degraded_odometry
 from data_tools.trajectories.errors import (
     TrajectoryErrors,
     absolute_errors,
@@ -18,6 +19,7 @@ __all__ = [
     "TrajectoryErrors",
     "absolute_errors",
     "aligned",
+    "degraded_odometry",
     "matched",
     "read_kitti_poses",
     "read_tum_poses",

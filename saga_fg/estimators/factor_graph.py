@@ -99,7 +99,7 @@ def _recording_graph(
             gone = layout.rows(moment.gone)
             stay = layout.without(gone) if len(gone) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
-            native, nonlinear = _motion_factors(moment.motion, stay, at, keys[k], keys[k + 1])
+            native, nonlinear = motion_factors(moment.motion, stay, at, keys[k], keys[k + 1])
             linear += native
             for factor in nonlinear:
                 graph.add(factor.as_custom_factor())
@@ -150,7 +150,7 @@ def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
     return [H]
 
 
-def _motion_factors(
+def motion_factors(
     motion: Motion | Standstill, layout: Layout, mean: FloatArray, keys: dict[int, int], next_keys: dict[int, int]
 ) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactor]]:
     """Factors of an interval, native ones and those of nodes that move nonlinearly."""

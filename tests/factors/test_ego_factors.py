@@ -108,14 +108,37 @@ def test_odometry_without_errors_is_the_increment_between_two_poses():
     factors = odometry_factors([[0, 1, 2, 3]], step[None], [0.5], np.eye(8))
     values = values_of([0, 1, 2, 3], [a, b, np.zeros(2), np.zeros(2)])
     assert factors.error(values) == pytest.approx(0.0, abs=1e-12)
-    values.update(2, np.array([0.1, 0.2]))  # 10 % longer, turned by 0.1 rad more
+    values.update(2, np.array([0.1, 0.2]))  # what is reported is 10 % too long and turned by 0.1 rad too much
     values.update(3, np.array([0.1, 0.2]))
-    turned = a @ np.block([[rotation_exp(np.array([[0, 0, 0.1]]))[0], np.zeros((3, 1))], [np.zeros(3), 1]])
-    expected = np.eye(4)
-    expected[:3, :3] = turned[:3, :3] @ step[:3, :3]
-    expected[:3, 3] = a[:3, 3] + a[:3, :3] @ (1.1 * step[:3, 3])
-    values.update(1, gtsam.Pose3(expected))
+    true = step.copy()
+    true[:3, :3] = rotation_exp(np.array([[0, 0, -0.1]]))[0] @ step[:3, :3]
+    true[:3, 3] /= 1.1
+    values.update(1, gtsam.Pose3(a @ true))
     assert factors.error(values) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_noisy_increments_do_not_pull_at_the_scale():
+    """Where the motion is known, the best scale is the true one, however noisy the increments."""
+    rng = np.random.default_rng(2)
+    n = 2000
+    poses = np.tile(np.eye(4), (n + 1, 1, 1))
+    poses[:, 0, 3] = 0.1 * np.arange(n + 1)
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    steps[:, :3, 3] = 1.05 * steps[:, :3, 3] + rng.normal(0, 0.1, (n, 3))
+    errors = n + 1 + np.arange(n + 1)
+    factors = odometry_factors(
+        np.column_stack([np.arange(n), np.arange(1, n + 1), errors[:-1], errors[1:]]),
+        steps,
+        np.full(n, 0.1),
+        np.diag([1e-4] * 3 + [1e-2] * 3 + [1e-10] * 2),
+    )
+    graph = nonlinear_graph(prior_factors([n + 1], np.zeros((1, 2)), np.eye(2)), {n + 1: 2})
+    known = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    for k in range(n + 1):
+        graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(poses[k]), known))
+    start = values_of(range(2 * n + 2), [*poses, *np.zeros((n + 1, 2))])
+    scale = solve(graph, [factors], start).values.atVector(n + 1)[0]
+    assert scale == pytest.approx(0.05, abs=4 * 0.1 / (0.1 * np.sqrt(n)))
 
 
 def test_pose_and_objects_are_recovered_together():
@@ -125,7 +148,7 @@ def test_pose_and_objects_are_recovered_together():
     truth = [gtsam.Pose3(gtsam.Rot3.Yaw(0.05 * k), np.array([2.0 * k, 0.1 * k * k, 0.3])) for k in range(5)]
     step = np.stack([truth[k].between(truth[k + 1]).matrix() for k in range(4)])
     reported = step.copy()
-    reported[:, :3, 3] /= 1.2
+    reported[:, :3, 3] *= 1.2
     poses, errors, names = range(5), range(5, 10), np.arange(10, 13)
     noise = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-8] * 2)
     odometry = odometry_factors(

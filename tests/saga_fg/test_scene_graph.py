@@ -100,3 +100,13 @@ def test_columns_are_read_only():
     assert not edges().rate.flags.writeable
     assert not edges().target.flags.writeable
     assert not SceneGraph.of([1], CAR).nodes.flags.writeable
+
+
+def test_a_part_of_a_graph_keeps_the_edges_within_it():
+    ring = edges((0, 1, 2), (1, 2, 0), rate=[0.1, 0.2, 0.3])
+    graph = SceneGraph(np.array([7, 5, 9]), (CAR,) * 3, (ring,), np.array([1.0, 2.0, 3.0]))
+    part = graph.only(np.array([9, 5, 100]))
+    assert part.nodes.tolist() == [5, 9]
+    assert part.diffusion_scale.tolist() == [2.0, 3.0]
+    (group,) = part.edges
+    assert (group.target.tolist(), group.source.tolist(), group.rate.tolist()) == ([0], [1], [0.2])

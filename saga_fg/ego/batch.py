@@ -1,0 +1,92 @@
+"""Path of the vehicle and objects around it, from a whole recording at once.
+
+Two discrete questions depend on the path that is sought: which detection belongs to which object, and which objects
+stand. So they are answered along the odometry's path, the graph of all moments is solved, and the answers are given
+anew along the path found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+
+from factors import SolverSettings, solve
+from saga_fg.arrays import FloatArray
+from saga_fg.ego.estimate import JointEstimate, read_estimate
+from saga_fg.ego.graph import Keyed, error_key, linear_graph, nonlinear_factors, object_key, pose_key, start_graph
+from saga_fg.ego.odometry import Odometry
+from saga_fg.ego.record import register
+from saga_fg.ego.settings import JointSettings
+from saga_fg.ego.standing import SlowErrors, standing_probabilities
+from saga_fg.errors import InputError
+from saga_fg.frame import Frame
+from saga_fg.geometry import transform_points
+from saga_fg.interactions import POSITION
+from saga_fg.tracking import Tracker
+
+_TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
+
+
+def estimate_jointly(
+    frames: Sequence[Frame],
+    odometry: Odometry,
+    new_tracker: Callable[[], Tracker],
+    settings: JointSettings | None = None,
+    start: FloatArray | None = None,
+) -> JointEstimate:
+    """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
+
+    odometry: between the frames' times; new_tracker: gives a fresh tracker, which registers detections; start: first
+    pose (4, 4), by default the identity. Detections in ego or sensor coordinates, or in those of the world with the
+    pose they were transformed by. Raises `InputError` where frames and odometry do not fit together.
+    """
+    settings = settings or JointSettings()
+    check_times(frames, odometry)
+    path = odometry.path(start)
+    slow = SlowErrors(settings.odometry.scale, settings.odometry.bias)
+    estimate = None
+    for _ in range(settings.rounds):
+        moments = register(frames, path, odometry.a_T_b, new_tracker(), settings.motion_noise)
+        standing = standing_probabilities(moments, path, slow, settings)
+        estimate = _solved(list(enumerate(moments)), path, standing, settings)
+        path, slow = estimate.world_T_ego, estimate.slow_errors
+    assert estimate is not None
+    return estimate
+
+
+def check_times(frames: Sequence[Frame], odometry: Odometry) -> None:
+    """Raise `InputError` unless each moment of the odometry is that of a frame."""
+    times = np.array([frame.timestamp for frame in frames])
+    if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
+        raise InputError(
+            f"frames: expected one at each of the {len(odometry)} moments of the odometry, got {len(times)}"
+        )
+
+
+def _solved(record: Keyed, path: FloatArray, standing: Sequence[FloatArray], settings: JointSettings) -> JointEstimate:
+    """All objects moving first, which needs no good start; from there with those that stand."""
+    graph = start_graph(0, path[0], settings)
+    graph.push_back(linear_graph(record))
+    solver = SolverSettings(max_iterations=settings.max_iterations, tolerance=_TOLERANCE)
+    values = start_values(record, path)
+    for standing_or_none in (None, standing):
+        solution = solve(graph, nonlinear_factors(record, settings, standing_or_none), values, solver)
+        values = solution.values
+    return read_estimate(record, solution)
+
+
+def start_values(record: Keyed, path: FloatArray) -> gtsam.Values:
+    """Where to begin: along a path (n, 4, 4), objects where they were last detected, at rest."""
+    values = gtsam.Values()
+    place: dict[int, FloatArray] = {}
+    for (k, moment), pose in zip(record, path, strict=True):
+        values.insert(pose_key(k), gtsam.Pose3(pose))
+        values.insert(error_key(k), np.zeros(2))
+        place.update(zip(moment.seen.id.tolist(), transform_points(pose, moment.seen.z)[:, :2], strict=True))
+        for name, node_type in zip(moment.objects.id.tolist(), moment.objects.types, strict=True):
+            state = np.zeros(node_type.dim)
+            state[node_type.index(POSITION)] = place[name]
+            values.insert(object_key(k, name), state)
+    return values

@@ -1,0 +1,127 @@
+"""Which objects stand? The discrete part of the joint estimation, decided from where they were detected.
+
+Around each detection of an object, within a window, D is the mean place of the later half of the detections less that
+of the earlier half, in the world along the path assumed so far, and T the time between the two. An object that stands
+has D ~ N(0, S): noise of the detections and of the odometry over the T seconds and s metres in between,
+
+    S = R (1/n_1 + 1/n_2) + distance_noise^2 s + time_noise^2 T + (scale s)^2 + range^2 (turn_noise^2 T + (bias T)^2)
+
+with the deviations of scale and bias as known so far; one that moves has D ~ N(0, S + (moving_speed T)^2). By Bayes,
+with even odds before,    P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (moving_speed T)^2)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.ego.record import EgoMoment
+from saga_fg.ego.settings import JointSettings
+from saga_fg.geometry import transform_points
+
+_SHORTEST = 0.3  # of the window: less time between the halves decides nothing
+
+
+@dataclass(frozen=True)
+class SlowErrors:
+    """Standard deviations of what is known of the odometry's scale and of its bias of the yaw rate (rad/s)."""
+
+    scale: float
+    bias: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Sightings:
+    """All detections, by object and time: object, moment (N,), time, place (N, 2), variance, range, driven (N,)."""
+
+    object: IntArray
+    moment: IntArray
+    time: FloatArray
+    place: FloatArray
+    variance: FloatArray
+    range: FloatArray
+    driven: FloatArray
+
+
+def standing_probabilities(
+    record: list[EgoMoment], path: FloatArray, slow: SlowErrors, settings: JointSettings
+) -> list[FloatArray]:
+    """For each moment the probabilities (n,) that its objects stand; path (K, 4, 4) assumed so far.
+
+    0 where too little was seen to tell. Between two detections it is the smaller one of theirs.
+    """
+    seen = _sightings(record, path)
+    p = _probabilities(seen, slow, settings)
+    result = [np.zeros(len(moment.objects.id)) for moment in record]
+    if not len(p):
+        return result
+    first = np.flatnonzero(np.append(True, seen.object[1:] != seen.object[:-1]))
+    for start, end in zip(first, np.append(first[1:], len(p)), strict=True):
+        name, moments, mine = seen.object[start], seen.moment[start:end], p[start:end]
+        for k in range(int(moments[0]), int(moments[-1]) + 1):
+            after = int(np.searchsorted(moments, k))
+            value = mine[after] if moments[after] == k else min(mine[after - 1], mine[after])
+            row = int(np.searchsorted(record[k].objects.id, name))
+            if row < len(record[k].objects.id) and record[k].objects.id[row] == name:
+                result[k][row] = value
+    return result
+
+
+def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings) -> FloatArray:
+    """P(stands) (N,) of the object of each detection, around it."""
+    n = len(seen.object)
+    if n == 0:
+        return np.empty(0)
+    far = 4 * (seen.time.max() - seen.time.min() + settings.standing_window)  # puts objects apart on one axis
+    axis = seen.time - seen.time.min() + far * np.unique(seen.object, return_inverse=True)[1]
+    low = np.searchsorted(axis, axis - settings.standing_window / 2, "left")
+    high = np.searchsorted(axis, axis + settings.standing_window / 2, "right")
+    start = np.searchsorted(seen.object, seen.object, "left")
+    end = np.searchsorted(seen.object, seen.object, "right")
+    # at an end of its life the window is shifted into it
+    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.standing_window, "left"), low)
+    low = np.maximum(low, start)
+    high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.standing_window, "right"), high)
+    high = np.minimum(high, end)
+    middle = (low + high) // 2
+    n1, n2 = middle - low, high - middle
+
+    def half(values: FloatArray, a: IntArray, b: IntArray) -> FloatArray:
+        total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+        count = np.maximum(b - a, 1).reshape(-1, *(1,) * (values.ndim - 1))
+        return np.asarray((total[b] - total[a]) / count)
+
+    columns = np.column_stack([seen.place, seen.time - seen.time.min(), seen.driven])
+    D, T, s = np.split(half(columns, middle, high) - half(columns, low, middle), [2, 3], axis=1)
+    T, s = T[:, 0], s[:, 0]
+    noise, distance = settings.odometry, half(seen.range, low, high)
+    S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
+    S = S + noise.distance_noise**2 * s + noise.time_noise**2 * T + (slow.scale * s) ** 2
+    S = S + distance**2 * (noise.turn_noise**2 * T + (slow.bias * T) ** 2)
+    M = S + (settings.moving_speed * T) ** 2
+    d2 = (D**2).sum(axis=1)
+    odds = np.log(M / S) - d2 / 2 * (1 / S - 1 / M)  # log, two dimensions
+    p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
+    return np.where((n1 > 0) & (_SHORTEST * settings.standing_window <= T), p, 0.0)
+
+
+def _sightings(record: list[EgoMoment], path: FloatArray) -> _Sightings:
+    moments = np.repeat(np.arange(len(record)), [len(moment.seen.id) for moment in record]).astype(np.int64)
+    names = np.concatenate([moment.seen.id for moment in record])
+    order = np.lexsort((moments, names))
+    place = [transform_points(pose, moment.seen.z)[:, :2] for moment, pose in zip(record, path, strict=True)]
+    variance = np.concatenate([np.trace(moment.seen.R, axis1=1, axis2=2) / 2 for moment in record])
+    distance = np.concatenate([np.hypot(moment.seen.z[:, 0], moment.seen.z[:, 1]) for moment in record])
+    driven = np.cumsum([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in record])
+    time = np.array([moment.time for moment in record])[moments]
+    return _Sightings(
+        names[order],
+        moments[order],
+        time[order],
+        np.concatenate(place)[order],
+        variance[order],
+        distance[order],
+        driven[moments][order],
+    )
