@@ -8,8 +8,6 @@ from data_tools.metrics import Interval, calibration, error_figures, errors_by_c
 from pipelines.bench.tracking import SetResult, verdict
 from pipelines.figures import FigureTable, cell
 
-_SHARES = ("sAMOTA", "MOTA")
-
 
 def tables(result: SetResult) -> list[FigureTable]:
     """For people: the variants, what the graph changes, how honest the covariances are."""
@@ -54,7 +52,7 @@ def _variants(result: SetResult) -> FigureTable:
 def _headline(name: str, value: float) -> str:
     if name.endswith("IDS") or name == "FRAG":
         return cell(value, 0)
-    return cell(100 * value, 2) if name.endswith(_SHARES) and name not in _SHARES else cell(value)
+    return cell(100 * value, 2) if name.endswith((" MOTA", " sAMOTA")) else cell(value)  # KITTI: in %
 
 
 def _differences(result: SetResult) -> list[FigureTable]:

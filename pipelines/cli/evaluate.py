@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, TypeVar
 
 import typer
 
@@ -20,11 +21,26 @@ evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup
 Hota = Annotated[bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")]
 
 
+Plots = Annotated[
+    Path | None,
+    typer.Option("--plots", help="Folder to draw recall sweeps, calibration and errors to.", metavar="DIR"),
+]
+
+
 class Evaluation(Protocol):
     """What an evaluation gives."""
 
     def tables(self) -> list[FigureTable]: ...
     def figures(self) -> dict[str, object]: ...
+
+
+class Drawn(Evaluation, Protocol):
+    """One that can be drawn as well."""
+
+    def pictures(self) -> dict[str, object]: ...
+
+
+AnyEvaluation = TypeVar("AnyEvaluation", bound=Evaluation)
 
 
 @evaluate_app.callback()
@@ -51,6 +67,7 @@ def nuscenes(
     ] = None,
     hota: Hota = False,
     json_file: JsonFile = None,
+    plots: Plots = None,
     verbose: Verbose = False,
 ) -> None:
     """Score a nuScenes tracking result, by the official metrics and at its labels.
@@ -67,7 +84,8 @@ def nuscenes(
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
     files = sensor_files(detections or [])
-    _report(lambda: evaluate_nuscenes(result, dataroot, version, chosen, files, hota), json_file)
+    evaluation = _report(lambda: evaluate_nuscenes(result, dataroot, version, chosen, files, hota), json_file)
+    _draw(evaluation, plots)
 
 
 @evaluate_app.command()
@@ -87,6 +105,7 @@ def kitti(
     ] = None,
     hota: Hota = False,
     json_file: JsonFile = None,
+    plots: Plots = None,
     verbose: Verbose = False,
 ) -> None:
     """Score KITTI tracking results by the 3D metrics averaged over recall, and at their labels.
@@ -103,7 +122,10 @@ def kitti(
 
     chosen = names("--sequences", sequences) if sequences is not None else None
     overlaps, labels = _overlaps(iou), names("--classes", classes)
-    _report(lambda: evaluate_kitti(result, dataroot, chosen, labels, overlaps, detections, hota), json_file)
+    evaluation = _report(
+        lambda: evaluate_kitti(result, dataroot, chosen, labels, overlaps, detections, hota), json_file
+    )
+    _draw(evaluation, plots)
 
 
 @evaluate_app.command()
@@ -119,6 +141,7 @@ def simulated(
         typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE"),
     ] = None,
     json_file: JsonFile = None,
+    plots: Plots = None,
     verbose: Verbose = False,
 ) -> None:
     """Track simulated traffic and score it against the simulator's truth, hidden objects included.
@@ -135,8 +158,10 @@ def simulated(
     settings = configured("simulated", config, method, estimator, lag)
     traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
     dataset = SimulatedTraffic(traffic, scenes, seed)
+    new_tracker = partial(settings.new_tracker, method)
     with progress_bar(scenes) as progress:
-        _report(lambda: evaluate_simulated(dataset, lambda: settings.new_tracker(method), progress), json_file, "")
+        evaluation = _report(lambda: evaluate_simulated(dataset, new_tracker, progress), json_file, "")
+    _draw(evaluation, plots)
 
 
 @evaluate_app.command()
@@ -192,7 +217,7 @@ def labels(
         _report(lambda: evaluate_labels(found.table, found.dataset, settings, method, progress), json_file, "")
 
 
-def _report(run: Callable[[], Evaluation], json_file: Path | None, doing: str = "scoring") -> None:
+def _report(run: Callable[[], AnyEvaluation], json_file: Path | None, doing: str = "scoring") -> AnyEvaluation:
     """Run an evaluation, show its tables, write its figures."""
     from data_tools.atomic_files import check_writable
     from pipelines.figures import write_figures
@@ -204,6 +229,18 @@ def _report(run: Callable[[], Evaluation], json_file: Path | None, doing: str = 
     show_tables(evaluation.tables())
     if json_file is not None:
         write_figures(json_file, evaluation.figures())
+    return evaluation
+
+
+def _draw(evaluation: Drawn, plots: Path | None) -> None:
+    """Write the pictures of an evaluation, if they are wanted."""
+    from data_tools.atomic_files import atomic_directory
+    from data_tools.plots import png
+
+    if plots is not None:
+        with atomic_directory(plots) as folder:
+            for name, picture in evaluation.pictures().items():
+                (folder / f"{name}.png").write_bytes(png(picture))
 
 
 def _overlaps(text: str) -> tuple[float, ...]:

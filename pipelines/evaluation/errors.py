@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.metrics import Calibration, ErrorFigures, LabelErrors, calibration, error_figures, errors_by_class
+from data_tools.plots import calibration_plot, error_histograms
 from pipelines.figures import FigureTable, cell
 
 _ERRORS = (
@@ -47,6 +48,12 @@ def error_json(errors: LabelErrors) -> dict[str, Any]:
             for name, c in fits.items()
         },
     }
+
+
+def error_pictures(errors: LabelErrors) -> dict[str, Any]:
+    """matplotlib figures by name: error histograms and, if there are covariances, how well they fit."""
+    pictures = {"errors": error_histograms(errors)}
+    return pictures | ({"calibration": calibration_plot(errors)} if np.isfinite(errors.nees).any() else {})
 
 
 def _error_cells(f: ErrorFigures) -> tuple[str, ...]:

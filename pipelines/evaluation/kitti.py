@@ -18,7 +18,7 @@ from data_tools.metrics import (
     label_errors,
     label_velocities,
 )
-from pipelines.evaluation.errors import error_json, error_tables
+from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
 from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.figures import FigureTable, cell
@@ -55,6 +55,10 @@ class KittiEvaluation:
             **error_json(self.errors),
             "hota": hota_json(self.hota),
         }
+
+    def pictures(self) -> dict[str, Any]:
+        """matplotlib figures by name."""
+        return error_pictures(self.errors)
 
 
 def evaluate_kitti(

@@ -21,7 +21,8 @@ from data_tools.metrics import (
     nuscenes_tracking_metrics,
 )
 from data_tools.nuscenes import NuScenes, read_scored_scenes
-from pipelines.evaluation.errors import error_json, error_tables
+from data_tools.plots import recall_sweep
+from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
 from pipelines.evaluation.placed_detections import PlacedBoxes, placed_detections
 from pipelines.figures import FigureTable, cell, count
@@ -57,6 +58,10 @@ class NuScenesEvaluation:
             **error_json(self.errors),
             "hota": hota_json(self.hota),
         }
+
+    def pictures(self) -> dict[str, Any]:
+        """matplotlib figures by name."""
+        return {"recall": recall_sweep(self.tracking.curves), **error_pictures(self.errors)}
 
 
 def evaluate_nuscenes(

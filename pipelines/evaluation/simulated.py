@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from data_tools.metrics import LabelErrors, SceneMetrics, TrackTable, label_errors, scene_metrics_by_label
-from pipelines.evaluation.errors import error_json, error_tables
+from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.figures import FigureTable, cell
 from pipelines.tracking import OnlineTracker, Progress, track_dataset
 from saga_fg.dataset import Annotations, Dataset
@@ -42,6 +42,10 @@ class SimulatedEvaluation:
             "tracking": {name: _figures(metrics) for name, metrics in self.metrics.items()},
             **error_json(self.errors),
         }
+
+    def pictures(self) -> dict[str, Any]:
+        """matplotlib figures by name."""
+        return error_pictures(self.errors)
 
 
 def evaluate_simulated(

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_tools.plots import Panel, birds_eye_view, png, trails
+from data_tools.metrics import LabelErrors, RecallCurves
+from data_tools.plots import (
+    Panel,
+    birds_eye_view,
+    calibration_plot,
+    error_histograms,
+    png,
+    recall_sweep,
+    trails,
+)
 from saga_fg import Annotations, Boxes, Detections, Tracks
 from saga_fg.geometry import yaw_transform
 
@@ -50,3 +59,44 @@ def test_unknown_sizes_and_headings_are_drawn_as_a_square() -> None:
     first, second = figure.axes
     assert np.ptp(first.lines[0].get_xdata()) == 1.0
     assert len(second.lines) == 0
+
+
+def label_errors(nees: np.ndarray) -> LabelErrors:
+    n = len(nees)
+    column = np.linspace(0.0, 1.0, n)
+    return LabelErrors(
+        np.full(n, "car"), np.arange(n), column, np.ones(n, dtype=bool), column / 2, column, column, column, nees
+    )
+
+
+def test_calibration_follows_the_diagonal_where_covariances_are_right() -> None:
+    nees = np.random.default_rng(0).chisquare(2, 4000)
+    (ax,) = calibration_plot(label_errors(nees)).axes
+    line = next(line for line in ax.lines if str(line.get_label()).startswith("car"))
+    np.testing.assert_allclose(line.get_ydata(), line.get_xdata(), atol=0.03)
+    (ax,) = calibration_plot(label_errors(nees / 4)).axes  # covariances too large
+    assert (ax.lines[0].get_ydata() >= ax.lines[0].get_xdata()).all()
+    assert len(calibration_plot(label_errors(np.full(5, np.nan))).axes[0].lines) == 1  # the diagonal alone
+
+
+def test_error_histograms_are_cumulative_and_show_the_detections() -> None:
+    figure = error_histograms(label_errors(np.ones(1000)))
+    position, velocity, heading = figure.axes
+    overall, detections = (line for line in position.lines if line.get_color() == "C0")
+    x, y = overall.get_data()
+    np.testing.assert_allclose(y, np.minimum(x, 1.0), atol=0.01)
+    np.testing.assert_allclose(detections.get_ydata(), np.minimum(2 * x, 1.0), atol=0.02)
+    assert len(velocity.lines) == len(heading.lines) == 2
+
+
+def test_recall_sweeps_leave_out_what_is_not_reached() -> None:
+    recall = np.linspace(1.0, 0.1, 10)
+    reached = np.where(recall > 0.75, np.nan, 0.5)
+    curves = RecallCurves(recall, *([reached] * 8))
+    figure = recall_sweep({"car": curves})
+    assert len(figure.axes) == 4
+    for ax in figure.axes:
+        (line,) = ax.lines
+        assert max(line.get_xdata()) <= 0.75
+        assert set(line.get_ydata()) == {0.5}
+    assert png(figure).startswith(b"\x89PNG")

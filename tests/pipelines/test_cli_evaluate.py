@@ -29,8 +29,20 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_nuscenes_figures_are_those_of_the_metrics(drive: Path, tmp_path: Path) -> None:
     file = tmp_path / "figures.json"
-    result = evaluate("nuscenes", drive / "result.json", "--dataroot", drive, "--split", "drive", "--json", file)
+    result = evaluate(
+        "nuscenes",
+        drive / "result.json",
+        "--dataroot",
+        drive,
+        "--split",
+        "drive",
+        "--json",
+        file,
+        "--plots",
+        tmp_path / "plots",
+    )
     assert result.exit_code == 0, result.output
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"recall.png", "errors.png"}
     metrics = nuscenes_tracking_metrics(list(read_scored_scenes(drive / "result.json", drive, VERSION).values()))
     figures = json.loads(file.read_text())
     assert figures["scenes"] == ["scene-0", "scene-1"]
