@@ -15,6 +15,7 @@ from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_lidar import lidar
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_paper import paper
+from pipelines.cli.bench_reading import reading
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
 from pipelines.cli.bench_streaming import streaming
@@ -33,6 +34,7 @@ bench_app.command()(metrics)
 bench_app.command()(lidar)
 bench_app.command()(slam)
 bench_app.command()(streaming)
+bench_app.command()(reading)
 bench_app.command()(paper)
 bench_app.command()(tracking)
 
