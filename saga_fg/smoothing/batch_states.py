@@ -5,13 +5,15 @@ r"""The states of all objects at all moments of a recording, given everything th
     detection     rho( || z - H x_i(k) ||_R )                              every attributed detection
     standing      || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object stands
 
-over one factor graph (`saga_fg.estimators.BatchSmoother`). The edges of an interval follow from given states at its
-start: those of an earlier, simpler round. Robust losses (`factors.robust`) are reached by reweighting between rounds.
+over one factor graph (`saga_fg.estimators.BatchSmoother`; long recordings in windows, by `WindowedSmoother`, which
+comes to the same within a millimetre and does not keep all matrices of an hour). The edges of an interval follow from
+given states at its start: those of an earlier, simpler round. Robust losses (`factors.robust`) are reached by
+reweighting between rounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +21,7 @@ import numpy as np
 from factors import Robust
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import BatchSmoother, Measurements
+from saga_fg.estimators import BatchSmoother, Measurements, Smoothed, WindowedSmoother
 from saga_fg.interactions import VELOCITY
 from saga_fg.node import NodeType
 from saga_fg.scene_graph import SceneGraph
@@ -27,6 +29,7 @@ from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.settings import OfflineClass, StandingSettings, offline_class
 from saga_fg.smoothing.states import Lives, StateTable
 
+LONG_RECORDING = 120.0  # s from which it is smoothed in windows
 UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of a life, m
 LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
 
@@ -71,7 +74,15 @@ def smooth_states(
     weight = np.ones(len(evidence)) if weight is None else weight
     types = _node_types(lives, classes)
     start = _first_positions(evidence, object_of, lives)
-    smoother = BatchSmoother(likelihoods=False)
+    smoother: BatchSmoother | WindowedSmoother
+    long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
+    smoother = WindowedSmoother() if long else BatchSmoother(likelihoods=False)
+    parts: list[tuple[int, IntArray, FloatArray, FloatArray]] = []
+
+    def keep(moments: Sequence[Smoothed]) -> None:
+        for state in moments:
+            parts.append((begin + len(parts), state.nodes, state.mean(state.nodes), state.covariance(state.nodes)))
+
     present = np.empty(0, dtype=np.int64)
     moments = evidence.moment
     bounds = np.searchsorted(moments, np.arange(len(evidence.times) + 1))
@@ -102,11 +113,11 @@ def smooth_states(
         if gone.any():
             smoother.marginalise(lives.id[present[gone]])
             present = present[~gone]
+        if isinstance(smoother, WindowedSmoother):
+            keep(smoother.final())
     if end < begin:
         return StateTable.of_moments([])
-    parts = []
-    for k, state in enumerate(smoother.smoothed()):
-        parts.append((begin + k, state.nodes, state.mean(state.nodes), state.covariance(state.nodes)))
+    keep(smoother.finish() if isinstance(smoother, WindowedSmoother) else smoother.smoothed())
     return StateTable.of_moments([part for part in parts if len(part[1])])
 
 
@@ -122,7 +133,9 @@ def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, 
     return weight
 
 
-def _measure(smoother: BatchSmoother, evidence: Evidence, object_of: IntArray, rows: slice, weight: FloatArray) -> None:
+def _measure(
+    smoother: BatchSmoother | WindowedSmoother, evidence: Evidence, object_of: IntArray, rows: slice, weight: FloatArray
+) -> None:
     """Take in the attributed detections of a moment."""
     mine = np.arange(rows.start, rows.stop)[object_of[rows] >= 0]
     for velocity in (True, False):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from factors import Robust
 from saga_fg.boxes import Boxes
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import Gaussian, kalman_predict, kalman_update, rts_smooth
+from saga_fg.estimators import Gaussian, WindowedSmoother, kalman_predict, kalman_update, rts_smooth
 from saga_fg.frame import Detections, Frame
 from saga_fg.node import NodeType
 from saga_fg.scene_graph import SceneGraph
@@ -19,6 +20,7 @@ from saga_fg.smoothing import (
     Standing,
     StandingSettings,
     StateTable,
+    batch_states,
     gather_evidence,
     lives_of_evidence,
     robust_weights,
@@ -68,6 +70,27 @@ def test_an_object_alone_is_smoothed_as_by_the_textbook() -> None:
     expected = rts_smooth(filtered, predicted, F)
     assert np.allclose(states.mean, [g.mean for g in expected], atol=1e-6)
     assert np.allclose(states.covariance, [g.covariance for g in expected], rtol=1e-5, atol=1e-9)
+
+
+def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    times = 0.5 * np.arange(260)
+    path = np.stack([3.0 * times, 10 * np.sin(times / 9)], axis=-1) + rng.normal(0, SIGMA, (260, 2))
+    evidence = evidence_of(times.tolist(), np.stack([path, path + 5], axis=1).tolist())
+    owner = np.tile([0, 1], 260)
+    owner[100:110] = -1  # both are hidden for a while
+    lives = lives_of_evidence(owner, evidence.boxes.label, evidence.moment)
+    V = np.tile(25 * np.eye(2), (2, 1, 1))
+    windows = []
+    final = WindowedSmoother.final
+    monkeypatch.setattr(WindowedSmoother, "final", lambda self: windows.append(out := final(self)) or out)
+    in_windows = smooth_states(evidence, owner, lives, V, CLASSES)
+    assert sum(map(len, windows)) > 200
+    monkeypatch.setattr(batch_states, "LONG_RECORDING", 1000.0)
+    at_once = smooth_states(evidence, owner, lives, V, CLASSES)
+    assert (in_windows.id == at_once.id).all()
+    assert np.allclose(in_windows.mean, at_once.mean, rtol=0, atol=1e-3)
+    assert np.allclose(in_windows.covariance, at_once.covariance, rtol=0, atol=1e-6)
 
 
 def test_lives_reach_from_first_to_last_detection_and_further_where_wanted() -> None:
