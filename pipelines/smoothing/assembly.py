@@ -29,9 +29,9 @@ HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, 
 
 
 def label_moments(
-    evidence: Evidence, track_of: IntArray, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
+    evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
 ) -> tuple[Labels, ...]:
-    """The labels at the times `wanted` (M,), s. track_of (N,): the online track of each detection, -1 for none."""
+    """The labels at the times `wanted` (M,), s."""
     lives, states = objects.lives, objects.states
     owner = lives.rows_of(states.id)
     rows = np.flatnonzero(objects.object_of >= 0)
@@ -50,7 +50,7 @@ def label_moments(
     lasting = offline_values(settings.classes, "lasting_error", label)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
-    source = _sources(evidence, track_of, objects, wanted)
+    source = _sources(evidence, objects, wanted)
     quality = quality_of(objects.score[owner], P, settings.quality)
     moments = []
     for time in wanted.tolist():
@@ -70,15 +70,17 @@ def count_labels(
     """The summary of a recording."""
     source = np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])
     at = np.searchsorted(evidence.times, wanted)
-    gone = objects.dropped
-    dropped = np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)
+    dropped = sum(
+        int((np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)).sum())
+        for gone in objects.dropped
+    )
     return LabelCounts(
         observed=int((source == "observed").sum()),
         filled=int((source == "filled").sum()),
         extended=int((source == "extended").sum()),
-        dropped=int(dropped.sum()),
+        dropped=dropped,
         objects=len(objects.lives),
-        dropped_objects=len(gone),
+        dropped_objects=sum(map(len, objects.dropped)),
         joined=objects.joined,
     )
 
@@ -106,7 +108,7 @@ def _time_to_detection(states: StateTable, times: FloatArray, object_of: IntArra
     return np.asarray(np.minimum(np.abs(keys[after] - wanted), np.abs(wanted - keys[np.maximum(after - 1, 0)])))
 
 
-def _sources(evidence: Evidence, track_of: IntArray, objects: SmoothedObjects, wanted: FloatArray) -> StrArray:
+def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> StrArray:
     """(R,) extended before and after the detections of the online tracks; else observed at the wanted moment that is
     nearest to a detection, filled elsewhere."""
     states, times = objects.states, evidence.times
@@ -118,7 +120,7 @@ def _sources(evidence: Evidence, track_of: IntArray, objects: SmoothedObjects, w
     hit = states.rows_of(nearest, objects.object_of[rows])
     observed[hit[hit >= 0]] = True
     online: Lives = lives_of_evidence(
-        np.where(track_of >= 0, objects.object_of, -1), evidence.boxes.label, evidence.moment
+        np.where(objects.track_of >= 0, objects.object_of, -1), evidence.boxes.label, evidence.moment
     )
     row = online.rows_of(states.id)
     beyond = (states.moment < online.first[row]) | (states.moment > online.last[row])

@@ -1,7 +1,7 @@
 """The rounds of smoothing a recording: each knows more than the one before, and leaves better objects.
 
-1. tracklets on their own, reaching beyond both ends;
-2. the same with the edges that follow from round 1: ends and beginnings that meet become one object;
+1. tracklets on their own, reaching beyond both ends; those with next to no evidence go;
+2. the others with the edges that follow from round 1: ends and beginnings that meet become one object;
 3. the objects so joined, with edges: detections nobody took are claimed, objects with too little evidence dropped, and
    stands recognised;
 4. what is left, from first to last detection, with edges, robust losses and pinned stands: the final states.
@@ -34,6 +34,7 @@ from saga_fg.smoothing import (
 from saga_fg.tracking import TrackerSettings
 from saga_fg.tracking.settings import class_values
 
+TAKES_PART = 0.5  # share of the score an object needs that a tracklet needs to become part of one
 MAX_CLAIM = 3.0  # largest distance between a state and a detection it claims, m
 
 
@@ -43,20 +44,22 @@ class SmoothedObjects:
 
     lives      the objects kept
     object_of  (N,) the object of each detection, -1 for none or one that was dropped
+    track_of   (N,) the online track of each detection, -1 for none or one that did not take part
     states     of the objects at all moments of their lives
     score      (n,) of the lives
     standing   the states in which an object stands
     joined     tracklets that became part of another's object
-    dropped    the lives of the objects dropped
+    dropped    the lives of the tracklets and objects dropped
     """
 
     lives: Lives
     object_of: IntArray
+    track_of: IntArray
     states: StateTable
     score: FloatArray
     standing: Standing
     joined: int
-    dropped: Lives
+    dropped: tuple[Lives, Lives]
 
 
 def smooth_objects(
@@ -65,15 +68,22 @@ def smooth_objects(
     """All rounds. track_of (N,): the online track of each detection, -1 for none."""
     rounds = _Rounds(evidence, settings, tracker)
     label, moment = evidence.boxes.label, evidence.moment
-    tracklets = lives_of_evidence(track_of, label, moment)
-    states = rounds.reaching(tracklets, track_of, max(settings.extension, settings.joining.max_gap))
+    everything = lives_of_evidence(track_of, label, moment)
+    ahead = max(settings.extension, settings.joining.max_gap)
+    states = rounds.alone(everything, track_of, ahead)
+    score = evidence_scores(evidence, track_of, everything, states.within(everything), settings.prior_time)
+    weak = everything.select(score < TAKES_PART * settings.min_score)
+    tracklets = everything.select(score >= TAKES_PART * settings.min_score)
+    track_of = np.where(np.isin(track_of, tracklets.id), track_of, -1)
+    states = rounds.coupled(tracklets, track_of, ahead, states.select(np.isin(states.id, tracklets.id)))
     first = join_tracklets(tracklets, states, rounds.velocity_prior(tracklets), evidence, settings.joining)
     object_of = track_of.copy()
     tracked = np.flatnonzero(track_of >= 0)
     object_of[tracked] = first[tracklets.rows_of(track_of[tracked])]
 
     joined = lives_of_evidence(object_of, label, moment)
-    states = rounds.reaching(joined, object_of, settings.extension)
+    states = rounds.alone(joined, object_of, settings.extension)
+    states = rounds.coupled(joined, object_of, settings.extension, states)
     object_of = claim_detections(evidence, object_of, joined, states, settings.claim, MAX_CLAIM)
     lives = lives_of_evidence(object_of, label, moment)
     within = states.within(lives)
@@ -82,9 +92,15 @@ def smooth_objects(
     object_of = np.where(np.isin(object_of, lives.id[kept]), object_of, -1)
     standing = standing_states(within, lives, evidence, object_of, settings.standing, settings.classes)
     final = rounds.final(lives.select(kept), object_of, states, standing)
-    joined_count = len(tracklets) - len(joined)
     return SmoothedObjects(
-        lives.select(kept), object_of, final, score[kept], standing, joined_count, lives.select(~kept)
+        lives.select(kept),
+        object_of,
+        track_of,
+        final,
+        score[kept],
+        standing,
+        len(tracklets) - len(joined),
+        (weak, lives.select(~kept)),
     )
 
 
@@ -101,14 +117,18 @@ class _Rounds:
         speed = class_values(self.tracker.classes, "birth_speed", lives.label)
         return np.asarray(speed[:, None, None] ** 2 * np.eye(2))
 
-    def reaching(self, lives: Lives, object_of: IntArray, ahead: float) -> StateTable:
-        """States of objects that reach beyond their detections: on their own, then with the edges that follow."""
+    def alone(self, lives: Lives, object_of: IntArray, ahead: float) -> StateTable:
+        """States without edges of objects that reach beyond their detections, by `ahead` s at their ends."""
         longer = lives.reaching(self.evidence.times, self.settings.extension, ahead)
-        prior, classes = self.velocity_prior(longer), self.settings.classes
-        states = smooth_states(self.evidence, object_of, longer, prior, classes, no_edges)
+        return smooth_states(self.evidence, object_of, longer, self.velocity_prior(longer), self.settings.classes)
+
+    def coupled(self, lives: Lives, object_of: IntArray, ahead: float, states: StateTable) -> StateTable:
+        """The same with the edges that follow from given states."""
         if not self.tracker.edges:
             return states
+        longer = lives.reaching(self.evidence.times, self.settings.extension, ahead)
         edges = self._edges(longer, object_of, states)
+        prior, classes = self.velocity_prior(longer), self.settings.classes
         return smooth_states(self.evidence, object_of, longer, prior, classes, edges)
 
     def final(self, lives: Lives, object_of: IntArray, states: StateTable, standing: Standing) -> StateTable:

@@ -51,7 +51,7 @@ def smooth_scene(
         tracker = tracking.new_tracker(method)
         track_of = track_evidence(scene, tracker, evidence, config.sensors, tracking.tracker.classes, progress)
         objects = smooth_objects(evidence, track_of, config.smoothing, tracking.tracker)
-        labels = label_moments(evidence, track_of, objects, scene.timestamps, config.smoothing)
+        labels = label_moments(evidence, objects, scene.timestamps, config.smoothing)
         counts = count_labels(evidence, objects, labels, scene.timestamps)
         seconds = time.perf_counter() - start
     return SmoothedScene(scene, labels, counts, len(scene.frames), seconds)
