@@ -6,7 +6,7 @@ with ground truth", Journal of Field Robotics 26, 2009), as text with GTSAM:
     NAME_GT.txt   time, x, y, heading        (optional: the truth)                     s, m, m, rad
     NAME_TL.txt   beacon, x, y               (optional: the truth)                     m
 
-Times must not decrease.
+Times of the odometry must not decrease; ranges may come in any order, and are sorted by time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class BeaconRanges:
     """A drive with ranges to beacons.
 
     time      (N,) s, of each row of odometry; distance (N,) m and turn (N,) rad since the row before
-    measured  (M,) s, when each range was; beacon (M,) its number; range (M,) m
+    measured  (M,) s, when each range was, not decreasing; beacon (M,) its number; range (M,) m
     truth     the true trajectory, where there is one; beacons: true places (2,) by number, m
     """
 
@@ -62,13 +62,14 @@ def read_plaza(path: str | Path) -> BeaconRanges:
     if (measured[:, 3] <= 0).any():
         row = int(np.argmax(measured[:, 3] <= 0))
         raise ranges.fault(row, f"range: expected a number > 0, got {measured[row, 3]:g}")
+    order = np.argsort(measured[:, 0], kind="stable")
     return BeaconRanges(
         _increasing(odometry, rows[:, 0]),
         rows[:, 1],
         rows[:, 2],
-        _increasing(ranges, measured[:, 0]),
-        _beacons(ranges, measured[:, 2]),
-        measured[:, 3],
+        measured[order, 0],
+        _beacons(ranges, measured[:, 2])[order],
+        measured[order, 3],
         _truth(files["GT"]) if files["GT"].exists() else None,
         _places(files["TL"]) if files["TL"].exists() else {},
     )

@@ -5,6 +5,11 @@ innovation of an observation takes the correlation of pose and landmark into acc
 and every `smooth_every` observations the whole graph is solved anew from where it stood, so that linearisation errors
 do not add up; the joint marginal of the newest pose and all landmarks then replaces the Gaussian. At the same time
 landmarks that turn out to be one are merged (see `merging`).
+
+How far odometry and sensor are to be believed is itself a hypothesis, and the probability of all that was measured says
+which is the better one, without any truth (Laplace's approximation at the solution x* with information matrix H):
+
+    log p(z) = -E(x*) - 1/2 log det H + D/2 log 2 pi - 1/2 sum_i log det 2 pi R_i + sum_landmarks log density
 """
 
 from __future__ import annotations
@@ -103,11 +108,13 @@ class LandmarkMapper:
         self._sightings: list[Sighting] = []
         self._numbers = 0
         self._since = 0
+        self._normaliser = _log_det(covariance)
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on to the next pose by odometry: a_T_b (d + 1, d + 1), covariance of its tangent."""
         self._native.add(between_factor(_pose_key(self._poses - 1), _pose_key(self._poses), a_T_b, covariance))
         self.estimate.move(a_T_b, covariance)
+        self._normaliser += _log_det(covariance)
         self._values.insert(_pose_key(self._poses), self.estimate.pose)
         self._poses += 1
 
@@ -132,6 +139,7 @@ class LandmarkMapper:
             Sighting(self._poses - 1, observation, number)
             for observation, number in zip(observations, taken, strict=True)
         ]
+        self._normaliser += sum(_log_det(observation.covariance) for observation in observations)
         self._since += len(observations)
         if self._since >= self.settings.smooth_every:
             self.smooth()
@@ -146,6 +154,17 @@ class LandmarkMapper:
             for number in merged:
                 self._values.erase(_landmark_key(number))
             self._solve()
+
+    def log_evidence(self) -> float:
+        """log p(z) of everything measured so far, smoothed."""
+        self.smooth()
+        graph, factors = self._graph()
+        solution = solve(graph, factors, self._values, _SOLVER)
+        half_log_det = float(solution.linear.eliminateMultifrontal().logDeterminant())
+        free = sum(self._values.dims().values())
+        expected = sum(float(np.log(kind.density)) for kind in self.estimate.kinds.values())
+        volume = 0.5 * free * float(np.log(2 * np.pi))
+        return -solution.error - half_log_det + volume - 0.5 * self._normaliser + expected
 
     def map(self) -> LandmarkMap:
         """Everything, smoothed."""
@@ -203,6 +222,10 @@ class LandmarkMapper:
         for sighting in self._sightings:
             seen.setdefault(sighting.pose, set()).add(sighting.landmark)
         return {(i, j) for together in seen.values() for i in together for j in together if i < j}
+
+
+def _log_det(covariance: FloatArray) -> float:
+    return float(np.linalg.slogdet(2 * np.pi * np.asarray(covariance))[1])
 
 
 def _pose_key(index: int) -> int:

@@ -1,0 +1,82 @@
+"""Trajectory and landmarks as files.
+
+trajectory.tum, trajectory.kitti   the poses, in both formats
+landmarks.json                     each landmark: number, type, coordinates (m), covariance, how often it was seen
+landmarks.ply                      their places, for viewers of point clouds
+above.png                          both from above
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.lidar.ply import write_ply
+from data_tools.plots import paths_from_above, png
+from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
+from saga_fg.arrays import FloatArray
+from saga_fg.landmarks import Landmark
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkRecord:
+    """What files say of a landmark; covariance (d, d) of its tangent."""
+
+    number: int
+    kind: str
+    coordinates: dict[str, float]
+    covariance: FloatArray
+    sightings: int
+
+
+def records(landmarks: Sequence[Landmark]) -> list[LandmarkRecord]:
+    """The landmarks of a map."""
+    return [
+        LandmarkRecord(l_.number, l_.kind.name, l_.kind.coordinates(l_.state), l_.covariance, l_.sightings)
+        for l_ in landmarks
+    ]
+
+
+def write_landmark_results(
+    output: Path,
+    trajectory: Trajectory,
+    landmarks: Sequence[LandmarkRecord],
+    figures: Mapping[str, object],
+    others: Mapping[str, FloatArray] | None = None,
+) -> None:
+    """Write all files to a folder, or none.
+
+    figures: go to figures.json; others: further paths (n, 2 or 3) for the picture, under their names.
+    """
+    places = np.array([[c["x"], c["y"], c.get("z", 0.0)] for c in (r.coordinates for r in landmarks)]).reshape(-1, 3)
+    listed = [
+        {
+            "number": record.number,
+            "type": record.kind,
+            **record.coordinates,
+            "covariance": record.covariance.tolist(),
+            "sightings": record.sightings,
+        }
+        for record in landmarks
+    ]
+    picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
+    with atomic_directory(output) as folder:
+        write_tum_poses(folder / "trajectory.tum", trajectory)
+        write_kitti_poses(folder / "trajectory.kitti", trajectory)
+        write_text(folder / "landmarks.json", json.dumps(listed, indent=1) + "\n")
+        write_ply(folder / "landmarks.ply", places)
+        write_text(folder / "figures.json", json.dumps(dict(figures), indent=1) + "\n")
+        write_bytes(folder / "above.png", png(picture))
+
+
+def planar_trajectory(time: FloatArray, world_T_pose: FloatArray) -> Trajectory:
+    """A trajectory in the plane, (N, 3, 3), as one in space at z = 0."""
+    poses = np.tile(np.eye(4), (len(world_T_pose), 1, 1))
+    poses[:, :2, :2] = world_T_pose[:, :2, :2]
+    poses[:, :2, 3] = world_T_pose[:, :2, 2]
+    return Trajectory(time, poses)

@@ -1,0 +1,199 @@
+"""Range-only SLAM: a drive and its beacons from odometry and ranges of an uncalibrated radio.
+
+A range does not say where its beacon is, so nothing can be begun from one. The beginning of the drive, by dead
+reckoning, gives each beacon a first place by linear trilateration,
+
+    z^2 = || l - t ||^2    =>    2 (t_k - t_mean)^T l = z_mean^2 - z_k^2 + |t_k|^2 - |t|^2_mean
+
+From there everything is solved at once, for ever longer parts of the drive, each starting where the last ended and
+going on by dead reckoning: poses, beacons, and the radio's scale and offset, with a robust loss over ranges, since
+echoes are long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from data_tools.plaza import BeaconRanges
+from data_tools.trajectories import absolute_errors, matched, rigid_alignment
+from factors import (
+    Robust,
+    Solution,
+    SolverSettings,
+    between_factor,
+    calibrated_range_factors,
+    nonlinear_graph,
+    pose,
+    pose_prior_factor,
+    prior_factor,
+    solve,
+)
+from pipelines.slam.landmark_results import planar_trajectory
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
+from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.settings import require_between, require_positive, setting
+
+_SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
+_START = 1e-8  # variance of the first pose, m^2 and rad^2
+_RANGES = 10  # at least, to place a beacon by
+_CALIBRATION = int(gtsam.symbol("c", 0))
+
+
+@dataclass(frozen=True)
+class PlazaSettings:
+    """How odometry and ranges are believed."""
+
+    distance_noise: float = setting(0.05, "standard deviation of the distance of a step, as a share of it")
+    least_noise: float = setting(0.005, "m, of a step's distance, and sideways, at least")
+    turn_noise: float = setting(0.01, "rad, of a step's heading change")
+    range_noise: float = setting(0.5, "m, standard deviation of a range")
+    robust: float = setting(2.0, "standard deviations beyond which ranges are believed less (Cauchy)")
+    scale_noise: float = setting(0.1, "standard deviation of the radio's scale before anything is measured")
+    offset_noise: float = setting(1.0, "m, the same of its offset")
+    beginning: float = setting(100.0, "m driven before the beacons are placed")
+    growth: float = setting(1.3, "by which each part of the drive is longer than the one before")
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self, "distance_noise", "least_noise", "turn_noise", "range_noise", "robust", "scale_noise",
+            "offset_noise", "beginning",
+        )  # fmt: skip
+        require_between(self, 1.01, 100.0, "growth")
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconMap:
+    """world_T_pose (N, 3, 3) at each row of odometry, the first at the origin; beacons (2,) by number, and their
+    covariances (2, 2), m and m^2; scale and offset (m) of the ranges; dead_reckoning (N, 3, 3).
+    """
+
+    world_T_pose: FloatArray
+    beacons: dict[int, FloatArray]
+    covariances: dict[int, FloatArray]
+    scale: float
+    offset: float
+    dead_reckoning: FloatArray
+
+
+def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> BeaconMap:
+    """Estimate all of a drive. Raises `InputError` for a beacon without ranges enough to place it."""
+    settings = settings or PlazaSettings()
+    steps = _steps(drive.distance, drive.turn)
+    reckoned = _chained(np.eye(3), steps[1:])
+    at = np.clip(np.searchsorted(drive.time, drive.measured), 0, len(drive.time) - 1)
+    end = int(np.searchsorted(np.cumsum(np.abs(drive.distance)), settings.beginning)) + 1
+    poses, beacons, calibration = reckoned[:1], dict[int, FloatArray](), np.zeros(2)
+    while True:
+        end = min(end, len(reckoned))
+        poses = _chained_on(poses, steps[:end])
+        for number in np.unique(drive.beacon).tolist():
+            if number not in beacons:
+                seen = (drive.beacon == number) & (at < end)
+                if np.count_nonzero(seen) >= _RANGES:
+                    beacons[number] = trilateration(poses[at[seen], :2, 2], drive.range[seen])
+        solution = _solved(drive, settings, steps, at, poses, beacons, calibration)
+        poses = np.stack([solution.values.atPose2(row).matrix() for row in range(end)])
+        beacons = {number: solution.values.atVector(_beacon(number)) for number in beacons}
+        calibration = solution.values.atVector(_CALIBRATION)
+        if end == len(reckoned):
+            break
+        end = max(end + 1, int(settings.growth * end))
+    missing = set(np.unique(drive.beacon).tolist()) - set(beacons)
+    if missing:
+        raise InputError(f"beacon {min(missing)}: expected at least {_RANGES} ranges to place it")
+    covariances = {number: solution.covariance([_beacon(number)]) for number in beacons}
+    return BeaconMap(poses, beacons, covariances, float(calibration[0]), float(calibration[1]), reckoned)
+
+
+def compared(drive: BeaconRanges, found: BeaconMap) -> tuple[dict[str, float], dict[str, FloatArray]]:
+    """Figures against the truth where there is one, and the true path (n, 3) in the coordinates of the estimate.
+
+    The estimate is moved as a whole to lie nearest to the true path; beacons are compared after the same motion. The
+    true heading has no part in it: its zero is not that of the direction of travel in every recording.
+    """
+    figures = {"scale": found.scale, "offset, m": found.offset}
+    if drive.truth is None:
+        return figures, {}
+    tolerance = float(np.diff(drive.time).max(initial=0.01))
+    estimate, truth = matched(planar_trajectory(drive.time, found.world_T_pose), drive.truth, tolerance)
+    reckoned, _ = matched(planar_trajectory(drive.time, found.dead_reckoning), drive.truth, tolerance)
+    figures["ATE, m"] = _root_mean_square(absolute_errors(estimate, truth))
+    figures["ATE of dead reckoning, m"] = _root_mean_square(absolute_errors(reckoned, truth))
+    truth_T_world = rigid_alignment(estimate.positions, truth.positions)
+    known = [number for number in found.beacons if number in drive.beacons]
+    if known:
+        places = np.array([[*found.beacons[number], 0.0] for number in known])
+        true = np.array([drive.beacons[number] for number in known])
+        off = transform_points(truth_T_world, places)[:, :2] - true
+        figures["beacons, m"] = _root_mean_square(np.linalg.norm(off, axis=1))
+    return figures, {"truth": transform_points(inverse_transform(truth_T_world), truth.positions)}
+
+
+def _root_mean_square(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def trilateration(places: FloatArray, ranges: FloatArray) -> FloatArray:
+    """The point (2,) at these ranges (K,) from these places (K, 2), m, in the sense of linear least squares."""
+    b = (ranges**2).mean() - ranges**2 + (places**2).sum(axis=1) - (places**2).sum(axis=1).mean()
+    return np.asarray(np.linalg.lstsq(2 * (places - places.mean(axis=0)), b, rcond=None)[0])
+
+
+def _solved(
+    drive: BeaconRanges,
+    settings: PlazaSettings,
+    steps: FloatArray,
+    at: IntArray,
+    poses: FloatArray,
+    beacons: dict[int, FloatArray],
+    calibration: FloatArray,
+) -> Solution:
+    """Solve for the poses of a part of the drive, the beacons placed so far, and the calibration."""
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(pose_prior_factor(0, poses[0], _START * np.eye(3)))
+    for row, matrix in enumerate(poses):
+        start.insert(row, pose("pose", matrix))
+        if row:
+            along = max(settings.distance_noise * abs(drive.distance[row]), settings.least_noise)
+            sigmas = np.array([along, settings.least_noise, settings.turn_noise])
+            graph.add(between_factor(row - 1, row, steps[row], np.diag(sigmas**2)))
+    for number, place in beacons.items():
+        start.insert(_beacon(number), place)
+    start.insert(_CALIBRATION, calibration)
+    noise = np.diag([settings.scale_noise, settings.offset_noise]) ** 2
+    prior = nonlinear_graph([prior_factor(_CALIBRATION, np.zeros(2), noise)], {_CALIBRATION: 2})
+    graph.push_back(prior)
+    used = (at < len(poses)) & np.isin(drive.beacon, list(beacons))
+    rows = [[int(row), _beacon(number), _CALIBRATION] for row, number in zip(at[used], drive.beacon[used], strict=True)]
+    loss = Robust("cauchy", settings.robust)
+    ranges = calibrated_range_factors(rows, drive.range[used], settings.range_noise**2, loss)
+    return solve(graph, [ranges], start, _SOLVER)
+
+
+def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
+    """The increment (N, 3, 3) that each row of odometry reports: half the turn, the distance, the other half."""
+    T = np.tile(np.eye(3), (len(turn), 1, 1))
+    T[:, :2, :2] = np.stack([np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)], axis=1).reshape(-1, 2, 2)
+    T[:, :2, 2] = distance[:, None] * np.stack([np.cos(turn / 2), np.sin(turn / 2)], axis=1)
+    return T
+
+
+def _chained(start: FloatArray, steps: FloatArray) -> FloatArray:
+    """The poses (K + 1, 3, 3) that K increments lead to."""
+    poses = [start]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return np.stack(poses)
+
+
+def _chained_on(poses: FloatArray, steps: FloatArray) -> FloatArray:
+    """As many poses as there are rows of odometry, those to come by dead reckoning."""
+    return np.concatenate([poses[:-1], _chained(poses[-1], steps[len(poses) :])])
+
+
+def _beacon(number: int) -> int:
+    return int(gtsam.symbol("l", number))

@@ -1,0 +1,79 @@
+"""A drive past trees whose identities nobody tells, from odometry that is worse than it says.
+
+The covariances of a recording's odometry are those of errors that come and go from step to step. True ones persist
+(a wheel slips through the whole bend), which adds up to more. So their scale is chosen first, as the likeliest of a few
+on the beginning of the drive (`LandmarkMapper.log_evidence`); the identities in the file have no part in that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.victoria_park import TreeSightings
+from saga_fg.landmarks import LandmarkMap, LandmarkMapper, MapperSettings, Observation, PointLandmark
+from saga_fg.settings import require_between, setting, settings_group
+
+_START = 1e-6  # variance of the first pose, m^2 and rad^2
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class ParkSettings:
+    """How a drive past trees is mapped."""
+
+    mapper: MapperSettings = settings_group(lambda: MapperSettings(smooth_every=300), "how trees are told apart")
+    tree: PointLandmark = settings_group(
+        lambda: PointLandmark(name="tree", density=0.01), "what is seen; a tree on 10 m by 10 m"
+    )
+    odometry_scales: tuple[float, ...] = setting(
+        (1.0, 4.0, 16.0, 64.0, 256.0), "factors on the covariance to choose of"
+    )
+    beginning: int = setting(2000, "poses on which that is chosen")
+
+    def __post_init__(self) -> None:
+        require_between(self, 1, 10**9, "beginning")
+
+
+@dataclass(frozen=True, eq=False)
+class ParkMap:
+    """map: of trees; odometry_scale: what was chosen; log_evidence: of each scale that was tried."""
+
+    map: LandmarkMap
+    odometry_scale: float
+    log_evidence: dict[float, float]
+
+
+def map_park(drive: TreeSightings, settings: ParkSettings | None = None, progress: Progress | None = None) -> ParkMap:
+    """Map the trees of a drive, one pose after the other."""
+    settings = settings or ParkSettings()
+    scales = settings.odometry_scales
+    evidence: dict[float, float] = {}
+    if len(scales) > 1:
+        for scale in scales:
+            evidence[scale] = _driven(drive, scale, settings, settings.beginning, progress).log_evidence()
+    chosen = max(scales, key=lambda scale: evidence.get(scale, 0.0))
+    return ParkMap(_driven(drive, chosen, settings, None, progress).map(), chosen, evidence)
+
+
+def _driven(
+    drive: TreeSightings,
+    scale: float,
+    settings: ParkSettings,
+    poses: int | None,
+    progress: Progress | None,
+) -> LandmarkMapper:
+    """The mapper after the first poses, or all of them."""
+    mapper = LandmarkMapper(np.eye(3), _START * np.eye(3), settings.mapper)
+    total = min(poses or len(drive.a_T_b) + 1, len(drive.a_T_b) + 1)
+    begin = np.searchsorted(drive.pose, np.arange(total + 1))
+    for pose in range(total):
+        if pose:
+            mapper.move(drive.a_T_b[pose - 1], scale * drive.odometry_covariance[pose - 1])
+        rows = range(int(begin[pose]), int(begin[pose + 1]))
+        mapper.observe([Observation(settings.tree, drive.place[row], drive.covariance[row]) for row in rows])
+        if progress is not None:
+            progress(f"odometry covariance x {scale:g}", pose + 1, total)
+    return mapper
