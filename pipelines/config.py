@@ -13,7 +13,7 @@ from pipelines.tracking import OnlineTracker
 from saga_fg.node import ConstantVelocity
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.settings import settings_group
-from saga_fg.tracking import EstimatorName, GreedySettings, GreedyTracker, Tracker, TrackerSettings
+from saga_fg.tracking import EstimatorName, GreedySettings, GreedyTracker, Observer, Tracker, TrackerSettings
 from saga_fg.tracking.settings import settings_of
 
 Method = Literal["saga", "kf", "centerpoint"]
@@ -44,11 +44,14 @@ class TrackConfig:
             classes[label] = replace(settings_of(classes, label), motion=motion)
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
-    def new_tracker(self, method: Method) -> OnlineTracker:
-        """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre)."""
+    def new_tracker(self, method: Method, observer: Observer | None = None) -> OnlineTracker:
+        """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre).
+
+        The `observer` watches the first two; `centerpoint` tells nothing.
+        """
         if method == "centerpoint":
             return GreedyTracker(self.greedy, self.sensors)
-        return Tracker(self.of_method(method).tracker, self.sensors)
+        return Tracker(self.of_method(method).tracker, self.sensors, observer=observer)
 
     def of_method(self, method: Method) -> TrackConfig:
         """The same, without edges unless the method has them."""

@@ -103,6 +103,7 @@ def bench_set(
     compared = variants(base, settings.components)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds = dict.fromkeys(runs, 0.0)
+    seconds = dict.fromkeys(runs, 0.0)
     coasting: list[dict[str, ErrorSample]] = []
     scenes = recordings.dataset.scenes
     for number, name in enumerate(scenes):

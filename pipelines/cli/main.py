@@ -11,6 +11,7 @@ from pipelines.cli.bench import bench_app
 from pipelines.cli.config import config
 from pipelines.cli.demo import demo
 from pipelines.cli.evaluate import evaluate_app
+from pipelines.cli.explain import explain
 from pipelines.cli.learn import learn_app
 from pipelines.cli.report import report_app
 from pipelines.cli.reporting import ReportingGroup
@@ -35,6 +36,7 @@ app.add_typer(learn_app, name="learn")
 app.add_typer(report_app, name="report")
 app.add_typer(bench_app, name="bench")
 app.add_typer(slam_app, name="slam")
+app.command()(explain)
 app.command()(simulate)
 app.command()(demo)
 app.command()(serve)

@@ -11,7 +11,7 @@ from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, 
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import Summary
-from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
+from pipelines.cli.tracking_options import EstimatorOption, ExplainOption, LagOption, MethodOption, configured, journal
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -37,6 +37,7 @@ def nuscenes(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
     config: Config = None,
@@ -59,6 +60,7 @@ def nuscenes(
           --detections lidar=a.json --workers 0 --output run   # all cores; writes run/tracks.json
     """
     from data_tools.nuscenes import NuScenes, merge_tracking_results, write_tracking_results
+    from pipelines.explaining import trackers
     from pipelines.scale_out import HeldScene, TrackTask
     from pipelines.tracking import track_dataset
 
@@ -67,6 +69,7 @@ def nuscenes(
     files = sensor_files(detections)
     apart(output, *files.values())
     dataset = NuScenes(dataroot, version, files, chosen)
+    kept = journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
         task = TrackTask(settings, method, "nuscenes", dataset.meta)
         inputs = (HeldScene(dataset.scene(name)) for name in chosen)
@@ -79,8 +82,8 @@ def nuscenes(
         run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
         return
     summary = Summary(output)
-    with progress_bar(len(chosen)) as progress:
-        runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
+    with progress_bar(len(chosen)) as progress, trackers(settings, method, chosen, kept) as new_tracker:
+        runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
         write_tracking_results(output, ((run.scene, run.tracks) for run in runs), dataset.meta)
     summary.write_record(method, settings)
     summary.show()
@@ -99,6 +102,7 @@ def kitti(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
     config: Config = None,
@@ -112,19 +116,21 @@ def kitti(
           --sequences 0000,0011 --output results
     """
     from data_tools.kitti import KittiTracking, write_kitti_results
+    from pipelines.explaining import trackers
     from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
 
     settings = configured("kitti", config, method, estimator, lag)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
+    kept = journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
         sequence_inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
         task = TrackTask(settings, method, "kitti")
         run_at_scale(sequence_inputs, len(dataset.scenes), task, output, workers, ray)
         return
     summary = Summary(output)
-    with progress_bar(len(dataset.scenes)) as progress:
-        runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), progress=progress))
+    with progress_bar(len(dataset.scenes)) as progress, trackers(settings, method, dataset.scenes, kept) as new_tracker:
+        runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
         write_kitti_results(output, dataset, ((run.scene, run.tracks) for run in runs))
     summary.write_record(method, settings)
     summary.show()
@@ -140,6 +146,7 @@ def file(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
     table: Annotated[
@@ -161,10 +168,12 @@ def file(
     """
     from data_tools.detection_files import read_detections, write_tracks
     from data_tools.remote_files import local_copy
+    from pipelines.explaining import trackers
     from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset
 
     settings = configured("file", config, method, estimator, lag)
+    kept = journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
         urls = several(detections, scenes)
         task = TrackTask(settings, method, ".csv" if table == "csv" else ".ndjson")
@@ -175,8 +184,8 @@ def file(
         dataset = read_detections(path)
     chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
     summary = Summary(output)
-    with progress_bar(len(chosen)) as progress:
-        runs = summary.of(track_dataset(dataset, lambda: settings.new_tracker(method), chosen, progress))
+    with progress_bar(len(chosen)) as progress, trackers(settings, method, chosen, kept) as new_tracker:
+        runs = summary.of(track_dataset(dataset, new_tracker, chosen, progress))
         write_tracks(output, ((run.scene, run.tracks) for run in runs))
     summary.write_record(method, settings)
     summary.show()

@@ -33,6 +33,10 @@ LagOption = Annotated[
     float | None,
     typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
 ]
+ExplainOption = Annotated[
+    bool,
+    typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
+]
 
 
 def configured(
@@ -52,3 +56,12 @@ def _estimator_fits(method: str, estimator: str | None, lag: float | None, confi
         raise InputError("--estimator, --lag: the method centerpoint has no estimator")
     if lag is not None and (estimator or configured) != "fixed-lag":
         raise InputError(f"--lag {lag:g}: goes with --estimator fixed-lag")
+
+
+def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
+    """Where the journal goes, if one is wanted. Raises `InputError` where none can be kept."""
+    from pipelines.explaining import journal_of
+
+    if explain and at_scale:
+        raise InputError("--explain: goes without --workers and --ray")
+    return journal_of(output) if explain else None

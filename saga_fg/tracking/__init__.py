@@ -1,6 +1,8 @@
 """Trackers: frames of detections in, tracks out."""
 
 from saga_fg.tracking.greedy import GreedyTracker
+from saga_fg.tracking.journal import Journal
+from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.settings import (
     AssociationSettings,
     ClassSettings,
@@ -18,6 +20,10 @@ __all__ = [
     "ExistenceSettings",
     "GreedySettings",
     "GreedyTracker",
+    "Journal",
+    "Observer",
+    "Stage",
     "Tracker",
     "TrackerSettings",
+    "TrackerView",
 ]

@@ -29,6 +29,7 @@ from saga_fg.tracking.existence import after_hit, after_miss, reported_score
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.matching import associate
 from saga_fg.tracking.observation import Observed, observe
+from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 
@@ -41,6 +42,7 @@ class Tracker:
     settings  the tracker's settings
     sensors   models by sensor name; the entry named "default" serves all others
     rules     edge rules, in place of `settings.edges`
+    observer  is told how things stand at the end of every stage
 
     A frame older than the newest one by up to `max_delay` is used: the fixed-lag estimator puts its measurements where
     they belong, a filter moves them to the present along the objects' own motion. An older one is left out and counted
@@ -52,8 +54,10 @@ class Tracker:
         settings: TrackerSettings | None = None,
         sensors: Mapping[str, Sensor] | None = None,
         rules: tuple[EdgeRule, ...] | None = None,
+        observer: Observer | None = None,
     ) -> None:
         self.settings = settings or TrackerSettings()
+        self._observer = observer
         self.sensors = dict(sensors or {})
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.late_frames = 0
@@ -86,16 +90,25 @@ class Tracker:
             return self._report(self._time)
         before = self._time
         self._predict(max(timestamp, self._time))
+        self._tell("predict", frame)
         observed = observe(frame, sensor, self.settings.classes)
+        self._tell("observe", frame, observed)
         matching = self._associate(observed, sensor, delay)
+        self._tell("associate", frame, observed, matching)
         self._update(observed, matching, delay)
+        self._tell("update", frame, observed, matching)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
+        self._tell("believe", frame, observed, matching)
         born = self._bear(observed, matching, frame.sensor, delay)
+        self._tell("births", frame, observed, matching, born)
         rows = np.concatenate([matching.detection, born])
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self._columns.id) - len(born) :]])
         self.assignment = Assignment(ids, observed.row[rows])
         self._bury()
-        return self._report(self._time)
+        self._tell("deaths", frame, observed, matching)
+        tracks = self._report(self._time)
+        self._tell("report", frame, observed, matching)
+        return tracks
 
     def tracks(self, timestamp: float) -> Tracks:
         """The tracks predicted to `timestamp` (s), without taking anything in; the present ones for an earlier time.
@@ -251,6 +264,25 @@ class Tracker:
         return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])
 
     # views on the state
+
+    def _tell(
+        self,
+        stage: Stage,
+        frame: Frame,
+        observed: Observed | None = None,
+        matching: Matching | None = None,
+        born: IntArray | None = None,
+    ) -> None:
+        if self._observer is not None:
+            fresh = np.empty(0, dtype=np.int64) if born is None else born
+            self._observer.after(stage, lambda: self._view(frame.sensor, observed, matching, fresh))
+
+    def _view(self, sensor: str, observed: Observed | None, matching: Matching | None, born: IntArray) -> TrackerView:
+        columns = self._columns.select(np.arange(len(self._columns.id)))
+        P = self._kinematics().P
+        return TrackerView(
+            self._time, sensor, columns, self._nodes(), P, self._origin, self.graph, observed, matching, born
+        )
 
     def _boxes(self, rows: IntArray, position: FloatArray, velocity: FloatArray) -> Boxes:
         """Tracks `rows` (k,) at local positions (k, 2) with velocities (k, 2), in the world."""

@@ -1,0 +1,156 @@
+"""Why tracks are what they are: journals written while tracking, read back and told track by track.
+
+A journal lies beside the result it belongs to, `RESULT.journal.jsonl`, an event (`saga_fg.tracking.journal`) a line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from data_tools.atomic_files import atomic_file
+from pipelines.config import Method, TrackConfig
+from pipelines.tracking import OnlineTracker
+from saga_fg.errors import InputError
+from saga_fg.tracking.journal import Event, Journal, of_scene
+
+
+def journal_of(result: Path) -> Path:
+    """Where the journal of a result lies."""
+    return result.with_name(f"{result.name}.journal.jsonl")
+
+
+@contextmanager
+def trackers(
+    settings: TrackConfig, method: Method, scenes: Iterable[str], journal: Path | None
+) -> Iterator[Callable[[], OnlineTracker]]:
+    """Makes a fresh tracker for one scene after the other; with a `journal`, one that keeps it.
+
+    Raises `InputError` for a journal of method centerpoint, which keeps none, or one that is not writable.
+    """
+    if journal is None:
+        yield lambda: settings.new_tracker(method)
+        return
+    if method == "centerpoint":
+        raise InputError("--explain: the method centerpoint keeps no journal")
+    names = iter(scenes)
+    with atomic_file(journal) as file:
+
+        def write(event: Event) -> None:
+            file.write(json.dumps(event, allow_nan=False).encode() + b"\n")
+
+        yield lambda: settings.new_tracker(
+            method, Journal(settings.of_method(method).tracker, of_scene(write, next(names)))
+        )
+
+
+def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
+    """The events of one track; `track` is its number, or SCENE-NUMBER as in nuScenes results.
+
+    Raises `InputError` for a journal that is not there or broken, a track that is not in it, or one that is in several
+    scenes of which none is named.
+    """
+    if scene is None and "-" in track:
+        scene, _, track = track.rpartition("-")
+    if not track.isdecimal():
+        raise InputError(f"--track {track}: expected the number of a track, or SCENE-NUMBER")
+    number = int(track)
+    events = [e for e in _events(journal) if e.get("track") == number and scene in (None, e.get("scene"))]
+    if not events:
+        where = "" if scene is None else f" of scene {scene}"
+        raise InputError(f"{journal}: expected events of track {number}{where}, there are none")
+    scenes = sorted({str(event.get("scene")) for event in events})
+    if len(scenes) > 1:
+        raise InputError(f"--track {number}: expected --scene, the track is in {', '.join(scenes)}")
+    return events
+
+
+def _events(journal: Path) -> Iterator[Event]:
+    if not journal.exists():
+        raise InputError(f"{journal}: there is no journal; track with --explain to have one beside the result")
+    with journal.open(encoding="utf-8") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                event = json.loads(line)
+            except ValueError as error:
+                raise InputError(f"{journal}: line {number}: broken or truncated JSON: {error}") from error
+            if not isinstance(event, dict):
+                raise InputError(f"{journal}: line {number}: expected an event, got {line.strip()[:40]!r}")
+            yield event
+
+
+def story(events: Sequence[Event]) -> list[str]:
+    """A track's life in lines for people; times from its birth."""
+    first, last = events[0], events[-1]
+    end = "" if last["event"] == "ended" else ", then the recording ends"
+    head = f"track {first['track']} of {first['scene']}, {first['label']}: {last['time'] - first['time']:.1f} s{end}"
+    tell = {"born": _born, "matched": _matched, "missed": _missed, "ended": _ended}
+    lines = [head]
+    for event in events:
+        text, *more = tell[event["event"]](event)
+        lines.append(f"{event['time'] - first['time']:8.2f} s  {event['sensor']:<8} {text}")
+        lines += [f"{'':22}{line}" for line in more]
+    return lines
+
+
+def _born(event: Event) -> list[str]:
+    near = event["nearest_tracks"]
+    text = (
+        f"born from detection {event['detection']}, probability {event['probability']:.2f} "
+        f"(births need {event['least_probability']:.2f}), which no track took"
+    )
+    if not near:
+        return [text, f"there was no track of class {event['label']}"]
+    sigmas = ", ".join(f"track {t['track']} {math.sqrt(t['distance2']):.1f}" for t in near)
+    return [text, f"nearest tracks, in sigmas (gate {math.sqrt(event['gate']):.1f}): {sigmas}"]
+
+
+def _matched(event: Event) -> list[str]:
+    chosen, others = _split(event["candidates"])
+    text = (
+        f"kept: detection {chosen['detection']}, probability {chosen['probability']:.2f}, {chosen['metres']:.2f} m "
+        f"from the prediction = {math.sqrt(chosen['distance2']):.1f} sigmas (gate {math.sqrt(chosen['gate']):.1f}); "
+        f"{_existence(event)}"
+    )
+    return [text, *_others(others), *_edges(event)]
+
+
+def _missed(event: Event) -> list[str]:
+    _, others = _split(event["candidates"])
+    nothing = [] if others else ["no detection of its class was near"]
+    text = f"missed, unseen for {event['unseen']:.2f} s; {_existence(event)}"
+    return [text, *nothing, *_others(others), *_edges(event)]
+
+
+def _ended(event: Event) -> list[str]:
+    return [f"ended: {event['reason']} (unseen for {event['unseen']:.2f} s, existence {event['existence']:.2f})"]
+
+
+def _split(candidates: Sequence[Event]) -> tuple[Event, list[Event]]:
+    chosen: dict[str, Any] = next((c for c in candidates if c["outcome"] == "chosen"), {})
+    return chosen, [c for c in candidates if c["outcome"] != "chosen"]
+
+
+def _others(candidates: Sequence[Event]) -> list[str]:
+    return [
+        f"rejected: detection {c['detection']}, probability {c['probability']:.2f}, {math.sqrt(c['distance2']):.1f} "
+        f"sigmas: {c['outcome']}"
+        for c in candidates
+    ]
+
+
+def _edges(event: Event) -> list[str]:
+    return [
+        f"edge from track {edge['from']} ({edge['interaction']}, {edge['rate']:.2f}/s): moved the prediction by "
+        f"{math.hypot(*edge['moved']):.3f} m, its velocity by {math.hypot(*edge['sped_up']):.3f} m/s"
+        for edge in event["edges"]
+    ]
+
+
+def _existence(event: Event) -> str:
+    before, after = event["existence"]
+    return f"existence {before:.2f} -> {after:.2f}"

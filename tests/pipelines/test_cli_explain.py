@@ -1,0 +1,88 @@
+"""`saga-fg track --explain` and `saga-fg explain`: the life of a track, from files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from pipelines.cli import app
+
+
+def saga_fg(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two cars in two scenes; the second one of scene b hides after a second."""
+    folder = tmp_path_factory.mktemp("explain")
+    lines = ["scene,timestamp,label,x,y,score"]
+    for scene in "ab":
+        for k in range(30):
+            lines.append(f"{scene},{k / 10},car,{k / 2},0.0,0.9")
+            if scene == "a" or k < 10:
+                lines.append(f"{scene},{k / 10},car,{k / 2 - 8},0.0,0.9")
+    (folder / "detections.csv").write_text("\n".join(lines) + "\n")
+    result = saga_fg("track", "file", folder / "detections.csv", "-o", folder / "tracks.csv", "--explain")
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def test_the_life_of_a_track_is_told_from_birth_to_end(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "events.json"
+    result = saga_fg("explain", folder / "tracks.csv", "--track", "b-2", "--json", file)
+    assert result.exit_code == 0, result.output
+    first, *lines = result.stdout.splitlines()
+    assert first.startswith("track 2 of b, car: ")
+    assert "born from detection" in lines[0]
+    assert any("kept: detection 1" in line for line in lines)
+    assert any("missed, unseen for" in line for line in lines)
+    assert "ended: unseen for longer than" in lines[-1]
+    events = json.loads(file.read_text())
+    assert [event["event"] for event in events][:2] == ["born", "matched"]
+    assert events[-1]["event"] == "ended"
+    assert {event["scene"] for event in events} == {"b"}
+
+
+def test_a_track_that_lives_to_the_end(folder: Path) -> None:
+    result = saga_fg("explain", folder / "tracks.csv", "--track", "1", "--scene", "a")
+    assert result.exit_code == 0, result.output
+    assert "then the recording ends" in result.stdout.splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--track", "1"), "expected --scene, the track is in a, b"),
+        (("--track", "99"), "expected events of track 99, there are none"),
+        (("--track", "car"), "expected the number of a track"),
+    ],
+)
+def test_tracks_that_are_not_there(folder: Path, arguments: tuple[str, ...], expected: str) -> None:
+    result = saga_fg("explain", folder / "tracks.csv", *arguments)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+
+
+def test_journals_that_are_not_there_or_broken(tmp_path: Path) -> None:
+    result = saga_fg("explain", tmp_path / "tracks.json", "--track", "1")
+    assert result.exit_code == 2
+    assert "track with --explain" in result.stderr
+    for content, expected in (("{\n", "line 1: broken or truncated JSON"), ("3\n", "line 1: expected an event")):
+        (tmp_path / "tracks.json.journal.jsonl").write_text(content)
+        result = saga_fg("explain", tmp_path / "tracks.json", "--track", "1")
+        assert result.exit_code == 2
+        assert expected in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"), [(("--method", "centerpoint"), "keeps no journal"), (("--workers", "1"), "goes without")]
+)
+def test_what_keeps_no_journal(folder: Path, tmp_path: Path, option: tuple[str, ...], expected: str) -> None:
+    arguments = (folder / "detections.csv", "-o", tmp_path / "out.csv", "--explain")
+    result = saga_fg("track", "file", *arguments, *option)
+    assert result.exit_code == 2
+    assert expected in result.stderr
