@@ -18,6 +18,7 @@ from pipelines.cli.bench_paper import paper
 from pipelines.cli.bench_reading import reading
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
+from pipelines.cli.bench_smoothing import smoothing
 from pipelines.cli.bench_streaming import streaming
 from pipelines.cli.bench_tracking import tracking
 from pipelines.cli.options import Config, Verbose
@@ -33,6 +34,7 @@ bench_app.command()(service)
 bench_app.command()(metrics)
 bench_app.command()(lidar)
 bench_app.command()(slam)
+bench_app.command()(smoothing)
 bench_app.command()(streaming)
 bench_app.command()(reading)
 bench_app.command()(paper)

@@ -2,6 +2,7 @@
 
 from pipelines.smoothing.config import SmoothConfig, load_smooth_config
 from pipelines.smoothing.output import write_kitti_run, write_labels, write_nuscenes_run
+from pipelines.smoothing.rounds import smooth_known_objects
 from pipelines.smoothing.scene import SmoothedScene, smooth_dataset, smooth_scene
 
 __all__ = [
@@ -9,6 +10,7 @@ __all__ = [
     "SmoothedScene",
     "load_smooth_config",
     "smooth_dataset",
+    "smooth_known_objects",
     "smooth_scene",
     "write_kitti_run",
     "write_labels",

@@ -104,6 +104,16 @@ def smooth_objects(
     )
 
 
+def smooth_known_objects(
+    evidence: Evidence, object_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
+) -> StateTable:
+    """The last round alone, without stands, where it is known which object (N,) each detection is of, -1 for none."""
+    rounds = _Rounds(evidence, settings, tracker)
+    lives = lives_of_evidence(object_of, evidence.boxes.label, evidence.moment)
+    states = smooth_states(evidence, object_of, lives, rounds.velocity_prior(lives), settings.classes)
+    return rounds.final(lives, object_of, states, Standing(settings.standing))
+
+
 @dataclass(frozen=True, eq=False)
 class _Rounds:
     """What all rounds share."""
