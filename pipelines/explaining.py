@@ -59,7 +59,7 @@ def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
     if not track.isdecimal():
         raise InputError(f"--track {track}: expected the number of a track, or SCENE-NUMBER")
     number = int(track)
-    events = [e for e in _events(journal) if e.get("track") == number and scene in (None, e.get("scene"))]
+    events = [e for e in read_events(journal) if e.get("track") == number and scene in (None, e.get("scene"))]
     if not events:
         where = "" if scene is None else f" of scene {scene}"
         raise InputError(f"{journal}: expected events of track {number}{where}, there are none")
@@ -69,7 +69,8 @@ def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
     return events
 
 
-def _events(journal: Path) -> Iterator[Event]:
+def read_events(journal: Path) -> Iterator[Event]:
+    """All events. Raises `InputError` for a journal that is not there or broken."""
     if not journal.exists():
         raise InputError(f"{journal}: there is no journal; track with --explain to have one beside the result")
     with journal.open(encoding="utf-8") as file:

@@ -18,6 +18,7 @@ from pipelines.bench.coasting import coasting_errors
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
+from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.frame import Frame
 from saga_fg.track import Tracks
@@ -43,12 +44,16 @@ class TrackingBenchSettings:
 
 @dataclass(frozen=True, eq=False)
 class VariantResult:
-    """One variant on one set: headline figures, errors at labels scene by scene, ms of CPU time a frame."""
+    """One variant on one set: headline figures, errors at labels scene by scene, ms of CPU time a frame.
+
+    stages  ms a frame by stage, of the trackers that tell (not `centerpoint`)
+    """
 
     variant: Variant
     score: Score
     figures: Mapping[str, float]
     milliseconds: float
+    stages: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +81,11 @@ class SetResult:
 class _Timed:
     """A tracker with a clock."""
 
-    def __init__(self, tracker: OnlineTracker) -> None:
-        self.seconds, self._tracker = 0.0, tracker
+    def __init__(self, tracker: OnlineTracker, stages: StageClock) -> None:
+        self.seconds, self._tracker, self._stages = 0.0, tracker, stages
 
     def step(self, frame: Frame) -> Tracks:
+        self._stages.start()
         begin = time.thread_time()
         tracks = self._tracker.step(frame)
         self.seconds += time.thread_time() - begin
@@ -102,14 +108,15 @@ def bench_set(
     settings = settings or TrackingBenchSettings()
     compared = variants(base, settings.components)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
-    seconds = dict.fromkeys(runs, 0.0)
-    seconds = dict.fromkeys(runs, 0.0)
+    seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
+    seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
     coasting: list[dict[str, ErrorSample]] = []
     scenes = recordings.dataset.scenes
     for number, name in enumerate(scenes):
         scene = recordings.dataset.scene(name)
         for done, variant in enumerate(compared):
-            timed = _Timed(variant.config(base).new_tracker(variant.method))
+            clock = clocks[variant.name]
+            timed = _Timed(variant.config(base).new_tracker(variant.method, clock), clock)
             runs[variant.name][name] = track_scene(scene, timed)
             seconds[variant.name] += timed.seconds
             if progress is not None:
@@ -120,9 +127,10 @@ def bench_set(
     for variant in compared:
         tracked = runs.pop(variant.name)
         score = recordings.score(tracked)
-        frames = sum(run.frames for run in tracked.values())
-        milliseconds = 1000 * seconds[variant.name] / max(frames, 1)
-        results[variant.name] = VariantResult(variant, score, score.figures, milliseconds)
+        per_frame = 1000 / max(sum(run.frames for run in tracked.values()), 1)
+        stages = {stage: per_frame * spent for stage, spent in clocks[variant.name].seconds.items()}
+        spent = per_frame * seconds[variant.name]
+        results[variant.name] = VariantResult(variant, score, score.figures, spent, stages)
     differences = graph_differences(results[SAGA].score, results[KF].score, coasting, settings)
     carried = {name: ErrorSample.pool(scene[name] for scene in coasting) for name in (SAGA, KF)} if coasting else {}
     return SetResult(recordings.name, scenes, results, differences, carried)

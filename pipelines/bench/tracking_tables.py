@@ -10,8 +10,8 @@ from pipelines.figures import FigureTable, cell
 
 
 def tables(result: SetResult) -> list[FigureTable]:
-    """For people: the variants, what the graph changes, how honest the covariances are."""
-    return [_variants(result), *_differences(result), *_calibrations(result)]
+    """For people: the variants, times by stage, what the graph changes, how honest the covariances are."""
+    return [_variants(result), _stages(result), *_differences(result), *_calibrations(result)]
 
 
 def figures(result: SetResult) -> dict[str, Any]:
@@ -23,6 +23,7 @@ def figures(result: SetResult) -> dict[str, Any]:
                 "figures": each.figures,
                 "errors": {label: error_figures(e) for label, e in errors_by_class(result.errors(name)).items()},
                 "milliseconds_per_frame": each.milliseconds,
+                "milliseconds_by_stage": each.stages,
                 "ratio_to_centerpoint": result.ratio(name),
             }
             for name, each in result.variants.items()
@@ -47,6 +48,13 @@ def _variants(result: SetResult) -> FigureTable:
         rows.append((name, *headline, *rest, cell(each.milliseconds, 2), cell(result.ratio(name), 1)))
     title = f"{result.name}: {len(result.scenes)} scenes; RMSE of position in m, of velocity in m/s"
     return FigureTable(title, columns, tuple(rows))
+
+
+def _stages(result: SetResult) -> FigureTable:
+    told = {name: result.variants[name] for name in ("saga", "kf")}
+    stages = tuple(next(iter(told.values())).stages)
+    rows = tuple((name, *(cell(each.stages[stage], 2) for stage in stages)) for name, each in told.items())
+    return FigureTable(f"{result.name}: ms a frame by stage", ("method", *stages), rows)
 
 
 def _headline(name: str, value: float) -> str:

@@ -21,6 +21,9 @@ evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup
 Hota = Annotated[bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")]
 
 
+Innovations = Annotated[
+    bool, typer.Option("--innovations", help="How well innovations fit (NIS), from the journal beside the result.")
+]
 Plots = Annotated[
     Path | None,
     typer.Option("--plots", help="Folder to draw recall sweeps, calibration and errors to.", metavar="DIR"),
@@ -66,6 +69,7 @@ def nuscenes(
         ),
     ] = None,
     hota: Hota = False,
+    innovations: Innovations = False,
     json_file: JsonFile = None,
     plots: Plots = None,
     verbose: Verbose = False,
@@ -84,7 +88,9 @@ def nuscenes(
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
     files = sensor_files(detections or [])
-    evaluation = _report(lambda: evaluate_nuscenes(result, dataroot, version, chosen, files, hota), json_file)
+    evaluation = _report(
+        lambda: evaluate_nuscenes(result, dataroot, version, chosen, files, hota, innovations), json_file
+    )
     _draw(evaluation, plots)
 
 
@@ -104,6 +110,7 @@ def kitti(
         ),
     ] = None,
     hota: Hota = False,
+    innovations: Innovations = False,
     json_file: JsonFile = None,
     plots: Plots = None,
     verbose: Verbose = False,
@@ -123,7 +130,7 @@ def kitti(
     chosen = names("--sequences", sequences) if sequences is not None else None
     overlaps, labels = _overlaps(iou), names("--classes", classes)
     evaluation = _report(
-        lambda: evaluate_kitti(result, dataroot, chosen, labels, overlaps, detections, hota), json_file
+        lambda: evaluate_kitti(result, dataroot, chosen, labels, overlaps, detections, hota, innovations), json_file
     )
     _draw(evaluation, plots)
 

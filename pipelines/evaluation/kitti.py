@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,11 @@ from data_tools.metrics import (
 )
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
+from pipelines.evaluation.innovations import innovation_json, innovation_table, journal_innovations
 from pipelines.evaluation.placed_detections import placed_detections
+from pipelines.explaining import journal_of
 from pipelines.figures import FigureTable, cell
+from saga_fg.arrays import FloatArray
 
 CLASSES = ("car", "pedestrian", "cyclist")
 IOUS = (0.25, 0.5, 0.7)
@@ -41,11 +44,13 @@ class KittiEvaluation:
     tracking: Mapping[str, ByIou]
     errors: LabelErrors
     hota: Sequence[HotaRow] = ()
+    innovations: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def tables(self) -> list[FigureTable]:
         """For people."""
         first = kitti_table("KITTI 3D tracking metrics, in %", self.tracking)
-        return [first, *error_tables(self.errors), *([hota_table(self.hota)] if self.hota else [])]
+        innovations = [innovation_table(self.innovations)] if self.innovations else []
+        return [first, *error_tables(self.errors), *innovations, *([hota_table(self.hota)] if self.hota else [])]
 
     def figures(self) -> dict[str, Any]:
         """For programs."""
@@ -53,6 +58,7 @@ class KittiEvaluation:
             "sequences": self.sequences,
             "per_class": self.tracking,
             **error_json(self.errors),
+            "innovations": innovation_json(self.innovations),
             "hota": hota_json(self.hota),
         }
 
@@ -69,12 +75,14 @@ def evaluate_kitti(
     ious: Sequence[float] = IOUS,
     detections: str | Path | None = None,
     with_hota: bool = False,
+    with_innovations: bool = False,
 ) -> KittiEvaluation:
     """Score the results NNNN.txt of folder `result` in the chosen sequences (None: all it has).
 
     detections  folder of the detections, to judge errors on the labels that they match
 
     Raises `InputError` for missing or broken files; `MissingExtraError` for HOTA without trackeval.
+    Innovations are read from the journal beside the result.
     """
     scored = read_scored_sequences(result, dataroot, sequences, detections)
     pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
@@ -89,6 +97,7 @@ def evaluate_kitti(
         tracking,
         LabelErrors.pool(kitti_label_errors(each, classes, detections is not None) for each in scored.values()),
         hota([(each.truth, each.found) for each in scored.values()], best) if with_hota else (),
+        journal_innovations(journal_of(Path(result))) if with_innovations else {},
     )
 
 

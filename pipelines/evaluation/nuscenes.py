@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,11 @@ from data_tools.nuscenes import NuScenes, read_scored_scenes
 from data_tools.plots import recall_sweep
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
+from pipelines.evaluation.innovations import innovation_json, innovation_table, journal_innovations
 from pipelines.evaluation.placed_detections import PlacedBoxes, placed_detections
+from pipelines.explaining import journal_of
 from pipelines.figures import FigureTable, cell, count
+from saga_fg.arrays import FloatArray
 
 REACH = 1  # keyframes to either side for a label's velocity, 0.5 s
 _COLUMNS = (
@@ -42,11 +45,13 @@ class NuScenesEvaluation:
     tracking: NuScenesTrackingMetrics
     errors: LabelErrors
     hota: Sequence[HotaRow] = ()
+    innovations: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def tables(self) -> list[FigureTable]:
         """For people."""
         first = nuscenes_table("nuScenes tracking metrics; AMOTP, MOTP in m, TID, LGD in s", self.tracking)
-        return [first, *error_tables(self.errors), *([hota_table(self.hota)] if self.hota else [])]
+        innovations = [innovation_table(self.innovations)] if self.innovations else []
+        return [first, *error_tables(self.errors), *innovations, *([hota_table(self.hota)] if self.hota else [])]
 
     def figures(self) -> dict[str, Any]:
         """For programs."""
@@ -56,6 +61,7 @@ class NuScenesEvaluation:
             "per_class": self.tracking.per_class,
             "curves": self.tracking.curves,
             **error_json(self.errors),
+            "innovations": innovation_json(self.innovations),
             "hota": hota_json(self.hota),
         }
 
@@ -71,13 +77,14 @@ def evaluate_nuscenes(
     scenes: Collection[str] | None = None,
     detections: Mapping[str, Path] | None = None,
     with_hota: bool = False,
+    with_innovations: bool = False,
 ) -> NuScenesEvaluation:
     """Score the tracks of file `result` in the chosen scenes (None: all of the tables).
 
     detections  files by sensor, to judge errors on the labels that they match
 
     Raises `InputError` for missing or broken files, and for a result that lacks a sample of these scenes;
-    `MissingExtraError` for HOTA without trackeval.
+    `MissingExtraError` for HOTA without trackeval. Innovations are read from the journal beside the result.
     """
     scored = read_scored_scenes(result, dataroot, version, scenes)
     seen: dict[str, PlacedBoxes] = {}
@@ -91,6 +98,7 @@ def evaluate_nuscenes(
         tracking,
         LabelErrors.pool(nuscenes_label_errors(scene, seen.get(name)) for name, scene in scored.items()),
         hota(pairs, _best_thresholds(tracking)) if with_hota else (),
+        journal_innovations(journal_of(Path(result))) if with_innovations else {},
     )
 
 

@@ -8,10 +8,14 @@ from typing import Any
 
 from data_tools.metrics import LabelErrors, SceneMetrics, TrackTable, label_errors, scene_metrics_by_label
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
+from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.figures import FigureTable, cell
+from pipelines.observers import Innovations
 from pipelines.tracking import OnlineTracker, Progress, track_dataset
+from saga_fg.arrays import FloatArray
 from saga_fg.dataset import Annotations, Dataset
 from saga_fg.errors import InputError
+from saga_fg.tracking import Observer
 
 _COLUMNS = (
     *("class", "MOTA", "MOTP", "recall", "IDS", "FP", "FN", "objects", "hidden", "... tracked", "carried error"),
@@ -26,6 +30,7 @@ class SimulatedEvaluation:
     scenes: tuple[str, ...]
     metrics: Mapping[str, SceneMetrics]
     errors: LabelErrors
+    innovations: Mapping[str, FloatArray]
 
     def tables(self) -> list[FigureTable]:
         """For people."""
@@ -33,7 +38,8 @@ class SimulatedEvaluation:
             "Simulated traffic; MOTP and errors in m; carried: error of the track that last followed a hidden object"
         )
         rows = tuple((name, *_cells(metrics)) for name, metrics in self.metrics.items())
-        return [FigureTable(title, _COLUMNS, rows), *error_tables(self.errors)]
+        innovations = [innovation_table(self.innovations)] if self.innovations else []
+        return [FigureTable(title, _COLUMNS, rows), *error_tables(self.errors), *innovations]
 
     def figures(self) -> dict[str, Any]:
         """For programs."""
@@ -41,6 +47,7 @@ class SimulatedEvaluation:
             "scenes": self.scenes,
             "tracking": {name: _figures(metrics) for name, metrics in self.metrics.items()},
             **error_json(self.errors),
+            "innovations": innovation_json(self.innovations),
         }
 
     def pictures(self) -> dict[str, Any]:
@@ -49,12 +56,12 @@ class SimulatedEvaluation:
 
 
 def evaluate_simulated(
-    dataset: Dataset, new_tracker: Callable[[], OnlineTracker], progress: Progress | None = None
+    dataset: Dataset, new_tracker: Callable[[Observer], OnlineTracker], progress: Progress | None = None
 ) -> SimulatedEvaluation:
     """Track every scene and score what comes out. Raises `InputError` for a scene without ground truth."""
     by_label: dict[str, list[SceneMetrics]] = {}
-    errors = []
-    for run in track_dataset(dataset, new_tracker, progress=progress):
+    errors, innovations = [], Innovations()
+    for run in track_dataset(dataset, lambda: new_tracker(innovations), progress=progress):
         truth = run.scene.ground_truth
         if truth is None:
             raise InputError(f"scene {run.scene.name}: expected ground truth")
@@ -65,7 +72,9 @@ def evaluate_simulated(
         errors.append(label_errors(labels, TrackTable.of_tracks(run.tracks), labels.boxes.velocity))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
     overall = SceneMetrics.pool(pooled.values())
-    return SimulatedEvaluation(dataset.scenes, {"overall": overall, **pooled}, LabelErrors.pool(errors))
+    return SimulatedEvaluation(
+        dataset.scenes, {"overall": overall, **pooled}, LabelErrors.pool(errors), innovations.by_class
+    )
 
 
 def _cells(m: SceneMetrics) -> tuple[str, ...]:

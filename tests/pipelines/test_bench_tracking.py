@@ -97,6 +97,8 @@ def test_a_set_is_tracked_by_every_variant() -> None:
     assert {"saga", "kf", "centerpoint", "without following"} <= set(result.variants)
     assert set(result.variants["saga"].figures) == {"MOTA", "IDS", "hidden RMSE"}
     assert all(each.milliseconds > 0 for each in result.variants.values())
+    assert set(result.variants["saga"].stages) >= {"predict", "associate", "update", "report"}
+    assert not result.variants["centerpoint"].stages
     assert len(result.errors("saga")) == len(result.errors("kf"))
     assert "velocity RMSE" in result.differences
 

@@ -94,8 +94,8 @@ def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path: 
     of_data = ("--dataroot", data, "--split", "all", "--detections", lidar)
     for command in (
         ("simulate", "-o", data, "--scenes", "1", "--config", tmp_path / "short.yaml"),
-        ("track", "nuscenes", *of_data, "-o", tracks),
-        ("evaluate", "nuscenes", tracks, *of_data, "--hota", "--json", file),
+        ("track", "nuscenes", *of_data, "-o", tracks, "--explain"),
+        ("evaluate", "nuscenes", tracks, *of_data, "--hota", "--innovations", "--json", file),
     ):
         result = CliRunner().invoke(app, [str(argument) for argument in command])
         assert result.exit_code == 0, result.output
@@ -107,6 +107,7 @@ def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path: 
     assert 0 < figures["calibration"]["overall"]["held"]["0.9"] <= 1
     assert figures["hota"]["car"]["2D"]["hota"] >= figures["hota"]["car"]["3D"]["hota"] > 0.2
     assert "HOTA, CLEAR and Identity" in result.stdout
+    assert figures["innovations"]["car"]["matches"] > 20
 
 
 def test_kitti_labels_as_results_are_perfect(tmp_path: Path) -> None:
@@ -125,6 +126,12 @@ def test_kitti_labels_as_results_are_perfect(tmp_path: Path) -> None:
     assert figures["errors"]["car"]["velocity"] is None
     assert figures["calibration"]["car"]["boxes"] == 0
     assert "Calibration" not in result.stdout
+
+
+def test_innovations_need_a_journal(drive: Path) -> None:
+    result = evaluate("nuscenes", drive / "result.json", "--dataroot", drive, "--split", "drive", "--innovations")
+    assert result.exit_code == 2
+    assert "track with --explain" in result.stderr
 
 
 @pytest.mark.parametrize("iou", ["half", "0", "1.5", ","])
@@ -147,3 +154,5 @@ def test_simulated_scenes_are_judged_at_every_moment(tmp_path: Path) -> None:
     assert overall["objects"] == figures["errors"]["overall"]["labels"]
     assert 0 < overall["position_rmse"] < 1
     assert figures["calibration"]["overall"]["boxes"] > 50
+    assert figures["innovations"]["car"]["matches"] > 50
+    assert 0.2 < figures["innovations"]["car"]["nis"] < 5
