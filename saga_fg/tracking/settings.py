@@ -120,6 +120,9 @@ class TrackerSettings:
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     score_memory: float = setting(0.15, "what a sensor said of a track counts for its score for this long, s")
     confirmations: int = setting(3, "detections that confirm a track born of a weak sensor; another sensor's one does")
+    unconfirmed_share: float = setting(
+        0.0, "share of its score with which a track is reported that waits for confirmation; 0: not at all"
+    )
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
     max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
@@ -128,6 +131,7 @@ class TrackerSettings:
         require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting", "score_memory")
         require_positive(self, "max_out_of_view", infinite=True)
         require_positive(self, "confirmations")
+        require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))
 
 

@@ -253,7 +253,7 @@ class Tracker:
         columns, settings = self._columns, self.settings
         coasting = np.maximum(self._time - columns.last_seen, 0.0)
         shown = (
-            columns.accepted
+            (columns.accepted | (settings.unconfirmed_share > 0))
             & (columns.confirmed | (columns.existence >= settings.existence.report))
             & (coasting <= settings.report_coasting)
         )
@@ -261,6 +261,7 @@ class Tracker:
         position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())
         boxes = self._boxes(rows, position, velocity)
         score = reported_score(columns, coasting > 0, settings.existence)[rows]
+        score = np.where(columns.accepted[rows], score, settings.unconfirmed_share * score)
         return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])
 
     # views on the state
