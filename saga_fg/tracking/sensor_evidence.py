@@ -1,11 +1,12 @@
 r"""What each sensor lately said of every track, put together: how sure a box is when several sensors look.
 
     logit P = logit prior + sum over sensors of   logit p - logit prior      detected, p the calibrated probability
-                                                  log(1 - P_D)               looked and saw nothing
-                                                  0                          out of view, or silent for too long
+                                                  log(1 - P_D)               looked, and has never seen it
+                                                  0                          out of view, or long without a word
 
 P is the probability that the track has an object, if sensors err independently of one another. With a single sensor
-it is that sensor's p. Sensors speak at times of their own, so that the latest word of each counts for a while.
+it is that sensor's p. Sensors speak at times of their own, so that the latest word of each counts for a while. A sensor that
+has seen the object before and misses it now says nothing new: what comes and goes is a matter of existence.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ class SensorEvidence:
     ) -> None:
         """A frame: `seen` tracks (k,), their probabilities (k,); `missed` ones (n,), by the chance (n,) to see them."""
         at = self._of(sensor)
+        missed = missed & (self._count[:, at] == 0)
         self._logit[missed, at] = np.log(1 - np.minimum(chance[missed], 0.99))
         self._logit[seen, at] = _logit(probability) - PRIOR_LOGIT
         self._detected[missed, at], self._detected[seen, at] = False, True

@@ -42,10 +42,18 @@ def test_a_sensor_that_should_have_seen_it_lowers_the_odds():
     assert logit(evidence.probability(0.05, 0.2)) == pytest.approx([logit(0.6) + np.log(0.2)])
 
 
+def test_a_sensor_that_has_seen_it_before_says_nothing_by_a_miss():
+    evidence = born(0.6)
+    heard(evidence, "camera", 0.05, [0], [0.7])
+    before = evidence.probability(0.05, 0.2)
+    heard(evidence, "camera", 0.1, missed=[True])
+    assert evidence.probability(0.1, 0.2) == pytest.approx(before)
+
+
 def test_without_a_detection_nothing_is_said():
     evidence = born(0.6)
-    heard(evidence, "lidar", 0.1, missed=[True])
-    assert np.isnan(evidence.probability(0.1, 0.2)).all()
+    heard(evidence, "camera", 1.0, missed=[True])
+    assert np.isnan(evidence.probability(1.0, 0.2)).all()
 
 
 def test_words_count_for_a_while_only():
