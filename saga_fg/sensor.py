@@ -113,6 +113,9 @@ class Sensor:
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
     )
+    clutter_area: float | None = setting(
+        None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
+    )
     births: Literal["alone", "confirmed"] = setting(
         "alone", "whether a track born of its detections counts at once, or when other evidence has confirmed it"
     )
@@ -126,6 +129,8 @@ class Sensor:
             if not 0 <= chance <= 1:
                 raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")
         require_between(self, -math.inf, math.inf, "time_offset")
+        if self.clutter_area is not None:
+            require_positive(self, "clutter_area", infinite=True)
         require_one_of(self, "score", ("probability", "logit"))
         require_one_of(self, "births", ("alone", "confirmed"))
 

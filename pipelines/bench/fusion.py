@@ -93,37 +93,33 @@ def fusion(
     simulator = simulator or SimulatorSettings()
     singles = tuple(simulator.sensors)
     with_poor = replace(config, sensors={**config.sensors, POOR: poor_model()})
-    contenders = (*singles, BOTH, WITH_POOR)
-    amota: dict[str, list[float]] = {name: [] for name in contenders}
-    kept: dict[str, dict[str, BoolArray]] = {
-        name: {BOTH: np.empty(0, bool), name: np.empty(0, bool)} for name in singles
-    }
-    for done, seed in enumerate(seeds):
+    amota: dict[str, list[float]] = {name: [] for name in (*singles, BOTH, WITH_POOR)}
+    scenes = []
+    for seed in seeds:
         scene = simulate_scene(simulator, seed)
         poor = simulate_scene(replace(simulator, sensors={POOR: poor_sensor()}), seed)
-        frames = {
-            **{name: of_sensors(scene, (name,)) for name in singles},
-            BOTH: scene,
-            WITH_POOR: _joined(scene, poor),
-        }
-        for name in contenders:
-            tracks = track_scene(frames[name], with_poor.new_tracker(method)).tracks
-            amota[name].append(scene_amota(scene, tracks))
-        for silent in singles:
-            for name, seen in ((BOTH, scene), (silent, frames[silent])):
-                tracks = track_scene(without(seen, silent, gap), config.new_tracker(method)).tracks
-                others = {other: sensor_model(config.sensors, other) for other in singles if other != silent}
-                found = survived(scene, tracks, others, gap)
-                kept[silent][name] = np.concatenate([kept[silent][name], found])
+        seen = {name: of_sensors(scene, (name,)) for name in singles} | {BOTH: scene, WITH_POOR: _joined(scene, poor)}
+        for name, part in seen.items():
+            amota[name].append(scene_amota(scene, track_scene(part, with_poor.new_tracker(method)).tracks))
+        scenes.append(scene)
         if progress is not None:
-            progress("tracking", done + 1, len(seeds))
+            progress("tracking", len(scenes), len(seeds))
     better = max(singles, key=lambda name: float(np.mean(amota[name])))
+    others = {name: sensor_model(config.sensors, name) for name in singles if name != better}
+    kept: dict[str, list[BoolArray]] = {BOTH: [], better: []}
+    for done, scene in enumerate(scenes):
+        for name, part in ((BOTH, scene), (better, of_sensors(scene, (better,)))):
+            tracks = track_scene(without(part, better, gap), config.new_tracker(method)).tracks
+            kept[name].append(survived(scene, tracks, others, gap))
+        if progress is not None:
+            progress("through the gap", done + 1, len(seeds))
+    followed = {name: np.concatenate(found) for name, found in kept.items()}
     return FusionResult(
         amota={name: float(np.mean(values)) for name, values in amota.items()},
         better=better,
         gain=_compared(amota[BOTH], amota[better]),
-        survival={name: float(found.mean()) if len(found) else float("nan") for name, found in kept[better].items()},
-        followed=len(kept[better][BOTH]),
+        survival={name: float(found.mean()) if len(found) else float("nan") for name, found in followed.items()},
+        followed=len(followed[BOTH]),
         poor_loss=_compared(amota[WITH_POOR], amota[BOTH]),
         seeds=tuple(seeds),
     )

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.cli.bench_estimators import estimators
+from pipelines.cli.bench_fusion import fusion
 from pipelines.cli.bench_lidar import lidar
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_paper import paper
@@ -30,6 +31,7 @@ Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to 
 
 
 bench_app.command()(estimators)
+bench_app.command()(fusion)
 bench_app.command()(service)
 bench_app.command()(metrics)
 bench_app.command()(lidar)

@@ -32,13 +32,19 @@ LEAST_CLUTTER = 0.05  # false detections to be reckoned with, however sure the d
 
 
 def associate(
-    predicted: Boxes, P: FloatArray, expected: FloatArray, observed: Observed, settings: TrackerSettings
+    predicted: Boxes,
+    P: FloatArray,
+    expected: FloatArray,
+    observed: Observed,
+    settings: TrackerSettings,
+    clutter_area: float,
 ) -> Matching:
     """The pairs of a frame.
 
     predicted  where the n tracks were when the frame was taken, world
     P          (n, 2, 2) covariance of their positions
     expected   (n,) chance that the track is detected: its existence times that of an object to be detected
+    clutter_area  of the module, m^2, of the sensor that speaks
     """
     pairs = [Matching.empty()]
     for label in np.unique(predicted.label):
@@ -54,7 +60,7 @@ def associate(
         if of_class.overlap_weight > 0:
             overlap = giou_3d(predicted.select(t), observed.boxes.select(d), of_class.max_distance)
             cost = cost - of_class.overlap_weight * overlap
-        unmatched = _unmatched(expected[t], observed.probability[d], settings.association)
+        unmatched = _unmatched(expected[t], observed.probability[d], settings.association, clutter_area)
         if unmatched is None:
             unmatched = cost.max(initial=0.0) + 1.0
         match = assign if settings.association.method == "hungarian" else assign_greedily
@@ -63,11 +69,13 @@ def associate(
     return Matching.concatenate(pairs)
 
 
-def _unmatched(expected: FloatArray, probability: FloatArray, settings: AssociationSettings) -> FloatArray | None:
+def _unmatched(
+    expected: FloatArray, probability: FloatArray, settings: AssociationSettings, clutter_area: float
+) -> FloatArray | None:
     """(n, m) of the module; None where clutter is spread over an infinite area."""
-    if settings.clutter_area == math.inf:
+    if clutter_area == math.inf:
         return None
-    density = max(float((1 - probability).sum()), LEAST_CLUTTER) / settings.clutter_area
+    density = max(float((1 - probability).sum()), LEAST_CLUTTER) / clutter_area
     of_track = settings.existence_weight * _log_odds(expected)
     of_detection = settings.score_weight * _log_odds(probability)
     return 2 * (of_track[:, None] + of_detection - math.log(2 * math.pi * density))

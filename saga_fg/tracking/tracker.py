@@ -163,7 +163,8 @@ class Tracker:
         position, P = self._state.positions_before(columns.id, columns.label, delay)
         predicted = self._boxes(np.arange(len(columns.id)), position, np.full_like(position, np.nan))
         expected = columns.existence * sensor.detection_chance(columns.label)
-        return associate(predicted, P, expected, observed, self.settings)
+        area = self.settings.association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
+        return associate(predicted, P, expected, observed, self.settings, area)
 
     def _update(self, observed: Observed, matching: Matching, delay: float) -> None:
         columns, boxes = self._columns, observed.boxes
@@ -193,18 +194,19 @@ class Tracker:
             return
         visible = sensor.sees(self._kinematics().position + self._origin, frame.world_T_ego)
         columns.last_in_view[visible] = self._time
-        columns.looks[visible] += 1
         missed = np.ones(len(columns.id), dtype=bool)
         missed[matching.track] = False
-        columns.looks[~missed & ~visible] += 1
-        columns.hits[matching.track] += 1
         p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
         p, settings = observed.probability[matching.detection], self.settings.existence
-        columns.existence[missed] = after_miss(columns.existence[missed], p_detect[missed], elapsed, settings)
+        # what another sensor has just seen exists, whatever this one misses
+        excused = self._evidence.seen_by_others(frame.sensor, self._time - delay, self.settings.score_memory)
+        p_miss = np.where(excused, 0.0, p_detect)[missed]
+        columns.existence[missed] = after_miss(columns.existence[missed], p_miss, elapsed, settings)
         columns.existence[matching.track] = after_hit(columns.existence[matching.track], p, settings)
         self._evidence.hear(frame.sensor, self._time - delay, matching.track, p, missed & visible, p_detect)
         fused = self._evidence.probability(self._time, max(self.settings.score_memory, delay))
         columns.score = np.where(np.isfinite(fused), fused, columns.score)
+        columns.hits, columns.looks = self._evidence.steadiest()
         columns.accepted |= self._evidence.confirmed(self.settings.confirmations)
         columns.last_seen[matching.track] = np.maximum(columns.last_seen[matching.track], self._time - delay)
         columns.last_in_view[matching.track] = self._time

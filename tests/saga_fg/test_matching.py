@@ -39,7 +39,14 @@ def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None,
         classes or {"default": ClassSettings(max_distance=20.0)}, association=AssociationSettings(**association)
     )
     P = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
-    matching = associate(tracks, P, np.broadcast_to(expected, n), observed(found, probability), settings)
+    matching = associate(
+        tracks,
+        P,
+        np.broadcast_to(expected, n),
+        observed(found, probability),
+        settings,
+        settings.association.clutter_area,
+    )
     return sorted(zip(matching.track.tolist(), matching.detection.tolist(), strict=True))
 
 

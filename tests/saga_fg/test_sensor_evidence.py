@@ -85,3 +85,20 @@ def test_tracks_that_end_take_their_evidence_with_them():
     evidence.select(np.array([False, True, True]))
     evidence.born("camera", np.array([0.9]), 0.0)
     assert evidence.probability(0.0, 0.2) == pytest.approx([0.4, 0.2, 0.9])
+
+
+def test_the_steadiest_sensor_speaks_for_a_track():
+    evidence = born([0.6, 0.6])
+    for k in range(1, 5):
+        heard(evidence, "lidar", k / 10, [0], [0.6], missed=[False, True], n=2)
+        heard(evidence, "camera", k / 10, [1], [0.6], missed=[True, False], n=2)
+    hits, looks = evidence.steadiest()
+    assert hits.tolist() == [5, 4]
+    assert looks.tolist() == [5, 4]
+
+
+def test_what_others_have_just_seen():
+    evidence = born([0.6, 0.6], now=0.0)
+    heard(evidence, "camera", 1.0, [1], [0.6], n=2)
+    assert evidence.seen_by_others("lidar", 1.0, 0.2).tolist() == [False, True]
+    assert evidence.seen_by_others("camera", 1.0, 0.2).tolist() == [False, False]
