@@ -137,3 +137,13 @@ def upper_triangle(P: FloatArray) -> FloatArray:
 def from_upper_triangle(entries: FloatArray) -> FloatArray:
     """The symmetric matrices (N, 2, 2) of entries (N, 3): xx, xy, yy."""
     return entries[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+
+
+def distinct(label: StrArray) -> tuple[list[str], IntArray]:
+    """The labels that occur, in order of appearance, and the number (n,) of each row's among them.
+
+    For the handful of classes in a frame this is several times as fast as sorting the strings.
+    """
+    number: dict[str, int] = {}
+    index = [number.setdefault(name, len(number)) for name in label.tolist()]
+    return list(number), np.array(index, dtype=np.int64)

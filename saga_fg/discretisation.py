@@ -62,12 +62,13 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     b = np.zeros(int(offsets[-1]))
     F: list[Blocks] = []
     Q: list[Blocks] = []
-    for number, node_type in enumerate(kinds):  # nodes that nobody acts on share their dynamics
-        rows = np.flatnonzero((kind == number) & ~coupled)
-        if len(rows):
-            (own,), noise = _phi_and_noise(node_type.generator, node_type.diffusion, dt, 0)
-            F.append(Blocks(rows, rows, np.broadcast_to(own, (len(rows), *own.shape))))
-            Q.append(Blocks(rows, rows, np.broadcast_to(noise, (len(rows), *noise.shape))))
+    for d in np.unique(graph.dims[~coupled]).tolist():  # nodes that nobody acts on share their kind's dynamics
+        rows = np.flatnonzero(~coupled & (graph.dims == d))
+        numbers, of_row = np.unique(kind[rows], return_inverse=True)
+        generators, diffusions = (np.stack([getattr(kinds[k], n) for k in numbers]) for n in ("generator", "diffusion"))
+        (own,), noise = _phi_and_noise(generators, diffusions, dt, 0)
+        F.append(Blocks(rows, rows, own[of_row]))
+        Q.append(Blocks(rows, rows, noise[of_row]))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
     for d in np.unique(graph.dims[coupled]).tolist():
         rows = np.flatnonzero(coupled & (graph.dims == d))
@@ -115,8 +116,9 @@ def _own_dynamics(
     graph: SceneGraph, rows: IntArray, kinds: list[NodeType], kind: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M (m, d, d), Qc (m, d, d), c (m, d) of the nodes `rows`, whose states have equal size."""
-    M = np.stack([kinds[k].generator for k in kind[rows]])
-    Qc = np.stack([kinds[k].diffusion for k in kind[rows]]) * graph.diffusion_scale[rows, None, None]
+    numbers, of_row = np.unique(kind[rows], return_inverse=True)
+    M = np.stack([kinds[k].generator for k in numbers])[of_row]
+    Qc = np.stack([kinds[k].diffusion for k in numbers])[of_row] * graph.diffusion_scale[rows, None, None]
     c = np.zeros(M.shape[:2])
     position = np.full(len(graph), -1)
     position[rows] = np.arange(len(rows))

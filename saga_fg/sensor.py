@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.arrays import BoolArray, FloatArray, StrArray, distinct
 from saga_fg.errors import InputError
 from saga_fg.frame import Detections, Frame
 from saga_fg.geometry import inverse_transform, wrap_angle, yaw_transform
@@ -28,7 +28,7 @@ from saga_fg.settings import require_between, require_one_of, require_positive, 
 
 DEFAULT = "default"  # key of the settings for every class that has none of its own
 LEAST_PROBABILITY = 1e-3  # of a detection, and of its being none
-_LARGEST_LOGIT = math.log((1 - LEAST_PROBABILITY) / LEAST_PROBABILITY)
+_LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,11 @@ class Sensor:
         require_one_of(self, "births", ("alone", "confirmed"))
 
     def logit(self, score: FloatArray) -> FloatArray:
-        """The logits (N,) of the detector's own scores, before calibration, within those of 0.001 and 0.999."""
+        """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""
         raw = np.asarray(score, dtype=np.float64)
         if self.score == "probability":
             p = np.clip(raw, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
-            raw = np.log(p / (1 - p))
+            return np.asarray(np.log(p / (1 - p)))
         return np.clip(raw, -_LARGEST_LOGIT, _LARGEST_LOGIT)
 
     def probability(self, score: FloatArray, label: StrArray) -> FloatArray:
@@ -227,10 +227,8 @@ class Sensor:
 
 def _by_class(label: StrArray, value: Callable[[str], float]) -> FloatArray:
     """(N,) the value of each row's class, asked for once a class."""
-    if len(label) == 0:
-        return np.empty(0)
-    classes, index = np.unique(label, return_inverse=True)
-    return np.array([value(str(c)) for c in classes], dtype=np.float64)[index]
+    classes, index = distinct(label)
+    return np.array([value(c) for c in classes], dtype=np.float64)[index]
 
 
 def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:

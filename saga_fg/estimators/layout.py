@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -16,7 +18,10 @@ class Layout:
         self.nodes: IntArray = checked_ids("nodes", nodes)
         self.dims: IntArray = np.asarray(dims, dtype=np.int64)
         self.offsets: IntArray = np.concatenate([[0], np.cumsum(self.dims)]).astype(np.int64)
-        self._row = {int(node): row for row, node in enumerate(self.nodes)}
+
+    @cached_property
+    def _row(self) -> dict[int, int]:
+        return {node: row for row, node in enumerate(self.nodes.tolist())}
 
     def __len__(self) -> int:
         return len(self.nodes)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import Estimator, FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.interactions import POSITION, VELOCITY
@@ -41,20 +41,21 @@ class JointTrackState:
     def __init__(self, estimator: Estimator, motion: Callable[[str], Motion]) -> None:
         self._estimator = estimator
         self._motion = motion
-        self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
+        self._types: dict[str, NodeType] = {}  # by class; classes that move alike share one
         self._born: dict[int, float] = {}  # on the estimator's clock
         self._kinematics: Kinematics | None = None  # until the state changes
 
     def type_of(self, label: str) -> NodeType:
         """The node type of a class."""
-        motion = self._motion(label)
-        if motion not in self._types:
-            self._types[motion] = NodeType(type(motion).__name__, motion)
-        return self._types[motion]
+        if label not in self._types:
+            motion = self._motion(label)
+            alike = next((t for t in self._types.values() if t.motion == motion), None)
+            self._types[label] = alike or NodeType(type(motion).__name__, motion)
+        return self._types[label]
 
     def add(self, ids: IntArray, label: StrArray, now: Kinematics, delay: float = 0.0) -> None:
         """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1."""
-        for node_type, rows in self._by_type(label):
+        for node_type, rows in self._by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
             P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
             at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
@@ -84,7 +85,7 @@ class JointTrackState:
         z (k, 4) position and velocity, R (k, 4, 4); velocity counts where `with_velocity` (k,). A smoother puts a late
         measurement where it belongs; a filter, one of a track born since, moves it to the present along own motion.
         """
-        for node_type, of_type in self._by_type(label):
+        for node_type, of_type in self._by_type(label, delay > 0):
             for velocity in (True, False):
                 rows = of_type[with_velocity[of_type] == velocity]
                 if len(rows) == 0:
@@ -105,7 +106,7 @@ class JointTrackState:
             now = self.kinematics(ids, label)
             return now.position, now.P
         position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
-        for node_type, rows in self._by_type(label):
+        for node_type, rows in self._by_type(label, moving=True):
             H, R = _moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
             position[rows] = self._estimator.mean(ids[rows]) @ H.T
             P[rows] = H @ self._estimator.covariance(ids[rows]) @ H.T + R
@@ -138,13 +139,16 @@ class JointTrackState:
         self._kinematics = None
         return self._estimator
 
-    def _by_type(self, label: StrArray) -> list[tuple[NodeType, IntArray]]:
-        """Rows of equal node type, with the type."""
-        classes, index = np.unique(label, return_inverse=True)
-        types = [self.type_of(str(c)) for c in classes]
-        distinct = list({id(t): t for t in types}.values())
-        number = np.array([next(k for k, d in enumerate(distinct) if d is t) for t in types], dtype=np.int64)[index]
-        return [(node_type, np.flatnonzero(number == k)) for k, node_type in enumerate(distinct)]
+    def _by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
+        """Rows whose states mean the same, with a type of theirs; if `moving`, rows that also move the same."""
+        classes, index = distinct(label)
+        types = [self.type_of(c) for c in classes]
+        number: dict[object, int] = {}
+        kind = [number.setdefault(id(t) if moving else t.components, len(number)) for t in types]
+        if len(number) == 1:
+            return [(types[0], np.arange(len(label)))]
+        of_row = np.array(kind, dtype=np.int64)[index]
+        return [(types[kind.index(k)], np.flatnonzero(of_row == k)) for k in range(len(number))]
 
     def _read(self, ids: IntArray, label: StrArray) -> Kinematics:
         n = len(ids)

@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import FloatArray, distinct
 from saga_fg.association import Matching, assign, assign_greedily, gate, mahalanobis
 from saga_fg.boxes import Boxes
 from saga_fg.overlap import giou_3d
@@ -47,11 +47,12 @@ def associate(
     clutter_area  of the module, m^2, of the sensor that speaks
     """
     pairs = [Matching.empty()]
-    for label in np.unique(predicted.label):
-        t, d = np.flatnonzero(predicted.label == label), np.flatnonzero(observed.boxes.label == label)
-        if len(d) == 0:
+    (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(observed.boxes.label)
+    for label in classes:
+        if label not in seen:
             continue
-        of_class = settings_of(settings.classes, str(label))
+        t, d = np.flatnonzero(of_track == classes.index(label)), np.flatnonzero(of_detection == seen.index(label))
+        of_class = settings_of(settings.classes, label)
         position, measured = predicted.position[t, :2], observed.boxes.position[d, :2]
         d2, log_det = mahalanobis(position, P[t], measured, observed.R[d, :2, :2])
         apart = np.hypot(*np.moveaxis(measured[None] - position[:, None], -1, 0))

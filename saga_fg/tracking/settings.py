@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.arrays import FloatArray, StrArray, distinct
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
 from saga_fg.node import ConstantAcceleration, ConstantVelocity
@@ -57,9 +57,8 @@ def settings_of(classes: Mapping[str, ClassSettings], label: str) -> ClassSettin
 
 def class_values(classes: Mapping[str, ClassSettings], name: str, label: StrArray) -> FloatArray:
     """(n,) the setting `name` of each label's class."""
-    distinct, index = np.unique(label, return_inverse=True)
-    values = np.array([getattr(settings_of(classes, str(c)), name) for c in distinct], dtype=np.float64)
-    return values[index] if len(label) else np.empty(0)
+    names, index = distinct(label)
+    return np.array([getattr(settings_of(classes, c), name) for c in names], dtype=np.float64)[index]
 
 
 @dataclass(frozen=True)
