@@ -70,7 +70,10 @@ def _connected(address: str, workers: int) -> ModuleType:
         import ray
     except ImportError as error:
         raise MissingExtraError('--ray: Ray is not installed; pip install "saga-fg[ray]"') from error
-    local: dict[str, Any] = {"num_cpus": workers or None, "include_dashboard": False} if address == "local" else {}
+    local: dict[str, Any] = {}
+    if address == "local":
+        local = {"num_cpus": workers or None, "include_dashboard": False}
+        os.environ.setdefault("RAY_worker_niceness", "0")  # there is no raylet of others to be nice to
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, configure_logging=False, **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
