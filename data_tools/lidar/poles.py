@@ -33,10 +33,13 @@ class PoleSettings:
     points: int = setting(8, "least points")
     filled: float = setting(0.5, "least share of half-metre steps of the height that hold points")
     alone: float = setting(0.6, "nothing else within this distance of the axis, m")
-    noise: float = setting(0.03, "of the axis where it is seen well: ranges, bent trunks, m")
+    alone_share: float = setting(0.1, "nor within this share of the range: columns of a wall seen aslant are no poles")
+    noise: float = setting(0.06, "of the axis where it is seen well: ranges, radius, bent trunks, m")
 
     def __post_init__(self) -> None:
-        require_positive(self, "cell", "reach", "lowest", "height", "width", "points", "filled", "alone", "noise")
+        require_positive(
+            self, "cell", "reach", "lowest", "height", "width", "points", "filled", "alone", "alone_share", "noise"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +64,22 @@ def extract_poles(
     """The poles among points (N, 3), m, with their `height` (N,) above the ground, m; none along the `walls`."""
     s = settings or PoleSettings()
     points = points[(height >= s.lowest) & (np.hypot(points[:, 0], points[:, 1]) <= s.reach)]
-    points = points[~near_walls(points, walls, s.alone)]
+    everything = points
+    points = points[~near_walls(points, walls, s.cell)]
     part = connected_from_above(points, s.cell)
     order = np.argsort(part, kind="stable")
     grouped = points[order]
     bounds = np.concatenate([[0], np.flatnonzero(np.diff(part[order])) + 1, [len(order)]])
-    tree = cKDTree(points[:, :2]) if len(points) else None
+    tree = cKDTree(everything[:, :2]) if len(points) else None
     poles = []
     for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         candidate = grouped[start:end]
         if tree is None or not _slender(candidate, s):
             continue
         pole = _pole(candidate, s)
-        around = points[tree.query_ball_point(pole.foot[:2], s.alone)]
+        around = everything[
+            tree.query_ball_point(pole.foot[:2], max(s.alone, s.alone_share * float(np.hypot(*pole.foot[:2]))))
+        ]
         level = (around[:, 2] >= pole.foot[2]) & (around[:, 2] <= pole.top)
         if level.sum() <= 1.2 * len(candidate):
             poles.append(pole)

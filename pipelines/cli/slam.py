@@ -13,6 +13,11 @@ slam_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mod
 slam_app.command()(g2o)
 slam_app.command()(plaza)
 slam_app.command("victoria-park")(victoria_park)
+from pipelines.cli.slam_kitti import kitti
+
+slam_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
+slam_app.command()(g2o)
+slam_app.command()(kitti)
 
 
 @slam_app.callback()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from street import SENSOR_HEIGHT, street
 
 from data_tools.lidar import (
     Scan,
@@ -21,6 +20,7 @@ from data_tools.lidar import (
 from data_tools.lidar.clusters import l_shape_heading
 from data_tools.lidar.components import connected_from_above
 from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
+from data_tools.simulator.street import SENSOR_HEIGHT, street
 from saga_fg.boxes import Boxes
 from saga_fg.geometry import transform_points, yaw_transform
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from street import drive, scans, street
 
 from data_tools.lidar import (
     RegistrationError,
@@ -24,6 +23,7 @@ from data_tools.lidar import (
     voxel_keys,
 )
 from data_tools.simulator.scanner import StandingWorld
+from data_tools.simulator.street import drive, scans, street
 from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
 from saga_fg.geometry import inverse_transform, transform_points, yaw_transform

@@ -5,36 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from street import drive, scans, street
 from typer.testing import CliRunner
 
-from data_tools.lidar import Scan
+from data_tools.simulator.scan_drive import SimulatedScans
 from data_tools.simulator.scanner import ScannerSettings
+from data_tools.simulator.street import street
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.detector_free import cluster_scene
 from pipelines.tracking import track_scene
-from saga_fg.arrays import FloatArray
-
-
-class SimulatedScans:
-    """A short drive past parked cars."""
-
-    def __init__(self) -> None:
-        self.world_T_ego: FloatArray = drive(8)
-        self.timestamps: FloatArray = 0.1 * np.arange(8)
-        self.ego_T_lidar: FloatArray = np.eye(4)
-        self._scans = scans(street(0), self.world_T_ego, settings=ScannerSettings(columns=500), skewed=False)
-
-    def __len__(self) -> int:
-        return len(self._scans)
-
-    def __getitem__(self, row: int) -> Scan:
-        return self._scans[row]
 
 
 def test_clusters_of_parked_cars_become_standing_tracks() -> None:
-    scene = cluster_scene("street", SimulatedScans())
+    scene = cluster_scene("street", SimulatedScans(0, 8, settings=ScannerSettings(columns=500)))
     assert scene.sensors == ("lidar",)
     tracks = track_scene(scene, load_config("file").new_tracker("saga")).tracks[-1]
     cars = street(0).boxes

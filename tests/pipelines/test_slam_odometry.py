@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from street import drive, scans, street
 from typer.testing import CliRunner
 
 from data_tools.kitti import KittiScans
 from data_tools.lidar import Scan
+from data_tools.simulator.scan_drive import SimulatedScans
+from data_tools.simulator.street import drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.bench.slam import bench_slam
 from pipelines.cli import app
@@ -78,25 +79,9 @@ def test_time_runs_forwards_and_settings_are_checked() -> None:
         OdometrySettings(surfel=0.0)
 
 
-class SimulatedScans:
-    """A drive as the benchmark takes it."""
-
-    def __init__(self, count: int) -> None:
-        self.world_T_ego: FloatArray = drive(count)
-        self.timestamps: FloatArray = PERIOD * np.arange(count)
-        self.ego_T_lidar: FloatArray = np.eye(4)
-        self._scans = scans(street(2), self.world_T_ego, 2)
-
-    def __len__(self) -> int:
-        return len(self._scans)
-
-    def __getitem__(self, row: int) -> Scan:
-        return self._scans[row]
-
-
 def test_the_benchmark_measures_both_on_the_same_scans() -> None:
     pytest.importorskip("kiss_icp", reason="kiss-icp comes with the extra bench")
-    rows = bench_slam(SimulatedScans(20))
+    rows = bench_slam(SimulatedScans(2, 20))
     assert [(row.case, row.contender) for row in rows] == [
         (case, name) for case in ("as recorded", "de-skewed") for name in ("saga-fg", "kiss-icp")
     ]

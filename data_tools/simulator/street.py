@@ -1,4 +1,4 @@
-"""A street for tests: houses on both sides, parked cars, poles, kerbs, and a drive along it."""
+"""A street for a LiDAR to drive along: houses on both sides, parked cars and poles, all drawn from a seed."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import numpy as np
 
 from data_tools.lidar import Scan, constant_velocity
 from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
+from saga_fg.arrays import FloatArray
 from saga_fg.boxes import Boxes
 from saga_fg.geometry import inverse_transform, yaw_transform
 
-SENSOR_HEIGHT = 1.8
+SENSOR_HEIGHT = 1.8  # m above the ground
 SMALL = ScannerSettings(rings=24, columns=360)
 
 
@@ -37,8 +38,8 @@ def street(seed: int = 0) -> StandingWorld:
     return StandingWorld(Boxes.of(label, position, size, np.zeros(n), np.zeros((n, 2))), poles)
 
 
-def drive(count: int, speed: float = 8.0, turn_rate: float = 0.05, period: float = 0.1) -> np.ndarray:
-    """world_T_lidar (count, 4, 4) of a sensor at `SENSOR_HEIGHT` that drives a gentle bend."""
+def drive(count: int, speed: float = 8.0, turn_rate: float = 0.05, period: float = 0.1) -> FloatArray:
+    """world_T_lidar (count, 4, 4) of a sensor at `SENSOR_HEIGHT` that sways along; m/s, rad/s, s between poses."""
     poses = [yaw_transform(-5.0, -1.5, SENSOR_HEIGHT, 0.0)]
     for k in range(count - 1):
         rate = turn_rate * np.sin(2 * np.pi * k / 40)
@@ -47,9 +48,9 @@ def drive(count: int, speed: float = 8.0, turn_rate: float = 0.05, period: float
 
 
 def scans(
-    world: StandingWorld, poses: np.ndarray, seed: int = 0, settings: ScannerSettings = SMALL, skewed: bool = True
+    world: StandingWorld, poses: FloatArray, seed: int = 0, settings: ScannerSettings = SMALL, skewed: bool = True
 ) -> list[Scan]:
-    """One scan at each pose, skewed by the motion to the next."""
+    """One scan at each pose (K, 4, 4), K >= 2, skewed by the motion to the next unless `skewed` is False."""
     rng = np.random.default_rng(seed)
     period = settings.period
     taken = []

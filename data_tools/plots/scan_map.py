@@ -1,0 +1,44 @@
+"""A LiDAR map from above: points coloured by height, the paths driven, poles and walls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray
+
+MOST_POINTS = 60_000  # that are drawn, evenly chosen
+MARGIN = 30.0  # m around the paths
+
+
+def scan_map_from_above(
+    points: FloatArray, paths: Mapping[str, FloatArray], poles: FloatArray, walls: FloatArray
+) -> Any:
+    """A matplotlib `Figure`; everything in world coordinates, m.
+
+    points  (N, 3); paths (K, 3), each under its name; poles (P, 2); walls (W, 2, 2) their two ends
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
+    ax = figure.subplots()
+    chosen = points[:: max(1, len(points) // MOST_POINTS)]
+    low, high = np.percentile(chosen[:, 2], [5, 95]) if len(chosen) else (0.0, 1.0)
+    x, y, z = chosen.T
+    dots = ax.scatter(x, y, c=z, s=0.3, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+    figure.colorbar(dots, ax=ax, label="height, m", shrink=0.7)
+    ax.add_collection(LineCollection(list(walls), colors="#d62728", linewidths=1.5, label="walls"))
+    if len(poles):
+        ax.plot(
+            *poles.T, "o", color="#ff7f0e", markersize=4, markeredgecolor="black", markeredgewidth=0.4, label="poles"
+        )
+    for (name, path), colour in zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False):
+        ax.plot(*path[:, :2].T, color=colour, linewidth=1.5, label=name)
+    driven = np.concatenate([path[:, :2] for path in paths.values()])
+    (left, bottom), (right, top) = driven.min(axis=0) - MARGIN, driven.max(axis=0) + MARGIN
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))
+    ax.legend(frameon=True, fontsize=9, loc="upper right")
+    return figure

@@ -1,0 +1,145 @@
+"""The results of SLAM on a recording, as files.
+
+trajectory.txt, times.txt   poses of the vehicle, KITTI's format: world_T_ego of every scan, and its time
+trajectory.tum              the same in the TUM format
+odometry.tum                by odometry alone; online.tum: as estimated when each keyframe came
+covariances.csv             of the sensor's pose at the keyframes: time, then the upper triangle of (rotation vector,
+                            translation) in the sensor's frame, rad and m
+map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
+landmarks.json              kind, number of sightings, coordinates and covariance of each landmark
+landmarks.ply               the same to look at: points along the poles and on the seen pieces of the walls
+above.png                   map, paths and landmarks from above
+metrics.json                errors of the trajectories against the recording's own poses, and the map's sharpness
+
+World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
+from data_tools.plots import png, scan_map_from_above
+from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.scan_sequence import ScanSequence
+from pipelines.slam.lidar_slam import LidarSlam
+from pipelines.slam.sightings import POLE
+from saga_fg.arrays import FloatArray
+from saga_fg.geometry import transform_points
+from saga_fg.landmarks import Landmark
+
+POLE_HEIGHT = 3.0  # m above the first pose, to which poles are drawn
+_COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
+
+
+def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
+    """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts."""
+    truth = Trajectory(scans.timestamps, scans.world_T_ego)
+    kinds = [landmark.kind.name for landmark in result.landmarks]
+    return {
+        "keyframes": len(result.keyframes),
+        "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
+        "loops": len(result.loops),
+        "scan_to_map_residual": scan_to_map_residual(result.clouds, result.world_T_lidar),
+        **{
+            name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
+            for name in ("odometry", "online", "trajectory")
+        },
+    }
+
+
+def write_lidar_slam(output: Path, result: LidarSlam, scans: ScanSequence, spacing: float = 0.2) -> dict[str, Any]:
+    """Write all files of a run to a folder, or none; returns the metrics. `spacing` of the map's points, m."""
+    points = accumulated_map(result, spacing)
+    figures = metrics(result, scans)
+    with atomic_directory(output) as folder:
+        write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
+        for name, trajectory in (
+            ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)
+        ):  # fmt: skip
+            write_tum_poses(folder / f"{name}.tum", trajectory)
+        _write_covariances(folder / "covariances.csv", result)
+        write_ply(folder / "map.ply", points)
+        _write_landmarks(folder, result)
+        paths = {"GPS/IMU": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _wall_ends(result))
+        write_bytes(folder / "above.png", png(figure))
+        write_text(folder / "metrics.json", json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+def accumulated_map(result: LidarSlam, spacing: float) -> FloatArray:
+    """Points (N, 3) of all keyframes in world coordinates, m, one in each voxel of `spacing` m."""
+    placed = zip(result.world_T_lidar, result.clouds, strict=True)
+    points = np.concatenate([transform_points(pose, cloud) for pose, cloud in placed])
+    return points[voxel_downsample(points, spacing)]
+
+
+def _write_covariances(path: Path, result: LidarSlam) -> None:
+    upper = np.triu_indices(6)
+    names = ["time", *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))]
+    times = result.trajectory.timestamps[result.keyframes].tolist()
+    rows = [
+        ",".join([repr(time), *(f"{x:.9g}" for x in covariance[upper])])
+        for time, covariance in zip(times, result.covariances, strict=True)
+    ]
+    write_text(path, "\n".join([",".join(names), *rows]) + "\n")
+
+
+def _write_landmarks(folder: Path, result: LidarSlam) -> None:
+    records = [
+        {
+            "id": landmark.number,
+            "kind": landmark.kind.name,
+            "sightings": landmark.sightings,
+            **landmark.kind.coordinates(landmark.state),
+            "covariance": landmark.covariance.tolist(),
+        }
+        for landmark in result.landmarks
+    ]
+    write_text(folder / "landmarks.json", json.dumps(records, indent=1) + "\n")
+    start = float(result.world_T_lidar[0, 2, 3])
+    drawn, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
+    for pole in _poles(result.landmarks):
+        z = np.arange(start - 1.5, start + POLE_HEIGHT, 0.1)
+        drawn.append(np.column_stack([np.broadcast_to(pole, (len(z), 2)), z]))
+        colours.append(np.full((len(z), 3), _COLOURS[True], dtype=np.uint8))
+    for a, b in _wall_ends(result):
+        share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(b - a) / 0.2)))
+        z = np.arange(start - 1.0, start + POLE_HEIGHT, 0.4)
+        foot = np.repeat(a + share[:, None] * (b - a), len(z), axis=0)
+        drawn.append(np.column_stack([foot, np.tile(z, len(share))]))
+        colours.append(np.full((len(foot), 3), _COLOURS[False], dtype=np.uint8))
+    write_ply(folder / "landmarks.ply", np.concatenate(drawn), np.concatenate(colours))
+
+
+def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
+    """Places (P, 2) of the poles."""
+    return np.array([mark.state for mark in landmarks if mark.kind == POLE], dtype=np.float64).reshape(-1, 2)
+
+
+def _wall_ends(result: LidarSlam) -> FloatArray:
+    """Ends (W, 2, 2), from above, of the seen piece of each wall: the outermost feet of its sightings."""
+    ends = []
+    for mark in result.landmarks:
+        if mark.kind.name != "wall":
+            continue
+        nx, ny, _, d = mark.state.planeCoefficients().tolist()
+        normal = np.array([nx, ny]) / np.hypot(nx, ny)
+        along = np.array([-normal[1], normal[0]])
+        centres = [
+            transform_points(result.world_T_lidar[seen.pose], extent)[:, :2]
+            for seen, extent in zip(result.sightings, result.extents, strict=True)
+            if seen.landmark == mark.number
+        ]
+        u = np.concatenate(centres) @ along
+        foot = -d / np.hypot(nx, ny) * normal
+        ends.append(np.stack([foot + u.min() * along, foot + u.max() * along]))
+    return np.array(ends).reshape(-1, 2, 2)

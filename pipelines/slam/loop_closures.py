@@ -1,0 +1,90 @@
+"""Loop closures: places that the vehicle comes back to, found by distance and proved by registration.
+
+A keyframe j is compared with the nearest earlier keyframe i from which it has driven a long way since. Its scan is
+registered with the surfels of the keyframes around i, started where the present estimate says. It is a loop where that
+converges, enough of the points have a surfel, and the residual is no larger than between neighbours. What slips
+through is the business of a robust loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.lidar import RegistrationError, RegistrationSettings, SurfelMap, register, voxel_downsample
+from saga_fg.arrays import FloatArray
+from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """When two keyframes are looked at, and when they are taken for one place."""
+
+    distance: float = setting(8.0, "largest distance of the two places by the present estimate, m")
+    path: float = setting(30.0, "least way driven between them, m")
+    every: float = setting(5.0, "least way between two searches, m")
+    around: int = setting(4, "keyframes to either side whose scans make the map that is registered with")
+    surfel: float = setting(1.0, "voxel of that map, m")
+    spacing: float = setting(1.0, "a scan is thinned to this before it is registered, m")
+    overlap: float = setting(0.5, "least share of the points that have a surfel")
+    residual: float = setting(0.3, "largest mean distance of points from their surfels, m")
+    registration: RegistrationSettings = settings_group(RegistrationSettings, "of the scan with the map")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "distance", "path", "every", "surfel", "spacing", "residual")
+        require_between(self, 0.0, 1.0, "overlap")
+        require_between(self, 0, 1000, "around")
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosure:
+    """Keyframe `second` seen from keyframe `first`: first_T_second (4, 4), covariance (6, 6) of its tangent."""
+
+    first: int
+    second: int
+    first_T_second: FloatArray
+    covariance: FloatArray
+
+
+def find_loops(
+    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, settings: LoopSettings | None = None
+) -> list[LoopClosure]:
+    """The loops of K keyframes: points (N, 3) of each in its sensor's frame, and estimated poses (K, 4, 4)."""
+    s = settings or LoopSettings()
+    places = world_T_lidar[:, :3, 3]
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+    loops, searched = [], -np.inf
+    for j in range(len(clouds)):
+        earlier = np.flatnonzero(way[j] - way >= s.path)
+        if not len(earlier) or way[j] - searched < s.every:
+            continue
+        distance = np.linalg.norm(places[earlier] - places[j], axis=1)
+        if distance.min() > s.distance:
+            continue
+        searched = float(way[j])
+        loop = _proved(clouds, world_T_lidar, int(earlier[distance.argmin()]), j, s)
+        if loop is not None:
+            loops.append(loop)
+    return loops
+
+
+def _proved(
+    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, i: int, j: int, s: LoopSettings
+) -> LoopClosure | None:
+    i_T_world = inverse_transform(world_T_lidar[i])
+    surfels = SurfelMap(s.surfel, reach=np.inf)
+    for k in range(max(0, i - s.around), min(j, i + s.around + 1)):
+        surfels.add(transform_points(i_T_world @ world_T_lidar[k], clouds[k]), np.zeros(3))
+    points = clouds[j][voxel_downsample(clouds[j], s.spacing)]
+    start = i_T_world @ world_T_lidar[j]
+    try:
+        rough = register(points, surfels, start, 3 * s.surfel, 1.0, s.registration)
+        found = register(points, surfels, rough.map_T_scan, s.surfel, 0.1, s.registration)
+    except RegistrationError:
+        return None
+    if not found.converged or found.pairs < s.overlap * len(points) or found.residual > s.residual:
+        return None
+    return LoopClosure(i, j, found.map_T_scan, found.covariance)

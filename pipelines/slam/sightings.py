@@ -1,0 +1,63 @@
+"""What a scan shows of landmarks: walls and the ground as planes, masts and trunks as poles, as observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.lidar import (
+    GroundSettings,
+    PlaneSettings,
+    PoleSettings,
+    extract_poles,
+    extract_walls,
+    fit_ground,
+    segment_ground,
+)
+from saga_fg.arrays import FloatArray
+from saga_fg.landmarks import Observation, PlaneLandmark, PoleLandmark
+from saga_fg.settings import setting, settings_group
+
+GROUND = PlaneLandmark(name="ground")
+WALL = PlaneLandmark(name="wall")
+POLE = PoleLandmark()
+
+
+@dataclass(frozen=True)
+class SightingSettings:
+    """Which landmarks are looked for, and how."""
+
+    ground: bool = setting(False, "the ground as one plane: for level places only")
+    walls: int = setting(6, "walls of a scan at most, the largest ones")
+    poles: int = setting(12, "poles of a scan at most, the nearest ones")
+    segmentation: GroundSettings = settings_group(GroundSettings, "of the ground")
+    plane: PlaneSettings = settings_group(PlaneSettings, "of walls and ground")
+    pole: PoleSettings = settings_group(PoleSettings, "of poles")
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """An observation, and the ends (2, 3) of the piece of the landmark that was seen, m, in the sensor's frame."""
+
+    observation: Observation
+    extent: FloatArray
+
+
+def landmarks_seen(points: FloatArray, settings: SightingSettings | None = None) -> list[Seen]:
+    """Landmarks seen in points (N, 3) of a scan without skew, m, in the sensor's frame."""
+    s = settings or SightingSettings()
+    ground = segment_ground(points, s.segmentation)
+    found = []
+    if s.ground:
+        plane = fit_ground(points[ground.is_ground], s.plane)
+        if plane is not None:
+            found.append(Seen(Observation(GROUND, plane.coefficients, plane.covariance), plane.extent))
+    walls = extract_walls(points[~ground.is_ground], s.plane)
+    for wall in walls[: s.walls]:
+        found.append(Seen(Observation(WALL, wall.coefficients, wall.covariance), wall.extent))
+    poles = extract_poles(points, ground.height, walls, s.pole)
+    for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
+        extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
+        found.append(Seen(Observation(POLE, pole.foot, pole.covariance), extent))
+    return found

@@ -1,0 +1,126 @@
+"""LiDAR SLAM: landmarks where they stand, loops closed, and every file of a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.lidar import read_scan
+from data_tools.simulator.scan_drive import SimulatedScans
+from data_tools.simulator.street import drive
+from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
+from pipelines.cli import app
+from pipelines.slam.kitti import write_lidar_slam
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
+from pipelines.slam.loop_closures import LoopSettings, find_loops
+from pipelines.slam.sightings import POLE
+from saga_fg.errors import InputError
+from saga_fg.geometry import inverse_transform, yaw_transform
+
+
+@pytest.fixture(scope="module")
+def scans() -> SimulatedScans:
+    return SimulatedScans(0, 24)
+
+
+@pytest.fixture(scope="module")
+def result(scans: SimulatedScans) -> LidarSlam:
+    return lidar_slam(scans)
+
+
+def test_the_drive_is_found_and_the_covariance_grows(scans: SimulatedScans, result: LidarSlam) -> None:
+    truth = Trajectory(scans.timestamps, scans.world_T_ego)
+    assert trajectory_errors(result.trajectory, truth, "start").relative_translation < 0.05
+    assert trajectory_errors(result.online, truth, "start").relative_translation < 0.1
+    spread = np.trace(result.covariances[:, 3:, 3:], axis1=1, axis2=2)
+    assert spread[0] < spread[len(spread) // 2] < spread[-1]
+    assert np.linalg.eigvalsh(result.covariances).min() > 0
+
+
+def test_landmarks_stand_where_they_do(scans: SimulatedScans, result: LidarSlam) -> None:
+    poles = [mark for mark in result.landmarks if mark.kind == POLE]
+    walls = [mark for mark in result.landmarks if mark.kind.name == "wall"]
+    assert len(poles) >= 2
+    assert len(walls) >= 4
+    squares = []
+    for mark in poles:
+        off = scans.world.poles[:, :2] - mark.state
+        nearest = off[np.argmin(np.linalg.norm(off, axis=1))]
+        assert np.linalg.norm(nearest) < 0.2
+        squares.append(float(nearest @ np.linalg.solve(mark.covariance, nearest)))
+    assert np.mean(squares) < 3 * 2  # of two degrees of freedom
+    for mark in walls:
+        assert abs(mark.state.planeCoefficients()[2]) < 0.02
+
+
+def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
+    """The recording's poses with a wrong scale and noise stand for a poor odometry; landmarks pull them straight."""
+    scans = SimulatedScans(1, 40)
+    truth = Trajectory(scans.timestamps, scans.world_T_ego)
+    rng = np.random.default_rng(0)
+    poor = [scans.world_T_ego[0]]
+    for a, b in zip(scans.world_T_ego[:-1], scans.world_T_ego[1:], strict=True):
+        noise = yaw_transform(*rng.normal(0, 0.05, 2), yaw=rng.normal(0, 0.003))
+        poor.append(poor[-1] @ inverse_transform(a) @ b @ noise)
+    scans.world_T_ego = np.array(poor)
+    settings = LidarSlamSettings(oxts_rotation=0.003, oxts_translation=0.05)
+    found = lidar_slam(scans, "oxts", settings)
+    before = trajectory_errors(found.odometry, truth, "start").ate
+    assert trajectory_errors(found.trajectory, truth, "start").ate < 0.7 * before
+
+
+def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
+    there = drive(18, speed=16.0)
+    poses = np.concatenate([there, there[-2::-1]])
+    scans = SimulatedScans(0, world_T_lidar=poses)
+    clouds = [scans[k].points for k in range(len(scans))]
+    drift = np.array([yaw_transform(y=0.02 * k) for k in range(len(poses))])
+    (loop, *others) = find_loops(clouds, drift @ poses, LoopSettings(path=20.0))
+    truth = inverse_transform(poses[loop.first]) @ poses[loop.second]
+    assert np.linalg.norm((inverse_transform(truth) @ loop.first_T_second)[:3, 3]) < 0.6  # scans are skewed here
+    assert loop.second - loop.first > 5
+    assert others
+    assert find_loops(clouds[:10], poses[:10]) == []
+
+
+def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: LidarSlam, tmp_path: Path) -> None:
+    figures = write_lidar_slam(tmp_path / "run", result, scans)
+    folder = tmp_path / "run"
+    for trajectory in (
+        read_kitti_poses(folder / "trajectory.txt", folder / "times.txt"),
+        read_tum_poses(folder / "trajectory.tum"),
+    ):
+        np.testing.assert_allclose(trajectory.world_T_ego, result.trajectory.world_T_ego, atol=1e-6)
+        np.testing.assert_allclose(trajectory.timestamps, scans.timestamps)
+    points = read_scan(folder / "map.ply").points
+    assert len(points) > 1000
+    assert len(read_scan(folder / "landmarks.ply")) > 0
+    landmarks = json.loads((folder / "landmarks.json").read_text())
+    assert {mark["kind"] for mark in landmarks} == {"pole", "wall"}
+    assert all(mark["sightings"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
+    covariances = np.loadtxt(folder / "covariances.csv", delimiter=",", skiprows=1)
+    assert covariances.shape == (len(result.keyframes), 22)
+    assert json.loads((folder / "metrics.json").read_text()) == figures
+    assert (folder / "above.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(tmp_path.iterdir()) == [folder]
+
+
+@pytest.mark.parametrize("odometry", ["lidar", "oxts"])
+def test_the_command_on_real_scans(recordings: Path, tmp_path: Path, odometry: str) -> None:
+    options = ["--dataroot", str(recordings / "kitti"), "--scans", "8", "--odometry", odometry]
+    outcome = CliRunner().invoke(app, ["slam", "kitti", *options, "--output", str(tmp_path / "run")])
+    assert outcome.exit_code == 0, outcome.output
+    assert "8 scans" in outcome.stdout
+    assert "trajectory against GPS/IMU: ATE" in outcome.stdout
+    assert (tmp_path / "run" / "map.ply").is_file()
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(InputError, match="overlap: expected a number from 0 to 1"):
+        LoopSettings(overlap=2.0)
+    with pytest.raises(InputError, match="map_spacing: expected"):
+        LidarSlamSettings(map_spacing=0.0)
