@@ -34,11 +34,25 @@ class PoleSettings:
     filled: float = setting(0.5, "least share of half-metre steps of the height that hold points")
     alone: float = setting(0.6, "nothing else within this distance of the axis, m")
     alone_share: float = setting(0.1, "nor within this share of the range: columns of a wall seen aslant are no poles")
-    noise: float = setting(0.06, "of the axis where it is seen well: ranges, radius, bent trunks, m")
+    noise: float = setting(0.05, "of the axis: ranges, radius, bent trunks, m")
+    bearing_noise: float = setting(0.006, "across the line of sight: rays hit or miss a thin pole, rad")
+    depth_noise: float = setting(0.1, "along it: how much of a round pole lies behind is guessed from its width, m")
 
     def __post_init__(self) -> None:
         require_positive(
-            self, "cell", "reach", "lowest", "height", "width", "points", "filled", "alone", "alone_share", "noise"
+            self,
+            "cell",
+            "reach",
+            "lowest",
+            "height",
+            "width",
+            "points",
+            "filled",
+            "alone",
+            "alone_share",
+            "noise",
+            "bearing_noise",
+            "depth_noise",
         )
 
 
@@ -99,8 +113,11 @@ def _slender(points: FloatArray, s: PoleSettings) -> bool:
 def _pole(points: FloatArray, s: PoleSettings) -> Pole:
     mean = points[:, :2].mean(axis=0)
     sight = mean / max(float(np.hypot(*mean)), 1e-9)
-    across = points[:, :2] @ np.array([-sight[1], sight[0]])
+    aside = np.array([-sight[1], sight[0]])
+    across = points[:, :2] @ aside
     radius = float(np.ptp(across)) / 2
     axis = mean + np.pi / 4 * radius * sight
     covariance = np.cov(points[:, :2].T) / len(points) + s.noise**2 * np.eye(2)
+    covariance += (s.bearing_noise * float(np.hypot(*mean))) ** 2 * np.outer(aside, aside)
+    covariance += s.depth_noise**2 * np.outer(sight, sight)
     return Pole(np.append(axis, points[:, 2].min()), float(points[:, 2].max()), radius, covariance)
