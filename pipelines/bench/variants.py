@@ -6,6 +6,7 @@ for every entry of a mapping. A value may be a function of the old value. One th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any
@@ -40,9 +41,18 @@ COMPONENTS = (
     Variant("without neighbours", changes={"tracker.edges": _without(Neighbours)}),
     Variant("without explained noise", changes={"tracker.explained_noise": 0.0}),
     Variant("without duplicate suppression", changes={"tracker.classes.*.duplicate_distance": 0.0}),
-    Variant("without existence of tracks", changes={"tracker.existence.lifetime": float("inf")}),
+    Variant("without shadow suppression", changes={"tracker.classes.*.shadow_distance": 0.0}),
+    Variant("matching without overlap", changes={"tracker.classes.*.overlap_weight": 0.0}),
+    Variant("matching without clutter", changes={"tracker.association.clutter_area": math.inf}),
+    Variant("matching without existence", changes={"tracker.association.existence_weight": 0.0}),
+    Variant("matching without scores", changes={"tracker.association.score_weight": 0.0}),
+    Variant("greedy matching", changes={"tracker.association.method": "greedy"}),
+    Variant("tracks that never leave unseen", changes={"tracker.existence.lifetime": math.inf}),
+    Variant("scores without steadiness", changes={"tracker.existence.steadiness_weight": 0.0}),
+    Variant("coasting tracks scored in full", changes={"tracker.existence.coasting_score": 1.0}),
+    Variant("without unconfirmed tracks", changes={"tracker.unconfirmed_share": 0.0}),
     Variant("without output while coasting", changes={"tracker.report_coasting": 0.0}),
-    Variant("heading drifts freely", changes={"tracker.classes.*.yaw_drift": 3.0}),
+    Variant("headings that drift freely", changes={"tracker.classes.*.yaw_drift": 3.0}),
 )
 
 
