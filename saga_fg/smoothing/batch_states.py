@@ -44,7 +44,7 @@ def no_edges(moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGr
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """States (m,) of objects that stand: their moments and ids; settings of how firmly."""
+    """States (m,) of objects that stand: their moments in ascending order, and ids; settings of how firmly."""
 
     settings: StandingSettings = field(default_factory=StandingSettings)
     moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -52,7 +52,8 @@ class Standing:
 
     def at(self, moment: int, ids: IntArray) -> BoolArray:
         """(n,) which of these objects stand at a moment."""
-        return np.isin(ids, self.id[self.moment == moment])
+        first, last = np.searchsorted(self.moment, [moment, moment + 1])
+        return np.isin(ids, self.id[first:last])
 
 
 def smooth_states(

@@ -50,6 +50,7 @@ def standing_states(
         if len(within) and _drift(evidence, within) <= max_drift[a]:
             kept.append(np.arange(a, b + 1))
     chosen = np.concatenate([np.empty(0, dtype=np.int64), *kept])
+    chosen = chosen[np.argsort(moments[chosen], kind="stable")]
     return Standing(settings, moments[chosen], ids[chosen])
 
 

@@ -106,7 +106,15 @@ class StateTable:
         """(m,) the rows of these objects at these moments, -1 where there is none."""
         if len(self) == 0:
             return np.full(len(ids), -1, dtype=np.int64)
-        span = max(int(self.id.max()), int(ids.max(initial=0))) + 1
-        keys, wanted = self.moment * span + self.id, moment * span + ids
-        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        return np.where((keys[at] == wanted) & (ids >= 0), at, -1)
+        wanted = moment * self._span + ids
+        at = np.minimum(np.searchsorted(self._keys, wanted), len(self) - 1)
+        return np.where((self._keys[at] == wanted) & (ids >= 0) & (ids < self._span), at, -1)
+
+    @cached_property
+    def _span(self) -> int:
+        return int(self.id.max()) + 1
+
+    @cached_property
+    def _keys(self) -> IntArray:
+        """(R,) one ascending number for each moment and object."""
+        return self.moment * self._span + self.id
