@@ -83,7 +83,7 @@ def _split(states: StateTable, reading: ScalarReadings) -> dict[int, ScalarReadi
     order = np.argsort(reading.rows)
     rows, value, variance = reading.rows[order], reading.value[order], reading.variance[order]
     moments, starts = np.unique(states.moment[rows], return_index=True)
-    ends = [*starts[1:].tolist(), len(rows)]
+    ends = np.append(starts[1:], len(rows))[: len(starts)].tolist()
     return {
         int(k): ScalarReadings(rows[a:b], value[a:b], variance[a:b])
         for k, a, b in zip(moments, starts.tolist(), ends, strict=True)

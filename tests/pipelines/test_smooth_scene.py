@@ -11,6 +11,7 @@ from data_tools.metrics import match_scene
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.smoothing import SmoothedScene, load_smooth_config, smooth_scene
 from pipelines.tracking import track_scene
+from saga_fg import Boxes, Detections, Frame, Scene
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +56,35 @@ def test_smoothed_positions_and_headings_are_better_than_online_ones(smoothed: S
                 errors.append([float(np.hypot(*(box - truth.boxes.position[i, :2]))) for box in boxes])
     online_rmse, smoothed_rmse = np.sqrt(np.mean(np.square(errors), axis=0))
     assert smoothed_rmse < 0.85 * online_rmse
+
+
+def frame_at(time: float, x: list[float]) -> Frame:
+    """Points without size and heading, seen from nobody knows where."""
+    position = np.column_stack([x, np.zeros(len(x)), np.zeros(len(x))])
+    return Frame(time, "radar", Detections(Boxes.of(["object"] * len(x), position), np.full(len(x), 0.9)))
+
+
+def scene_of(frames: list[Frame], times: list[float]) -> Scene:
+    return Scene("drive", np.array(times), np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), frames)
+
+
+@pytest.mark.parametrize("frames", [[], [frame_at(0.0, []), frame_at(1.0, [])]])
+def test_where_nothing_was_seen_there_are_no_labels(frames: list[Frame]) -> None:
+    smoothed = smooth_scene(scene_of(frames, [0.0, 0.5, 1.0]), load_smooth_config("file"))
+    assert [len(moment) for moment in smoothed.labels] == [0, 0, 0]
+    assert smoothed.counts.boxes == 0
+
+
+def test_size_and_heading_that_nobody_measured_stay_unknown() -> None:
+    times = [0.1 * k for k in range(12)]
+    scene = scene_of([frame_at(time, [0.2 * k]) for k, time in enumerate(times)], times)
+    smoothed = smooth_scene(scene, load_smooth_config("file"))
+    assert [len(moment) for moment in smoothed.labels] == [1] * 12
+    assert all(np.isnan(moment.tracks.boxes.size).all() for moment in smoothed.labels)
+
+
+def test_moments_between_frames_are_filled_and_those_beyond_are_not() -> None:
+    frames = [frame_at(0.1 * k, [0.5 * k]) for k in range(10)]
+    smoothed = smooth_scene(scene_of(frames, [-1.0, 0.25, 0.55, 5.0]), load_smooth_config("file"))
+    assert [len(moment) for moment in smoothed.labels] == [0, 1, 1, 0]
+    assert smoothed.tracks[1].boxes.position[0, 0] == pytest.approx(1.25, abs=0.1)
