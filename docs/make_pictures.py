@@ -8,8 +8,12 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.demo import run_demo
+from pipelines.slam.joint import run_joint
+from pipelines.slam.simulated import street, write_joint
+from saga_fg.ego import JointSettings
 
 HERE = Path(__file__).parent
 
@@ -25,11 +29,14 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the demonstration."""
+    """The pictures of the demonstration, and of a drive down a simulated street."""
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")
         screenshot(result.page, HERE / "report.png", 1300, 920)
+        run = run_joint(simulate_scene(street(), 0), load_config("simulated"), JointSettings(), "lidar", 0)
+        write_joint(Path(folder) / "joint", run)
+        shutil.copy(Path(folder) / "joint" / "above.png", HERE / "joint_above.png")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_fusion import fusion
+from pipelines.cli.bench_joint import joint
 from pipelines.cli.bench_lidar import lidar
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_paper import paper
@@ -34,6 +35,7 @@ bench_app.command()(estimators)
 bench_app.command()(fusion)
 bench_app.command()(service)
 bench_app.command()(metrics)
+bench_app.command()(joint)
 bench_app.command()(lidar)
 bench_app.command()(slam)
 bench_app.command()(smoothing)

@@ -2,6 +2,7 @@
 
 from saga_fg.ego.batch import estimate_jointly
 from saga_fg.ego.estimate import JointEstimate, ObjectStates
+from saga_fg.ego.landmarks import Observations
 from saga_fg.ego.odometry import Odometry, OdometryNoise
 from saga_fg.ego.settings import JointSettings
 
@@ -9,6 +10,7 @@ __all__ = [
     "JointEstimate",
     "JointSettings",
     "ObjectStates",
+    "Observations",
     "Odometry",
     "OdometryNoise",
     "estimate_jointly",

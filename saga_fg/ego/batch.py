@@ -16,6 +16,7 @@ from factors import SolverSettings, solve
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.estimate import JointEstimate, read_estimate
 from saga_fg.ego.graph import Keyed, error_key, linear_graph, nonlinear_factors, object_key, pose_key, start_graph
+from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_part
 from saga_fg.ego.odometry import Odometry
 from saga_fg.ego.record import register
 from saga_fg.ego.settings import JointSettings
@@ -35,22 +36,27 @@ def estimate_jointly(
     new_tracker: Callable[[], Tracker],
     settings: JointSettings | None = None,
     start: FloatArray | None = None,
+    landmarks: Observations | None = None,
 ) -> JointEstimate:
     """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
 
     odometry: between the frames' times; new_tracker: gives a fresh tracker, which registers detections; start: first
-    pose (4, 4), by default the identity. Detections in ego or sensor coordinates, or in those of the world with the
-    pose they were transformed by. Raises `InputError` where frames and odometry do not fit together.
+    pose (4, 4), by default the identity; landmarks: what is observed of them at each of the n moments. Detections are
+    in ego or sensor coordinates, or in those of the world with the pose they were transformed by. Raises `InputError`
+    where frames, odometry and landmarks do not fit together.
     """
     settings = settings or JointSettings()
     check_times(frames, odometry)
+    if landmarks is not None and len(landmarks) != len(frames):
+        raise InputError(f"landmarks: expected what is observed at {len(frames)} moments, got {len(landmarks)}")
     path = odometry.path(start)
     slow = SlowErrors(settings.odometry.scale, settings.odometry.bias)
     estimate = None
     for _ in range(settings.rounds):
         moments = register(frames, path, odometry.a_T_b, new_tracker(), settings.motion_noise)
         standing = standing_probabilities(moments, path, slow, settings)
-        estimate = _solved(list(enumerate(moments)), path, standing, settings)
+        seen = landmark_part(landmarks or [()] * len(frames), path, settings.landmark_reach)
+        estimate = _solved(list(enumerate(moments)), path, standing, seen, settings)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate
@@ -65,14 +71,19 @@ def check_times(frames: Sequence[Frame], odometry: Odometry) -> None:
         )
 
 
-def _solved(record: Keyed, path: FloatArray, standing: Sequence[FloatArray], settings: JointSettings) -> JointEstimate:
+def _solved(
+    record: Keyed, path: FloatArray, standing: Sequence[FloatArray], landmarks: LandmarkPart, settings: JointSettings
+) -> JointEstimate:
     """All objects moving first, which needs no good start; from there with those that stand."""
     graph = start_graph(0, path[0], settings)
     graph.push_back(linear_graph(record))
+    graph.push_back(landmarks.graph)
     solver = SolverSettings(max_iterations=settings.max_iterations, tolerance=_TOLERANCE)
     values = start_values(record, path)
+    values.insert(landmarks.start)
     for standing_or_none in (None, standing):
-        solution = solve(graph, nonlinear_factors(record, settings, standing_or_none), values, solver)
+        factors = [*nonlinear_factors(record, settings, standing_or_none), *landmarks.factors]
+        solution = solve(graph, factors, values, solver)
         values = solution.values
     return read_estimate(record, solution)
 

@@ -8,7 +8,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from factors import Solution
+from factors import Solution, marginal_moments
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.ego.graph import Keyed, error_key, object_key, pose_key
 from saga_fg.ego.record import EgoMoment
@@ -47,7 +47,7 @@ class JointEstimate:
     @cached_property
     def pose_covariances(self) -> FloatArray:
         """(n, 6, 6) of each pose, in its own frame: rotation vector (rad), translation (m)."""
-        return np.stack([self._tree.marginalCovariance(pose_key(k)) for k, _ in self._record])
+        return np.stack([self._covariance(pose_key(k)) for k, _ in self._record])
 
     def object_covariances(self, moment: int) -> FloatArray:
         """(n, 4, 4) of position and velocity of the objects of a moment."""
@@ -55,15 +55,22 @@ class JointEstimate:
         result = np.empty((len(told.objects.id), 4, 4))
         for row, (name, node_type) in enumerate(zip(told.objects.id.tolist(), told.objects.types, strict=True)):
             at = node_type.index(POSITION + VELOCITY)
-            result[row] = self._tree.marginalCovariance(object_key(k, name))[at[:, None], at]
+            result[row] = self._covariance(object_key(k, name))[at[:, None], at]
         return result
 
     @cached_property
     def slow_errors(self) -> SlowErrors:
-        """How well the odometry's slow errors are known, on average over time."""
-        P = np.stack([self._tree.marginalCovariance(error_key(k)) for k, _ in self._record])
+        """How well the odometry's slow errors are known: at the first, the middle and the last moment, on average."""
+        n = len(self._record)
+        P = np.stack([self._covariance(error_key(self._record[row][0])) for row in (0, n // 2, n - 1)])
         scale, bias = np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0))
         return SlowErrors(float(scale), float(bias))
+
+    def _covariance(self, key: int) -> FloatArray:
+        try:
+            return np.asarray(self._tree.marginalCovariance(key))
+        except RuntimeError:  # Cholesky squares the condition number, which objects hardly seen make large
+            return marginal_moments(self._linear, [key], "qr")[1]
 
     @cached_property
     def _tree(self) -> gtsam.GaussianBayesTree:

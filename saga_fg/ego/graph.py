@@ -39,7 +39,7 @@ from saga_fg.estimators.motion import Motion
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import NodeType
 
-_LIKELY = 0.7  # an object that stands with less than this probability is taken to move
+_LIKELY = 0.9  # an object that stands with less than this probability is taken to move
 _SURELY_MOVING = 4.0  # standard deviations from standing at which the loss gives up an object
 _ANY_SPEED = 100.0  # m/s, deviation of a velocity of which nothing is known
 _OBJECTS = 1 << 32  # keys of objects: moment times this, plus the id

@@ -16,25 +16,24 @@ class JointSettings:
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "how good the odometry is")
     start_noise: float = setting(1e-3, "standard deviation of the first pose, m and rad")
-    standing_window: float = setting(4.0, "time over which an object is judged to stand or to move, s")
+    standing_window: float = setting(6.0, "time over which an object is judged to stand or to move, s")
     moving_speed: float = setting(
-        0.3, "deviation of a velocity component of the slowest objects that count as moving, m/s"
+        0.5, "deviation of a velocity component of the slowest objects that count as moving, m/s"
     )
     standing_drift: float = setting(0.05, "how far an object that stands may wander, m after one second")
     standing_speed: float = setting(0.1, "standard deviation of the velocity of an object that stands, m/s")
     motion_noise: float = setting(10.0, "factor on the noise of the objects' motion: many brake at the same time")
     outlier_scale: float = setting(3.0, "detections farther off than this count less (Cauchy), standard deviations")
-    keyframe_period: float = setting(0.0, "frames that follow a keyframe within this time are passed over, s")
-    lag: float = setting(3.0, "window of the online estimator, s")
-    rounds: int = setting(2, "offline, how often objects are associated anew along the estimated path")
-    max_iterations: int = setting(30, "linearisations at most, offline")
-    online_iterations: int = setting(3, "linearisations per keyframe, online")
+    landmark_reach: float = setting(2.5, "a landmark seen farther than this from where it was last is another one, m")
+    keyframe_period: float = setting(0.15, "frames that follow a keyframe within this time are passed over, s")
+    rounds: int = setting(2, "how often objects are associated anew along the path estimated so far")
+    max_iterations: int = setting(30, "linearisations at most, in each round")
 
     def __post_init__(self) -> None:
         require_positive(self, "start_noise", "standing_window", "moving_speed", "standing_drift", "standing_speed")
-        require_positive(self, "motion_noise")
-        require_positive(self, "lag", "outlier_scale", infinite=True)
+        require_positive(self, "motion_noise", "landmark_reach")
+        require_positive(self, "outlier_scale", infinite=True)
         require_between(self, 0, math.inf, "keyframe_period")
-        for name in ("rounds", "max_iterations", "online_iterations"):
+        for name in ("rounds", "max_iterations"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected a whole number of at least 1, got {getattr(self, name)!r}")

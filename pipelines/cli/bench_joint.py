@@ -1,0 +1,93 @@
+"""`saga-fg bench joint`: the vehicle and the objects around it together, against one after the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
+
+if TYPE_CHECKING:
+    from data_tools.metrics import Interval
+
+
+def joint(
+    dataroot: Annotated[
+        Path | None, typer.Option("--dataroot", help="KITTI tracking; without it, simulated streets.")
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
+    ] = None,
+    sequences: Annotated[str | None, typer.Option("--sequences", help="KITTI sequences, by commas; all.")] = None,
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
+    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Draws of the odometry's errors per recording.")] = 1,
+    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
+    json_file: JsonFile = None,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """Joint against decoupled estimation with degraded odometry: the error of the path.
+
+    The odometry has noise, a scale error and a bias of the yaw rate, all wandering, drawn anew for every seed.
+
+    \b
+    Examples:
+      saga-fg bench joint --scenes 10 --poles
+      saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
+    """
+    from data_tools.atomic_files import check_writable
+    from data_tools.kitti import KittiTracking
+    from data_tools.simulator import simulate_scene
+    from pipelines.bench.joint import bench_joint
+    from pipelines.config import load_config
+    from pipelines.figures import write_figures
+    from pipelines.slam.simulated import street
+    from saga_fg.errors import InputError
+
+    if (dataroot is None) != (detections is None):
+        raise InputError("expected both --dataroot and --detections, or neither")
+    if poles and dataroot is not None:
+        raise InputError("--poles: expected with simulated streets only, recordings have no made-up poles")
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        if dataroot is None:
+            many = (simulate_scene(street(), seed) for seed in range(first, first + scenes))
+            settings = load_config("simulated", config)
+            result = bench_joint(many, scenes, settings, range(seeds), poles=poles, progress=progress)
+        else:
+            kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","))
+            recorded = map(kitti.scene, kitti.scenes)
+            settings = load_config("kitti", config)
+            result = bench_joint(recorded, len(kitti.scenes), settings, range(seeds), progress=progress)
+    columns = ("recording", "draws", "path, m", "ATE, m: decoupled", "joint", "m per 10 m: decoupled", "joint")
+    table = Table(*columns, title="error of the vehicle's path, medians over draws", title_justify="left")
+    for name in dict.fromkeys(row.scene for row in result.rows):
+        mine = [row for row in result.rows if row.scene == name]
+        figures = [
+            sorted(values)[len(mine) // 2]
+            for values in zip(
+                *((r.decoupled_ate, r.joint_ate, r.decoupled_relative, r.joint_relative) for r in mine), strict=True
+            )
+        ]
+        table.add_row(name, str(len(mine)), f"{mine[0].path_length:.0f}", *(f"{x:.3f}" for x in figures))
+    Console(width=max(Console().width, 100)).print(table)
+    better = sum(row.joint_ate < row.decoupled_ate for row in result.rows)
+    typer.echo(f"{_percent('joint against decoupled', result.change)}, lower in {better} of {len(result.rows)} runs")
+    if result.landmarks is not None:
+        better = sum(row.landmarks_ate < row.joint_ate for row in result.rows)
+        typer.echo(f"{_percent('with poles against without', result.landmarks)}, lower in {better} runs")
+    if json_file is not None:
+        write_figures(json_file, result)
+
+
+def _percent(what: str, change: Interval) -> str:
+    figures = f"{100 * change.estimate:+.1f} % ({100 * change.confidence:.0f} % interval"
+    return f"ATE, {what}: {figures} {100 * change.low:+.1f} to {100 * change.high:+.1f} %)"

@@ -1,0 +1,44 @@
+"""`saga-fg slam simulated`: a simulated street, where the truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import working
+
+
+def simulated(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the scene and of the odometry's errors.")] = 0,
+    duration: Annotated[float, typer.Option("--duration", min=2.0, help="Length of the drive, s.")] = 20.0,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """Drive down a simulated street with poor odometry; the path and all objects are estimated in one graph.
+
+    Writes the paths (TUM, KITTI), the covariances of the poses, the tracks of the objects (tracks.csv), errors.json and
+    a picture from above (above.png).
+
+    \b
+    Example:
+      saga-fg slam simulated --seed 3 --output street
+    """
+    from dataclasses import replace
+
+    from data_tools.simulator import simulate_scene
+    from pipelines.config import load_config
+    from pipelines.slam.joint import run_joint
+    from pipelines.slam.simulated import street, write_joint
+    from saga_fg.ego import JointSettings
+
+    scene = simulate_scene(replace(street(), duration=duration), seed)
+    with working("estimating"):
+        run = run_joint(scene, load_config("simulated", config), JointSettings(), "lidar", seed)
+        write_joint(output, run)
+    odometry, joint = run.errors()
+    typer.echo(f"{output}: {joint.poses} poses over {joint.path_length:.0f} m")
+    typer.echo(f"ATE: odometry {odometry.ate:.3f} m, joint {joint.ate:.3f} m")

@@ -1,0 +1,80 @@
+"""The vehicle's path and the objects around it from one scene: its frames, and odometry between them.
+
+Ego odometry comes from the scene's own poses, made worse by a stated amount where a poor device shall be studied. What
+is estimated jointly is compared with the decoupled pipeline: the odometry's path, and objects tracked along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odometry, trajectory_errors
+from pipelines.config import TrackConfig
+from saga_fg.arrays import FloatArray
+from saga_fg.dataset import Scene
+from saga_fg.ego import JointEstimate, JointSettings, Observations, Odometry, estimate_jointly
+from saga_fg.errors import InputError
+from saga_fg.frame import Frame
+from saga_fg.tracking import Tracker
+
+
+@dataclass(frozen=True, eq=False)
+class JointRun:
+    """One scene: the true path, the odometry's, and the estimate."""
+
+    truth: Trajectory
+    odometry: Trajectory
+    estimate: JointEstimate
+
+    @property
+    def joint(self) -> Trajectory:
+        """The estimated path."""
+        return Trajectory(self.estimate.timestamps, self.estimate.world_T_ego)
+
+    def errors(self) -> tuple[TrajectoryErrors, TrajectoryErrors]:
+        """Of the odometry's path and of the estimated one, each moved to lie nearest to the truth."""
+        return trajectory_errors(self.odometry, self.truth), trajectory_errors(self.joint, self.truth)
+
+
+def run_joint(
+    scene: Scene,
+    config: TrackConfig,
+    settings: JointSettings,
+    sensor: str,
+    seed: int,
+    landmarks: Callable[[FloatArray], Observations] | None = None,
+) -> JointRun:
+    """Estimate jointly from the frames of one sensor and odometry degraded as `settings.odometry` says.
+
+    landmarks: what is observed of them from true poses (n, 4, 4).
+    Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
+    """
+    frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], settings.keyframe_period)
+    if not frames:
+        raise InputError(f"scene {scene.name}: expected frames of {sensor}, there are those of {scene.sensors}")
+    poses = [frame.world_T_ego for frame in frames if frame.world_T_ego is not None]
+    if len(poses) < len(frames):
+        raise InputError(f"scene {scene.name}: expected a pose with every frame of {sensor}")
+    truth = Trajectory(np.array([frame.timestamp for frame in frames]), np.stack(poses))
+    exact = Odometry.of(truth.timestamps, truth.world_T_ego)
+    odometry = degraded_odometry(exact, settings.odometry, np.random.default_rng(seed))
+    start = truth.world_T_ego[0]
+
+    def new_tracker() -> Tracker:
+        return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
+
+    observed = None if landmarks is None else landmarks(truth.world_T_ego)
+    estimate = estimate_jointly(frames, odometry, new_tracker, settings, start, observed)
+    return JointRun(truth, Trajectory(truth.timestamps, odometry.path(start)), estimate)
+
+
+def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:
+    """The first frame, and each that comes more than `period` s after the last one chosen."""
+    chosen: list[Frame] = []
+    for frame in frames:
+        if not chosen or frame.timestamp > chosen[-1].timestamp + period:
+            chosen.append(frame)
+    return chosen

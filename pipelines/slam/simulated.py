@@ -1,0 +1,75 @@
+"""SLAM on a simulated street, where the truth is known: results as files.
+
+odometry.tum, joint.tum, truth.tum   the paths (TUM); joint.txt the estimated one in KITTI's format
+covariances.csv                      of each estimated pose in its own frame: rotation vector (rad), translation (m)
+tracks.csv                           objects in the world at every moment: place, velocity and their deviations
+errors.json                          ATE and relative error of the odometry's path and of the estimated one
+above.png                            the paths and the objects from above
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.plots import paths_from_above, png
+from data_tools.simulator import SimulatorSettings
+from data_tools.simulator.settings import SurroundingSettings
+from data_tools.trajectories import write_kitti_poses, write_tum_poses
+from pipelines.slam.joint import JointRun
+
+
+def street() -> SimulatorSettings:
+    """Simulated scenes with cars parked on both sides of the road."""
+    return SimulatorSettings(surroundings=SurroundingSettings(parking_probability=1.0))
+
+
+def write_joint(output: Path, run: JointRun) -> None:
+    """Write the results of one scene to a folder, all or none of them."""
+    odometry, joint = run.errors()
+    with atomic_directory(output) as folder:
+        write_tum_poses(folder / "truth.tum", run.truth)
+        write_tum_poses(folder / "odometry.tum", run.odometry)
+        write_tum_poses(folder / "joint.tum", run.joint)
+        write_kitti_poses(folder / "joint.txt", run.joint, folder / "times.txt")
+        write_text(folder / "covariances.csv", _covariances(run))
+        write_text(folder / "tracks.csv", _tracks(run))
+        errors = {"odometry": asdict(odometry), "joint": asdict(joint)}
+        write_text(folder / "errors.json", json.dumps(errors, indent=1) + "\n")
+        write_bytes(folder / "above.png", png(picture(run)))
+
+
+def picture(run: JointRun) -> Any:
+    """The paths from above, and where objects were last seen."""
+    paths = {"truth": run.truth.positions, "odometry": run.odometry.positions, "joint": run.joint.positions}
+    last = {
+        name: place
+        for objects in run.estimate.objects
+        for name, place in zip(objects.id.tolist(), objects.position, strict=True)
+    }
+    return paths_from_above(paths, {"objects": np.array(list(last.values())).reshape(-1, 2)})
+
+
+def _covariances(run: JointRun) -> str:
+    upper = np.triu_indices(6)
+    rows = [",".join(["timestamp", *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))])]
+    for time, P in zip(run.estimate.timestamps.tolist(), run.estimate.pose_covariances, strict=True):
+        rows.append(",".join([f"{time:.6f}", *(f"{x:.6g}" for x in P[upper])]))
+    return "\n".join(rows) + "\n"
+
+
+def _tracks(run: JointRun) -> str:
+    rows = ["timestamp,id,x,y,vx,vy,sigma_x,sigma_y,sigma_vx,sigma_vy"]
+    for moment, (time, objects) in enumerate(zip(run.estimate.timestamps, run.estimate.objects, strict=True)):
+        sigma = np.sqrt(np.diagonal(run.estimate.object_covariances(moment), axis1=1, axis2=2))
+        table = np.concatenate([objects.position, objects.velocity, sigma], axis=1)
+        rows += [
+            f"{time:.6f},{name}," + ",".join(f"{x:.4f}" for x in row)
+            for name, row in zip(objects.id.tolist(), table, strict=True)
+        ]
+    return "\n".join(rows) + "\n"

@@ -1,0 +1,91 @@
+"""`saga-fg slam simulated` and `saga-fg bench joint`: the vehicle and the objects around it together."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.simulator import simulate_scene
+from data_tools.trajectories import read_kitti_poses, read_tum_poses
+from pipelines.bench.joint import bench_joint
+from pipelines.cli.main import app
+from pipelines.config import load_config
+from pipelines.slam.joint import keyframes, run_joint
+from pipelines.slam.roadside import RoadsideSettings, observe_poles
+from pipelines.slam.simulated import street
+from saga_fg import InputError
+from saga_fg.ego import JointSettings
+from saga_fg.geometry import yaw_transform
+
+SHORT = replace(street(), duration=2.0)
+
+
+def test_a_simulated_street(tmp_path: Path) -> None:
+    output = tmp_path / "street"
+    done = CliRunner().invoke(app, ["slam", "simulated", "--seed", "2", "--duration", "2", "--output", str(output)])
+    assert done.exit_code == 0, done.output
+    assert "ATE: odometry" in done.output
+    errors = json.loads((output / "errors.json").read_text())
+    assert errors["joint"]["poses"] == errors["odometry"]["poses"]
+    joint = read_tum_poses(output / "joint.tum")
+    kitti = read_kitti_poses(output / "joint.txt", output / "times.txt")
+    np.testing.assert_allclose(kitti.world_T_ego, joint.world_T_ego, atol=1e-6)
+    tracks = np.loadtxt(output / "tracks.csv", delimiter=",", skiprows=1)
+    assert tracks.shape[1] == 10
+    assert (tracks[:, 6:] > 0).all()
+    covariances = np.loadtxt(output / "covariances.csv", delimiter=",", skiprows=1)
+    assert covariances.shape == (len(joint), 22)
+    assert (output / "above.png").stat().st_size > 1000
+
+
+def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None:
+    scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
+    settings = JointSettings(rounds=1, keyframe_period=0.15)
+    config = load_config("simulated")
+    result = bench_joint(scenes, 2, config, [0], settings, poles=True)
+    assert [row.scene for row in result.rows] == ["street 1", "street 2"]
+    for scene, row in zip(scenes, result.rows, strict=True):
+        odometry, joint = run_joint(scene, config, settings, "lidar", 0).errors()
+        assert (row.decoupled_ate, row.joint_ate) == (odometry.ate, joint.ate)
+    square = [(row.joint_ate**2, row.decoupled_ate**2) for row in result.rows]
+    joint_square, decoupled_square = np.sum(square, axis=0)
+    assert result.landmarks is not None
+    assert all(np.isfinite(row.landmarks_ate) for row in result.rows)
+    assert result.change.estimate == pytest.approx(np.sqrt(joint_square / decoupled_square) - 1)
+
+
+def test_keyframes_lie_apart_in_time() -> None:
+    frames = [frame for frame in simulate_scene(SHORT, 1).frames if frame.sensor == "lidar"]
+    chosen = keyframes(frames, 0.25)
+    assert len(chosen) < len(frames) / 2
+    assert min(b.timestamp - a.timestamp for a, b in pairwise(chosen)) > 0.25
+
+
+def test_a_sensor_without_frames_is_named() -> None:
+    with pytest.raises(InputError, match="expected frames of radar, there are those of"):
+        run_joint(simulate_scene(SHORT, 1, "s"), load_config("simulated"), JointSettings(), "radar", 0)
+
+
+def test_options_of_the_benchmark_go_together() -> None:
+    done = CliRunner().invoke(app, ["bench", "joint", "--dataroot", "somewhere"])
+    assert done.exit_code != 0
+    assert "expected both --dataroot and --detections" in done.output
+
+
+def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
+    poses = np.stack([yaw_transform(0.5 * k) for k in range(60)])
+    settings = RoadsideSettings(reach=20.0, noise=0.1)
+    seen = observe_poles(poses, 1, settings)
+    assert len(seen) == len(poses)
+    places = np.array([pose[:2, 3] + o.value[:2] for pose, now in zip(poses, seen, strict=True) for o in now])
+    assert max(np.hypot(*o.value[:2]) for now in seen for o in now) < 21
+    first = places[np.linalg.norm(places - places[0], axis=1) < 2]
+    assert 0.05 < first.std(axis=0).mean() < 0.2
+    again = observe_poles(poses, 1, settings)
+    assert [len(now) for now in seen] == [len(now) for now in again]
