@@ -36,5 +36,6 @@ def central_differences(
     t, p = time[order], position[order]
     elapsed = t[after] - t[before]
     known = (elapsed > 0) & (elapsed <= longest_gap * (after - before))
-    velocity[order[known]] = (p[after] - p[before])[known] / elapsed[known, None]
+    with np.errstate(over="ignore"):  # positions beyond all numbers are for others to refuse
+        velocity[order[known]] = (p[after] - p[before])[known] / elapsed[known, None]
     return velocity

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, checked
+from saga_fg.arrays import BoolArray, FloatArray, checked
 from saga_fg.errors import InputError
 
 
@@ -23,14 +23,16 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
 def checked_transform(name: str, value: ArrayLike) -> FloatArray:
     """`value` as a read-only 4 x 4 rigid transform; raises `InputError` unless its rotation is orthonormal (1e-4)."""
     matrix = checked(name, value, (4, 4))
-    R = matrix[:3, :3]
-    if (
-        not np.allclose(R @ R.T, np.eye(3), atol=1e-4)
-        or np.linalg.det(R) < 0
-        or not np.allclose(matrix[3], [0, 0, 0, 1])
-    ):
+    if not is_rotation(matrix[:3, :3], 1e-4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise InputError(f"{name}: expected a rigid 4 x 4 transform (orthonormal rotation, last row 0 0 0 1)")
     return matrix
+
+
+def is_rotation(R: FloatArray, tolerance: float) -> BoolArray:
+    """Which of the matrices (..., 3, 3) are orthonormal to within `tolerance` and no reflections; of any magnitude."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        orthonormal = (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) <= tolerance).all(axis=(-2, -1))
+        return np.asarray(orthonormal & (np.linalg.det(R) > 0))
 
 
 def inverse_transform(target_T_source: FloatArray) -> FloatArray:
@@ -90,10 +92,16 @@ def rotation_quaternion(rotation: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True))
 
 
+def quaternion_norms(quaternions: FloatArray) -> FloatArray:
+    """Norms (N,) of quaternions (N, 4); infinite where they are beyond all numbers."""
+    with np.errstate(over="ignore"):
+        return np.asarray(np.linalg.norm(quaternions, axis=1))
+
+
 def checked_quaternions(name: str, value: ArrayLike) -> FloatArray:
     """`value` as unit quaternions (N, 4), (w, x, y, z); raises `InputError` where the norm is off 1 by over 1e-3."""
     quaternions = checked(name, value, (None, 4))
-    norm = np.linalg.norm(quaternions, axis=1)
+    norm = quaternion_norms(quaternions)
     bad = np.abs(norm - 1) > 1e-3
     if bad.any():
         row = int(np.argmax(bad))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -16,6 +14,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from data_tools.detection_files.columns import COLUMNS, REQUIRED, RawTable, Values
+from data_tools.located import located
+from data_tools.numpy_files import load_archive
 from saga_fg.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -107,17 +107,9 @@ def _read_ndjson(path: Path, layout: Layout) -> RawTable:
 
 
 def _read_npz(path: Path, layout: Layout) -> RawTable:
-    columns: dict[str, Values] = {}
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            names = set(archive.files)
-            for name in layout.columns:
-                if name in names:
-                    columns[name] = archive[name]
-    except (ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: expected a NumPy archive of plain arrays: {error}") from error
-    except TypeError as error:  # a single array, without a name
-        raise InputError(f"{path}: expected a NumPy archive of plain arrays, got a single array") from error
+    with located(str(path)):
+        names, arrays = load_archive(path, layout.columns)
+    columns: dict[str, Values] = dict(arrays)
     _check_names(path, names, layout)
     length = len(columns["timestamp"]) if np.ndim(columns.get("timestamp", 0.0)) == 1 else 0
     for name, column in columns.items():

@@ -15,6 +15,7 @@ from saga_fg.arrays import FloatArray, StrArray, from_upper_triangle
 from saga_fg.boxes import Boxes
 
 REQUIRED = ("timestamp", "id", "x", "y")
+LARGEST_ID = 2**53  # beyond, doubles leave integers out
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,10 @@ def track_rows_of(raw: RawTable) -> TrackRows:
     for name, column in (("timestamp", timestamp), ("id", id_ := raw.numbers("id"))):
         if np.isnan(column).any():
             raise raw.fault(int(np.argmax(np.isnan(column))), f"{name}: expected a number, got none")
+    strange = (np.abs(id_) > LARGEST_ID) | (id_ != np.floor(id_))
+    if strange.any():
+        row = int(np.argmax(strange))
+        raise raw.fault(row, f"id: expected an integer of at most {LARGEST_ID}, got {id_[row]:g}")
     return TrackRows(
         raw.texts("scene", raw.path.stem),
         timestamp,

@@ -18,6 +18,7 @@ import numpy as np
 from data_tools.text_tables import read_lines
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+from saga_fg.geometry import is_rotation
 
 _KEYS: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
     "P2": ((3, 4), ("P2",)),
@@ -68,7 +69,7 @@ def _matrix(path: Path, found: dict[str, tuple[int, list[str]]], name: str) -> F
         raise InputError(f"{path}: line {line}: {key}: expected {count} finite numbers, got {len(numbers)} values")
     matrix = numbers.reshape(shape)
     R = matrix[:, :3]
-    if name != "P2" and (not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0):
+    if name != "P2" and not is_rotation(R, 1e-4):
         raise InputError(f"{path}: line {line}: {key}: expected a rotation in the first three columns")
     return matrix
 

@@ -14,14 +14,15 @@ elsewhere they are errors. Sources: development kits of KITTI (https://www.cvlib
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from data_tools.lidar.cloud_headers import check_pcd, check_ply
 from data_tools.lidar.scan import Scan
 from data_tools.located import located
+from data_tools.numpy_files import load_archive, load_array
 from data_tools.open3d_loader import load_open3d
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
@@ -64,21 +65,14 @@ def _bytes(path: Path) -> bytes:
 
 
 def _array(path: Path) -> Scan:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"expected an array of numbers: {error}") from error
+    array = load_array(path)
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
         raise InputError(f"expected numbers (N, 3) or wider, got {array.dtype} {array.shape}")
     return _of_columns(np.asarray(array, dtype=np.float64))
 
 
 def _arrays(path: Path) -> Scan:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            columns = {name: file[name] for name in ("points", "intensity", "time") if name in file}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"expected an archive of arrays: {error}") from error
+    _, columns = load_archive(path, ("points", "intensity", "time"))
     if "points" not in columns:
         raise InputError("expected the array points (N, 3)")
     scan = Scan.of(columns["points"])
@@ -87,8 +81,8 @@ def _arrays(path: Path) -> Scan:
 
 def _cloud(path: Path) -> Scan:
     open3d = load_open3d()
-    if not _bytes(path).strip():
-        raise InputError("expected a point cloud, the file is empty")
+    check = check_pcd if path.suffix.lower() == ".pcd" else check_ply
+    check(_bytes(path))
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         try:
             cloud = open3d.t.io.read_point_cloud(str(path))

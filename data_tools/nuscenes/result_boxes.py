@@ -25,7 +25,7 @@ from data_tools.nuscenes.classes import DETECTION_CLASSES, TRACKING_CLASSES
 from saga_fg.arrays import BoolArray, FloatArray, StrArray, from_upper_triangle
 from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
-from saga_fg.geometry import quaternion_yaw
+from saga_fg.geometry import quaternion_norms, quaternion_yaw
 
 Task = Literal["detection", "tracking"]
 _UNKNOWN = (np.nan, np.nan)
@@ -90,7 +90,7 @@ class ResultColumns:
     def finish(self) -> ResultBoxes:
         """Check the values and convert. Raises `InputError` naming sample, box and field."""
         columns = {name: np.concatenate([np.empty((0, n)), *self._numbers[name]]) for name, n in _NUMBERS.items()}
-        norm = np.linalg.norm(columns["rotation"], axis=1)
+        norm = quaternion_norms(columns["rotation"])
         for name, good, expected in (
             ("translation", np.isfinite(columns["translation"]).all(axis=1), "three finite numbers in m"),
             (

@@ -23,7 +23,7 @@ from data_tools.atomic_files import write_text
 from data_tools.text_tables import TextTable, read_lines
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
-from saga_fg.geometry import quaternion_rotation, rotation_quaternion
+from saga_fg.geometry import quaternion_norms, quaternion_rotation, rotation_quaternion
 from saga_fg.pose_graph import PoseGraph
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
@@ -147,7 +147,7 @@ def _transforms(table: TextTable, column: int, layout: _Layout) -> FloatArray:
         T[:, :2, 2] = values[:, :2]
         return T
     quaternion = values[:, [6, 3, 4, 5]]
-    norm = np.linalg.norm(quaternion, axis=1)
+    norm = quaternion_norms(quaternion)
     bad = np.abs(norm - 1) > _UNIT
     if bad.any():
         row = int(np.argmax(bad))

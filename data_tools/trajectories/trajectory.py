@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.errors import InputError
+from saga_fg.geometry import is_rotation
 
 _ORTHONORMAL = 1e-4  # the largest entry of R R^T - 1 that is let pass, as in `saga_fg.geometry.checked_transform`
 
@@ -38,9 +39,8 @@ class Trajectory:
             raise InputError(
                 f"timestamps[{k}]: expected increasing times, got {timestamps[k]:.6f} s after {timestamps[k - 1]:.6f} s"
             )
-        R = poses[:, :3, :3]
-        askew = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > _ORTHONORMAL
-        askew |= (np.linalg.det(R) < 0) | (np.abs(poses[:, 3] - [0, 0, 0, 1]) > 1e-9).any(axis=1)
+        askew = ~is_rotation(poses[:, :3, :3], _ORTHONORMAL)
+        askew |= (np.abs(poses[:, 3] - [0, 0, 0, 1]) > 1e-9).any(axis=1)
         if askew.any():
             k = int(np.argmax(askew))
             raise InputError(f"world_T_ego[{k}]: expected a rigid transform (orthonormal rotation, last row 0 0 0 1)")

@@ -18,7 +18,7 @@ from data_tools.located import located
 from data_tools.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
 from saga_fg.errors import InputError
-from saga_fg.geometry import quaternion_rotation
+from saga_fg.geometry import quaternion_norms, quaternion_rotation
 
 _COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # how far a quaternion's norm may be off 1, for files of few digits
@@ -30,7 +30,7 @@ def read_tum_poses(path: str | Path) -> Trajectory:
     if not len(table):
         raise InputError(f"{path}: expected a pose per line, there is none")
     numbers = table.numbers(slice(0, 8), _COLUMNS)
-    norm = np.linalg.norm(numbers[:, 4:], axis=1)
+    norm = quaternion_norms(numbers[:, 4:])
     if (np.abs(norm - 1) > _UNIT).any():
         row = int(np.argmax(np.abs(norm - 1) > _UNIT))
         raise table.fault(row, f"qx qy qz qw: expected a unit quaternion, got norm {norm[row]:.6g}")

@@ -14,6 +14,7 @@ out  tracks     the answer to a frame
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -155,9 +156,12 @@ def _number(where: str, values: Mapping[str, Any], name: str, default: float | N
         got = "it is left out" if value is None else f"got {_short(value)}"
         raise InputError(f"{where}{name}: expected a number, {got}")
     try:
-        return float(cast(float, value))
+        number = float(cast(float, value))
     except OverflowError:
-        raise InputError(f"{where}{name}: expected a finite number, got {_short(value)}") from None
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{where}{name}: expected a finite number, got {_short(value)}")
+    return number
 
 
 def _name(where: str, values: Mapping[str, Any], name: str, default: str) -> str:

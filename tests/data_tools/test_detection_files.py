@@ -233,7 +233,10 @@ BROKEN_NPZ: list[tuple[dict[str, Any], str]] = [
     ({"label": [1] * 4}, "label: expected an array of strings, got int64"),
     ({"empty": [1, 0, 0, 0]}, "empty: expected an array of booleans"),
     ({"empty": [False] * 4}, "row 2: x: expected a finite number of metres, got nan"),
-    ({"label": np.array(["a", 1, None, "b"], dtype=object)}, "expected a NumPy archive of plain arrays: Object arrays"),
+    (
+        {"label": np.array(["a", 1, None, "b"], dtype=object)},
+        "expected NumPy's format, with plain arrays: Object arrays",
+    ),
 ]
 
 
@@ -248,7 +251,7 @@ def test_npz_that_is_none(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for content in (b"", b"text", whole[:200], whole[:-30]):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=r"drive\.npz: expected a NumPy archive of plain arrays"):
+        with pytest.raises(InputError, match=r"drive\.npz: expected NumPy's format, with plain arrays"):
             read_detections(path)
     with path.open("wb") as file:
         np.save(file, np.zeros(3))

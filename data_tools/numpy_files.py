@@ -1,0 +1,47 @@
+"""NumPy's files from outside: plain arrays only, never pickled objects."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saga_fg.errors import InputError
+
+
+def load_array(path: Path) -> NDArray[Any]:
+    """The array of a .npy file. Raises `InputError` for anything else."""
+    loaded = _loaded(path, None)
+    if not isinstance(loaded, np.ndarray):
+        raise InputError("expected a single array, got an archive")
+    return loaded
+
+
+def load_archive(path: Path, wanted: Collection[str] | None = None) -> tuple[set[str], dict[str, NDArray[Any]]]:
+    """Names of all arrays of a .npz file, and those `wanted` (None: all). Raises `InputError` for anything else."""
+    loaded = _loaded(path, wanted)
+    if isinstance(loaded, np.ndarray):
+        raise InputError("expected a NumPy archive of plain arrays, got a single array")
+    return loaded
+
+
+def _first_line(error: Exception) -> str:
+    """What an exception says, without the rest of a long message."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _loaded(path: Path, wanted: Collection[str] | None) -> NDArray[Any] | tuple[set[str], dict[str, NDArray[Any]]]:
+    try:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return loaded
+            names = set(loaded.files)
+            return names, {name: loaded[name] for name in (names if wanted is None else names & set(wanted))}
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # a broken file ends in whatever the parts of NumPy's reader happen to raise
+        raise InputError(f"expected NumPy's format, with plain arrays: {_first_line(error)}") from error

@@ -1,0 +1,206 @@
+"""Damage done to valid files, and the readers that must either read what is left or say in one error what is wrong.
+
+`targets(folder)` makes a small valid input for every reader; `damaged` does to the bytes of a file what disks,
+programs and people do to them.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from kitti_example import write_sequence
+from nuscenes_example import box, results, write_results, write_tables
+
+from data_tools import KittiTracking, NuScenes, read_detections, split_scenes
+from data_tools.detection_files import read_tracks
+from data_tools.kitti.scored_sequences import read_scored_sequences
+from data_tools.label_files import read_label_table
+from data_tools.lidar import read_scan
+from data_tools.nuscenes import read_scored_scenes
+from data_tools.pose_graphs import read_g2o
+from data_tools.trajectories import read_kitti_poses, read_tum_poses
+from pipelines.config import load_config
+from pipelines.report.run_record import read_run_record
+from pipelines.serving import StreamTracker
+
+PIECES = [
+    *(b"", b"NaN", b"nan", b"-1", b"0", b"1e999", b"-1e308", b"1e-320", b"99999999999999999999", b"0x10", b"1_0"),
+    *(b"null", b"true", b"[]", b"{}", b'""', b'"x"', b"[[[[", b"\n", b"\r\n", b"\t", b",", b" ", b";", b'"'),
+    *(b"\xff", b"\x00", b"\xef\xbb\xbf", "²".encode(), "car²".encode(), b"../../x", b"!!python/object:os.system"),
+]
+NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+
+CSV = "timestamp,sensor,label,x,y,length,ego_x,ego_y,ego_yaw\n0,a,car,1,2,3,0,0,0\n1,a,,,,,1,1,1\n"
+NDJSON = '{"timestamp": 0, "x": 1, "y": 2, "label": "car", "yaw": 0.5}\n{"timestamp": 1, "sensor": "b"}\n'
+TRACKS = (
+    "scene,timestamp,id,label,x,y,vx,cov_xx,cov_xy,cov_yy\na,0,1,car,1,2,3,0.5,0.1,0.5\na,1,1,car,2,2,3,0.5,0,0.5\n"
+)
+LABELS = TRACKS.replace("cov_yy\n", "cov_yy,yaw_variance,source,quality\n").replace("0.5\n", "0.5,0.1,observed,high\n")
+G2O_2D = (
+    "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.1\nEDGE_SE2 0 1 1 0 0.1 100 0 0 100 0 400\n"
+    "EDGE_SE2 1 0 -1 0 -0.1 100 0 0 100 0 400\n"
+)
+UNIT = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+G2O_3D = f"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {UNIT}\n"
+POSES = "1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 2 0 0 1 3\n"
+TUM = "# timestamp tx ty tz qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"
+CONFIG = "tracker:\n  max_delay: 0.5\n  classes:\n    car: {birth_speed: 3.0}\nsensors:\n  default: {score: logit}\n"
+RECORD = json.dumps({"method": "kf", "version": "1", "configuration": "a", "milliseconds": {"s": [1.0, 2.0]}})
+MESSAGES = (
+    '{"seq": 1, "timestamp": 0.5, "sensor": "a", "coordinates": "ego", "ego": {"x": 1, "y": 2, "yaw": 0.1}, '
+    '"detections": [{"x": 1, "y": 2, "label": "car", "length": 4, "width": 2, "height": 1, "score": 0.5}]}\n'
+    '{"type": "status"}\n{"timestamp": 0.6, "detections": []}\n{"type": "reset"}\n'
+)
+PCD = (
+    "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\n"
+    "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n"
+)
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    "1 2 3\n4 5 6\n"
+)
+
+
+@dataclass(frozen=True)
+class Target:
+    """The valid files of an input, and how to read it."""
+
+    files: tuple[Path, ...]
+    read: Callable[[], object]
+
+
+def targets(folder: Path) -> dict[str, Target]:
+    """An input for every reader, below an empty folder."""
+    nuscenes = folder / "nuscenes"
+    write_tables(nuscenes)
+    found, tracked = write_results(nuscenes / "found.json"), nuscenes / "tracked.json"
+    write_results(tracked, {token: [_tracked(token)] * (token == "a0") for token in (*results(), "b1")})
+    kitti = write_sequence(folder / "kitti")
+    made = kitti / "results"
+    made.mkdir()
+    (made / "0007.txt").write_text("0 1 Car 0 0 -1.5 500 150 600 250 1.5 1.6 4 2 1.75 10 -1.57 0.9\n")
+
+    def table(name: str, content: str | bytes) -> Path:
+        path = folder / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    def one(name: str, content: str | bytes, read: Callable[[Path], object]) -> Target:
+        path = table(name, content)
+        return Target((path,), lambda: read(path))
+
+    npz = folder / "table.npz"
+    np.savez(npz, timestamp=[0.0, 1.0], x=[1.0, 2.0], y=[3.0, 4.0], label=["car", "bus"])
+    npy = folder / "scan.npy"
+    np.save(npy, np.ones((3, 4), dtype=np.float32))
+    config = load_config("file")
+    return {
+        "nuScenes": Target(tuple(sorted((nuscenes / "v1.0-mini").glob("*.json"))), lambda: _read_nuscenes(nuscenes)),
+        "nuScenes detections": Target((found,), lambda: _read_nuscenes(nuscenes)),
+        "nuScenes results": Target((tracked,), lambda: read_scored_scenes(tracked, nuscenes, "v1.0-mini")),
+        "KITTI": Target(tuple(p for p in sorted(kitti.rglob("*.txt")) if p.stat().st_size), lambda: _read_kitti(kitti)),
+        "KITTI results": Target((made / "0007.txt",), lambda: read_scored_sequences(made, kitti)),
+        "detections, CSV": one("table.csv", CSV, _read_table),
+        "detections, NDJSON": one("table.ndjson", NDJSON, _read_table),
+        "detections, NumPy": Target((npz,), lambda: _read_table(npz)),
+        "tracks": one("tracks.csv", TRACKS, read_tracks),
+        "labels": one("labels.csv", LABELS, read_label_table),
+        "pose graph, plane": one("plane.g2o", G2O_2D, read_g2o),
+        "pose graph, space": one("space.g2o", G2O_3D, read_g2o),
+        "poses, KITTI": one("poses.txt", POSES, read_kitti_poses),
+        "poses, TUM": one("poses.tum", TUM, read_tum_poses),
+        "scan, KITTI": one("scan.bin", np.ones(12, dtype="<f4").tobytes(), read_scan),
+        "scan, nuScenes": one("scan.pcd.bin", np.ones(15, dtype="<f4").tobytes(), read_scan),
+        "scan, PCD": one("scan.pcd", PCD, read_scan),
+        "scan, PLY": one("scan.ply", PLY, read_scan),
+        "scan, NumPy": Target((npy,), lambda: read_scan(npy)),
+        "configuration": one("config.yaml", CONFIG, lambda path: load_config("file", path)),
+        "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
+        "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
+    }
+
+
+def damaged(content: bytes, rng: random.Random) -> bytes:
+    """The content with one to three things done to it."""
+    for _ in range(rng.randint(1, 3)):
+        content = rng.choice((_put, _put, _number, _number, _twice, _flip, _cut, _swap))(content, rng)
+    return content
+
+
+def _put(content: bytes, rng: random.Random) -> bytes:
+    start, end = _slice(content, rng)
+    return content[:start] + rng.choice(PIECES) + content[end:]
+
+
+def _number(content: bytes, rng: random.Random) -> bytes:
+    found = list(NUMBER.finditer(content))
+    if not found:
+        return content
+    chosen = rng.choice(found)
+    return content[: chosen.start()] + rng.choice(PIECES) + content[chosen.end() :]
+
+
+def _twice(content: bytes, rng: random.Random) -> bytes:
+    lines = content.splitlines(keepends=True)
+    if len(lines) > 1:
+        k = rng.randrange(len(lines))
+        return b"".join([*lines[: k + 1], *lines[k:]])
+    start, end = _slice(content, rng)
+    return content[:end] + content[start:]
+
+
+def _flip(content: bytes, rng: random.Random) -> bytes:
+    if not content:
+        return content
+    at = rng.randrange(len(content))
+    return content[:at] + bytes([content[at] ^ 1 << rng.randrange(8)]) + content[at + 1 :]
+
+
+def _cut(content: bytes, rng: random.Random) -> bytes:
+    return content[: rng.randint(0, len(content))]
+
+
+def _swap(content: bytes, rng: random.Random) -> bytes:
+    (a, b), (c, d) = sorted((_slice(content, rng), _slice(content, rng)))
+    return content if b > c else content[:a] + content[c:d] + content[b:c] + content[a:b] + content[d:]
+
+
+def _slice(content: bytes, rng: random.Random) -> tuple[int, int]:
+    start = rng.randint(0, len(content))
+    return start, min(len(content), start + rng.randint(0, 20))
+
+
+def _tracked(token: str) -> dict[str, object]:
+    found = box(token, velocity=[1.0, 0.0])
+    score = found.pop("detection_score")
+    return {**found, "tracking_id": "1", "tracking_name": found.pop("detection_name"), "tracking_score": score}
+
+
+def _read_nuscenes(root: Path) -> None:
+    data = NuScenes(root, "v1.0-mini", {"lidar": root / "found.json"}, ground_truth=True)
+    for name in data.scenes:
+        data.scene(name)
+    split_scenes(root, "v1.0-mini", "mini_val")
+
+
+def _read_kitti(root: Path) -> None:
+    KittiTracking(root, root / "found", ground_truth=True).scene("0007")
+
+
+def _read_table(path: Path) -> None:
+    data = read_detections(path)
+    for name in data.scenes:
+        data.scene(name)
+
+
+def _stream(path: Path, new_tracker: Callable[[], object]) -> None:
+    service: StreamTracker[None] = StreamTracker(new_tracker)  # type: ignore[arg-type]
+    for line in path.read_bytes().splitlines(keepends=True):
+        for _, answer in service.handle(line, None):
+            json.dumps(answer, allow_nan=False)
