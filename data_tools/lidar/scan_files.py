@@ -54,7 +54,8 @@ def _records(path: Path, columns: int) -> FloatArray:
     size = 4 * columns
     if len(content) % size:
         raise InputError(f"expected records of {size} bytes ({columns} float32 a point), got {len(content)} bytes")
-    return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # numbers that are none are refused by the scan
+        return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)
 
 
 def _bytes(path: Path) -> bytes:
