@@ -1,5 +1,6 @@
-"""Pose graphs in files."""
+"""Pose graphs: in files, and made up."""
 
 from data_tools.pose_graphs.g2o import read_g2o, write_g2o
+from data_tools.pose_graphs.generated import city, torus
 
-__all__ = ["read_g2o", "write_g2o"]
+__all__ = ["city", "read_g2o", "torus", "write_g2o"]
