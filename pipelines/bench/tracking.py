@@ -7,6 +7,7 @@ errors at labels from their sums, the figures averaged over recall by scoring ea
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -166,8 +167,9 @@ def headline_differences(a: Score, b: Score, draws: int, seed: int, confidence: 
     ours, theirs = a.figures, b.figures
     result = {}
     for name, values in drawn.items():
-        if name in ours and name in theirs:
-            low, high = np.nanquantile(values, [tail, 1 - tail]).tolist()
+        known = [value for value in values if math.isfinite(value)]
+        if name in ours and name in theirs and known:
+            low, high = np.quantile(known, [tail, 1 - tail]).tolist()
             result[name] = Interval(ours[name] - theirs[name], low, high, confidence)
     return result
 
