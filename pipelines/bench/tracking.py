@@ -161,8 +161,9 @@ def headline_differences(a: Score, b: Score, draws: int, seed: int, confidence: 
     for _ in range(draws):
         rows = rng.integers(count, size=count).tolist()
         first, second = a.figures_of(rows), b.figures_of(rows)
-        for name in first.keys() & second.keys():
-            drawn.setdefault(name, []).append(first[name] - second[name])
+        for name in first:
+            if name in second:
+                drawn.setdefault(name, []).append(first[name] - second[name])
     tail = (1 - confidence) / 2
     ours, theirs = a.figures, b.figures
     result = {}

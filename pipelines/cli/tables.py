@@ -14,17 +14,15 @@ from pipelines.figures import FigureTable
 
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
 
-LEAST_WIDTH = 160  # narrower, the tables are no longer ones
-
 
 def show_tables(tables: Iterable[FigureTable]) -> None:
-    """Print the tables on stdout."""
-    console = Console()
-    console = Console(width=max(console.width, LEAST_WIDTH))
+    """Print the tables on stdout, each as wide as it needs to be: broken lines are no table any more."""
     for table in tables:
         shown = Table(title=table.title, title_justify="left")
         for n, column in enumerate(table.columns):
             shown.add_column(column, justify="right" if n else "left")
         for row in table.rows:
             shown.add_row(*row)
-        console.print(shown)
+        widths = (max(map(len, texts)) for texts in zip(table.columns, *table.rows, strict=True))
+        needed = max(len(table.title), sum(width + 3 for width in widths) + 1)
+        Console(width=max(Console().width, needed)).print(shown)
