@@ -6,9 +6,12 @@ edge rules it is the classical tracker of independent Kalman filters, by the sam
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +37,17 @@ from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A tracker at one moment, see `Tracker.snapshot`."""
+
+    state: Any
+    own: tuple[TrackColumns, BoxFilter, SensorEvidence]
+    numbers: tuple[float, FloatArray, int, int]
+    graph: SceneGraph | None
+    assignment: Assignment
 
 
 class Tracker:
@@ -129,6 +143,19 @@ class Tracker:
         finally:
             self._state.restore(state)
             self._box, self._time, self.graph = box, now, graph
+
+    def snapshot(self) -> Snapshot:
+        """All that the tracker knows; what it does later leaves it as it is."""
+        own = copy.deepcopy((self._columns, self._box, self._evidence))
+        numbers = (self._time, self._origin, self._next_id, self.late_frames)
+        return Snapshot(self._state.snapshot(), own, numbers, self.graph, self.assignment)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go on from where a tracker of the same settings was; as often as wanted from one snapshot."""
+        self._state.restore(snapshot.state)
+        self._columns, self._box, self._evidence = copy.deepcopy(snapshot.own)
+        self._time, self._origin, self._next_id, self.late_frames = snapshot.numbers
+        self.graph, self.assignment = snapshot.graph, snapshot.assignment
 
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
