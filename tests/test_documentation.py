@@ -51,6 +51,15 @@ def test_the_contents_name_every_page() -> None:
         assert name == "README.md" or f"]({name})" in contents, f"docs/README.md does not name {name}"
 
 
+def test_the_site_has_every_page() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").rglob("*.md"):
+        name = page.relative_to(ROOT / "docs").as_posix()
+        assert re.search(rf"^ +- (?:[^:]+: )?{re.escape(name)}$", navigation, flags=re.M), (
+            f"mkdocs.yml does not name {name}"
+        )
+
+
 def test_every_example_says_whether_it_is_run() -> None:
     run = run_examples("--mark", "ci", *(page for page in PAGES if page.name != "README.md"))
     assert run.returncode == 0, run.stderr
@@ -87,3 +96,34 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
         'pip install -e ".[dev]" && pytest -n 2',
     ]
     assert "run_examples.py --mark ci README.md" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+def test_the_api_reference_names_every_face() -> None:
+    """Every package with an `__all__`, but the command and the benchmarks, which are documented by what they print."""
+    faces = {
+        ".".join(face.parent.relative_to(ROOT).parts)
+        for top in ("factors", "saga_fg", "data_tools", "pipelines")
+        for face in (ROOT / top).rglob("__init__.py")
+        if "__all__" in face.read_text(encoding="utf-8")
+    }
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
+    assert faces - {"pipelines.cli"} <= set(re.findall(r"^::: (\S+)$", pages, flags=re.M))
+
+
+def test_links_to_the_top_of_the_repository_are_links_of_the_site() -> None:
+    pytest.importorskip("mkdocs", reason="the site comes with the extra docs")
+    code = (
+        "from types import SimpleNamespace as Some\n"
+        "from site_hooks import on_page_markdown\n"
+        "def site(uri, text):\n"
+        "    return on_page_markdown(text, Some(file=Some(src_uri=uri)), None, None)\n"
+        "print(site('README.md', '[a](../CONTRIBUTING.md#b) [c](install.md)'))\n"
+        "print(site('guides/slam.md', '[a](../../CHANGELOG.md) [c](../model.md)'))\n"
+        "print(site('CONTRIBUTING.md', '[a](docs/guides/slam.md#b)'))\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "docs")
+    assert run.stdout.splitlines() == [
+        "[a](CONTRIBUTING.md#b) [c](install.md)",
+        "[a](../CHANGELOG.md) [c](../model.md)",
+        "[a](guides/slam.md#b)",
+    ]
