@@ -28,7 +28,7 @@ from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion, NodeMotion
-from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, Sighting
 from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
@@ -37,6 +37,14 @@ from saga_fg.transition import Transition
 log = logging.getLogger(__name__)
 
 _MAX_STAGES = 200  # of graduated non-convexity
+
+
+@dataclass(frozen=True, eq=False)
+class BatchState:
+    """The smoother as a value: the recording, and whether graduated non-convexity has weighed all of it."""
+
+    recording: RecordingState
+    graduated: bool
 
 
 class BatchSmoother:
@@ -165,14 +173,15 @@ class BatchSmoother:
         self._graduate()
         return self._recording.graph(self._means())
 
-    def snapshot(self) -> tuple[RecordingState, bool]:
+    def snapshot(self) -> BatchState:
         """The whole state, as a value."""
-        return self._recording.snapshot(), self._graduated
+        return BatchState(self._recording.snapshot(), self._graduated)
 
-    def restore(self, state: tuple[RecordingState, bool]) -> None:
+    def restore(self, state: BatchState) -> None:
         """Continue from a snapshot, bit-identically."""
-        recording, self._graduated = state
-        self._recording.restore(recording)
+        require_kind("state", state, BatchState)
+        self._recording.restore(state.recording)
+        self._graduated = state.graduated
         self._changed()
 
     def _newest(self) -> Newest:

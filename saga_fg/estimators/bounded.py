@@ -21,6 +21,7 @@ which is the logarithm of a proper density.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,8 +37,17 @@ from saga_fg.estimators.graph_parts import adjacency
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.overlapping import gathered, propagated
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.transition import Transition
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedState:
+    """The filter as a value: its clusters, the Gaussian of each, and the time, s."""
+
+    cover: Cover
+    x: BlockGaussian
+    time: float
 
 
 class BoundedKalmanFilter:
@@ -99,6 +109,7 @@ class BoundedKalmanFilter:
         self._time += transition.dt
 
     def update(self, measurements: Measurements) -> float:
+        require_kind("measurements", measurements, Measurements)
         if len(measurements) == 0:
             return 0.0
         cover, m = self._cover, measurements
@@ -164,13 +175,14 @@ class BoundedKalmanFilter:
         label = np.unique(cover.home, return_inverse=True)[1].astype(np.int64)
         return prior_graph(gathered(self._state, Partition(cover.layout, label), cover.own))
 
-    def snapshot(self) -> tuple[Cover, BlockGaussian, float]:
+    def snapshot(self) -> BoundedState:
         """The whole state, as a value."""
-        return self._cover, self._state, self._time
+        return BoundedState(self._cover, self._state, self._time)
 
-    def restore(self, state: tuple[Cover, BlockGaussian, float]) -> None:
+    def restore(self, state: BoundedState) -> None:
         """Continue from a snapshot, bit-identically."""
-        self._cover, self._state, self._time = state
+        require_kind("state", state, BoundedState)
+        self._cover, self._state, self._time = state.cover, state.x, state.time
 
     def _joint_copies(self, rows: IntArray) -> tuple[IntArray, IntArray]:
         """The copies that the joint covariance of distinct node rows is made of, and the cluster of each."""

@@ -18,6 +18,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import BlockDiagonal, Partition
+from saga_fg.estimators.protocol import require_kind
 from saga_fg.transition import Blocks, Transition
 
 _SPARSE_FROM = 100  # size of a component from which its part of F is kept sparse
@@ -35,6 +36,7 @@ class Dynamics:
     @staticmethod
     def of(transition: Transition, layout: Layout) -> Dynamics:
         """Those of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
+        require_kind("transition", transition, Transition)
         rows = layout.rows(transition.nodes)
         if len(rows) != len(layout):
             raise InputError(f"transition: expected {len(layout)} nodes, got {len(rows)}")

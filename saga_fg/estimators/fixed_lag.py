@@ -25,7 +25,7 @@ from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.motion import Motion, NodeMotion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
-from saga_fg.estimators.sighting import Observations, Sighting
+from saga_fg.estimators.sighting import Observations, along_the_way
 from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
 from saga_fg.transition import Transition
 
@@ -82,7 +82,7 @@ class FixedLagSmoother:
         kept. Returns the log-likelihood of the measurements given all taken in before; where the window holds something
         nonlinear or robust, that of its linearisation. Raises `InputError` for a time outside the window.
         """
-        return self._recording.see(Sighting(measurements, robust), time)
+        return self._recording.see(along_the_way(measurements, robust), time)
 
     def marginalise(self, nodes: ArrayLike) -> None:
         self._recording.leave(nodes)

@@ -32,7 +32,7 @@ from saga_fg.estimators.moment import Birth, Moment, passed
 from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.prediction import Prediction
-from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Sighting, whitened
 from saga_fg.estimators.smoothed import Newest
 from saga_fg.transition import Transition
@@ -115,6 +115,7 @@ class IncrementalFilter:
         self._held = _moved(self._held, motion)
 
     def update(self, measurements: Measurements) -> float:
+        require_kind("measurements", measurements, Measurements)
         sighting = Sighting(measurements)
         sighting.check(self._held.live)
         if len(measurements) == 0:
@@ -175,6 +176,7 @@ class IncrementalFilter:
 
     def restore(self, state: IncrementalState) -> None:
         """Continue from a snapshot."""
+        require_kind("state", state, IncrementalState)
         self._held = _Held(state.x.layout, None, state.x, state.x, (Moment(state.time),))
 
     def _newest(self) -> Newest:

@@ -10,6 +10,8 @@ measured so rarely, or left its neighbours so long ago, that its correlation has
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray
@@ -19,10 +21,19 @@ from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import Dynamics, predict
 from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
 from saga_fg.estimators.layout import checked_prior
-from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.transition import Transition
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanState:
+    """The filter as a value: its Gaussian, how many predictions it has made, and the time, s."""
+
+    x: BlockGaussian
+    predictions: int
+    time: float
 
 
 class JointKalmanFilter:
@@ -53,6 +64,7 @@ class JointKalmanFilter:
         self._time += transition.dt
 
     def update(self, measurements: Measurements) -> float:
+        require_kind("measurements", measurements, Measurements)
         if len(measurements) == 0:
             return 0.0
         rows = self._state.layout.rows(measurements.nodes)
@@ -89,10 +101,11 @@ class JointKalmanFilter:
         """One joint prior a component: the filter keeps nothing of the past but this."""
         return prior_graph(self._state)
 
-    def snapshot(self) -> tuple[BlockGaussian, int, float]:
+    def snapshot(self) -> KalmanState:
         """The whole state, as a value."""
-        return self._state, self._predictions, self._time
+        return KalmanState(self._state, self._predictions, self._time)
 
-    def restore(self, state: tuple[BlockGaussian, int, float]) -> None:
+    def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
-        self._state, self._predictions, self._time = state
+        require_kind("state", state, KalmanState)
+        self._state, self._predictions, self._time = state.x, state.predictions, state.time

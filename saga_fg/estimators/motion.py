@@ -18,6 +18,7 @@ from saga_fg.discretisation import discretise
 from saga_fg.errors import InputError
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.protocol import require_kind
 from saga_fg.transition import Blocks, Transition
 
 
@@ -50,6 +51,8 @@ class Motion:
     def check(self, layout: Layout) -> None:
         """Raise `InputError` or `UnknownNodeError` unless it is about exactly the nodes of `layout`, each once."""
         Dynamics.of(self.transition, layout)
+        for motion in self.nonlinear:
+            require_kind("nonlinear", motion, NodeMotion)
         moving = [motion.node for motion in self.nonlinear]
         layout.rows(moving)
         if len(set(moving)) < len(moving):
@@ -108,8 +111,9 @@ def _affine(
     """[F_i, F_j, ...] and b of f around x, others; angles of the prediction are those next to the node's own."""
     try:
         F, F_others, b = motion.interaction.affine(x, others, dt)
-    except FactorError as error:
-        raise InputError(f"interaction of node {motion.node}: {error}") from error
+    except Exception as error:  # of a researcher's function: anything
+        reason = error if isinstance(error, FactorError) else repr(error)
+        raise InputError(f"interaction of node {motion.node}: {reason}") from error
     angles = list(motion.interaction.angles)
     predicted = (
         b + F @ x + sum((block @ other for block, other in zip(F_others, others, strict=True)), np.zeros(len(x)))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
+from saga_fg.errors import InputError
 from saga_fg.transition import Transition
 
 if TYPE_CHECKING:  # it is made of measurements itself
@@ -47,6 +48,13 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.nodes)
+
+
+def require_kind(name: str, value: object, *kinds: type) -> None:
+    """Raise `InputError` unless `value` is an instance of one of `kinds`."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}")
 
 
 def _one_each(value: ArrayLike, m: int) -> ArrayLike:
@@ -112,5 +120,5 @@ class Estimator(Protocol):
         ...
 
     def restore(self, state: Any) -> None:
-        """Continue from a snapshot of an estimator of the same kind."""
+        """Continue from a snapshot of an estimator of the same kind; raises `InputError` for anything else."""
         ...

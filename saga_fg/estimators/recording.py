@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import FloatArray, checked
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import (
     MarginalCovariances,
@@ -29,6 +29,7 @@ from saga_fg.estimators.fixed_point import FixedPoint
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.moment import Birth, Moment, Pass, arrival, passed, reckoned
 from saga_fg.estimators.motion import Motion, Standstill
+from saga_fg.estimators.protocol import require_kind
 from saga_fg.estimators.sighting import Sighting
 from saga_fg.settings import setting
 
@@ -69,7 +70,8 @@ class RecordingState:
 class Recording:
     """Moments in order of time, from 0 s on. Every method checks all it is given before it changes anything.
 
-    With `lazy` the filter's pass waits until somebody asks for an estimate; nobody learns the likelihoods meanwhile.
+    With `lazy` the filter's pass waits until somebody asks for an estimate, or something nonlinear comes that must be
+    tried; nobody learns the likelihoods meanwhile.
     """
 
     def __init__(self, settings: GaussNewtonSettings | None = None, lazy: bool = False) -> None:
@@ -88,6 +90,7 @@ class Recording:
         )
 
     def restore(self, state: RecordingState) -> None:
+        require_kind("state", state, RecordingState)
         self._prior, self._converged = state.prior, state.converged
         self._moments, self._layouts, self._passes = list(state.moments), list(state.layouts), list(state.passes)
         self._nonlinear = not all(moment.linear for moment in state.moments)
@@ -163,12 +166,15 @@ class Recording:
         inserted = len(moments) > len(self._moments)
         moments[k] = replace(moments[k], sightings=(*moments[k].sightings, sighting))
         passes, likelihood = self._passes[:k], math.nan
-        if not self._lazy:
-            before = sum(state.log_likelihood for state in self._passes[k:])
+        if not (self._lazy and sighting.linear):
+            known = _completed(self._passes, self._prior, self._moments)
+            passes = known[:k]
             if not inserted:
-                passes.append(self._passes[k].seen(sighting))
+                passes.append(known[k].seen(sighting))
             passes = _completed(passes, self._prior, moments)
-            likelihood = sum(state.log_likelihood for state in passes[k:]) - before
+            if not self._lazy:
+                likelihood = sum(state.log_likelihood for state in passes[k:])
+                likelihood -= sum(state.log_likelihood for state in known[k:])
         elif newest and not inserted and len(self._passes) == len(moments):
             passes.append(self._passes[k].seen(sighting))
         self._moments, self._layouts, self._passes = moments, layouts, passes
@@ -272,8 +278,10 @@ class Recording:
         moment, layout, passes = self._moments[-1], self.layout, self._passes
         if not self._lazy:
             self.solve()
-            state, prior = self._passes[-1].moved(moment.gone, motion)
-            passes = [*self._passes[:-1], state, arrival(prior)]
+        if not (self._lazy and motion.linear):
+            known = _completed(self._passes, self._prior, self._moments)
+            state, prior = known[-1].moved(moment.gone, motion)
+            passes = [*known[:-1], state, arrival(prior)]
         self._moments = [*self._moments[:-1], replace(moment, motion=motion), Moment(moment.time + motion.dt)]
         self._layouts, self._passes = [*self._layouts, layout], passes
         self._nonlinear |= not motion.linear
@@ -283,8 +291,7 @@ class Recording:
     def _moment_at(self, time: float) -> tuple[int, list[Moment], list[Layout]]:
         """The moment of `time`, with moments and layouts in which it is, an interval split if need be."""
         moments, layouts = list(self._moments), list(self._layouts)
-        if not math.isfinite(time):
-            raise InputError(f"time: expected a finite number of seconds, got {time!r}")
+        time = float(checked("time", time, ()))
         first, last = moments[0].time, moments[-1].time
         if time > last + _SAME_TIME:
             raise InputError(f"time: {time:.6f} s is after the newest moment, {last:.6f} s; predict first")

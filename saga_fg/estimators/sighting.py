@@ -21,7 +21,7 @@ from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.protocol import Measurements, require_kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +85,11 @@ class Sighting:
     robust: Robust | GraduatedNonConvexity | None = None
     weights: FloatArray | None = None
 
+    def __post_init__(self) -> None:
+        require_kind("measurements", self.measured, Measurements, Observations)
+        if self.robust is not None:
+            require_kind("robust", self.robust, Robust, GraduatedNonConvexity)
+
     @property
     def loss(self) -> Robust | None:
         """The loss whose weights follow the residuals."""
@@ -146,13 +151,21 @@ class Sighting:
         try:
             residual = measured.z - model.predict(x)
             H = np.array(model.jacobian(x), dtype=np.float64)
-        except FactorError as error:
-            raise InputError(f"{model.name}: {error}") from error
+        except Exception as error:  # of a researcher's model: anything
+            reason = error if isinstance(error, FactorError) else repr(error)
+            raise InputError(f"{model.name}: {reason}") from error
         angles = list(model.angles)
         residual[:, angles] = (residual[:, angles] + np.pi) % (2 * np.pi) - np.pi
         if not (np.isfinite(residual).all() and np.isfinite(H).all()):
             raise InputError(f"{model.name}: the prediction or its Jacobian is not finite")
         return residual, H
+
+
+def along_the_way(measured: Measurements | Observations, robust: Robust | None) -> Sighting:
+    """What a smoother records that never has the whole recording, which graduated non-convexity would need."""
+    if robust is not None:
+        require_kind("robust", robust, Robust)
+    return Sighting(measured, robust)
 
 
 def _distances(residual: FloatArray, R: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from saga_fg.estimators.backward import future_influence
 from saga_fg.estimators.motion import Motion, NodeMotion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording
-from saga_fg.estimators.sighting import Observations, Sighting
+from saga_fg.estimators.sighting import Observations, along_the_way
 from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.settings import require_between, require_positive, setting
 from saga_fg.transition import Transition
@@ -98,7 +98,7 @@ class WindowedSmoother:
 
         Raises `InputError` for a time before `start`.
         """
-        self._recording.see(Sighting(measurements, robust), time)
+        self._recording.see(along_the_way(measurements, robust), time)
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Nodes that disappear."""

@@ -7,11 +7,14 @@ kinds speak or are silent, some of them late.
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 import scipy.linalg
 from random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
+
+EXACT = 1e-9  # standard deviations of means, relative difference of covariances
 
 
 def random_covariance(rng, count, dim, scale=1.0):
@@ -169,3 +172,41 @@ def part(x, places, nodes):
     """The marginal of some nodes."""
     chosen = np.concatenate([places[int(node)] for node in nodes])
     return Gaussian(x.mean[chosen], x.covariance[np.ix_(chosen, chosen)])
+
+
+def tell(estimator, calls):
+    """The estimator, told of all that."""
+    for name, *arguments in calls:
+        getattr(estimator, name)(*arguments)
+    return estimator
+
+
+def admissible(textbook, call, start):
+    """Whether a late measurement is of a time not before `start` at which its nodes were there."""
+    name, *arguments = call
+    if name != "update" or arguments[1] is None:
+        return True
+    measured, time = arguments
+    if time < start:
+        return False
+    steps, _ = textbook.solve()
+    k = max(k for k, step in enumerate(textbook.steps) if step.time <= time + 1e-9)
+    there = set(steps[k][1]) - set(textbook.steps[k].gone)
+    return set(measured.nodes.tolist()) <= there
+
+
+def assert_smoothed(moments, textbook, joint=True):
+    """These moments, which are the last ones, as the textbook has them; `joint`: their joint covariances, too."""
+    steps, _ = textbook.solve()
+    assert len(moments) > 0
+    for moment, (time, places, _, reference) in zip(moments[::-1], steps[::-1], strict=False):
+        assert moment.time == pytest.approx(time, abs=1e-12)
+        assert set(moment.nodes.tolist()) == set(places)
+        expected = part(reference, places, moment.nodes)
+        assert mean_error(moment.joint_mean(moment.nodes), expected) < EXACT
+        if joint:
+            assert covariance_error(moment.joint_covariance(moment.nodes), expected.covariance) < EXACT
+        for node in moment.nodes:
+            own = part(reference, places, [node])
+            assert mean_error(moment.mean([node])[0], own) < EXACT
+            assert covariance_error(moment.covariance([node])[0], own.covariance) < EXACT

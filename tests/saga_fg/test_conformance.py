@@ -23,6 +23,7 @@ from estimator_programs import (
     random_program,
     run,
 )
+from estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
 
 from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
@@ -195,6 +196,21 @@ def test_every_moment_is_smoothed_as_by_rauch_tung_striebel(make_smoother, seed)
             for node, (mean, P) in reference.items():
                 assert np.abs((moment.mean([node])[0] - mean) / np.sqrt(np.diag(P))).max() <= TOLERANCE
                 assert np.linalg.norm(moment.covariance([node])[0] - P) <= TOLERANCE * np.linalg.norm(P)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_late_measurements_change_the_past_as_if_they_had_come_in_time(make_smoother, seed):
+    """At any time within the window, also between two moments: the interval is split, its graph kept."""
+    smoother, textbook, late = make_smoother(), Textbook(), 0
+    for call in random_scenario(np.random.default_rng(300 + seed), late=0.5).calls:
+        if admissible(textbook, call, getattr(smoother, "start", 0.0)):
+            tell(textbook, [call])
+            tell(smoother, [call])
+            if call[0] == "update" and call[2] is not None:
+                late += 1
+                assert_smoothed(smoother.smoothed(), textbook, joint=False)
+    assert late > 0 or getattr(smoother, "lag", 1.0) == 0.0
+    assert_smoothed(smoother.smoothed(), textbook, joint=False)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -478,6 +494,17 @@ BAD = {
     ),
     "predict: negative interval": (lambda e: e.predict(transition(IDS, dt=-1.0)), InputError, "dt: expected a finite"),
     "predict: endless interval": (lambda e: e.predict(transition(IDS, dt=np.inf)), InputError, "dt: expected a finite"),
+    "predict: no transition": (
+        lambda e: e.predict(transition(IDS).graph),
+        InputError,
+        "transition: expected Transition, got SceneGraph",
+    ),
+    "update: no measurements": (
+        lambda e: e.update(([4], [[0.0, 0.0]])),
+        InputError,
+        "measurements: expected Measurements.*, got tuple",
+    ),
+    "restore: no snapshot": (lambda e: e.restore((1, 2, 3.0)), InputError, "state: expected .*State, got tuple"),
     "update: unknown node": (
         lambda e: e.update(measured([4, 99])),
         UnknownNodeError,
@@ -574,6 +601,18 @@ def test_continuing_from_a_snapshot_is_bit_identical(make):
         second = again.nodes, again.joint_mean(again.nodes), again.joint_covariance(again.nodes)
         for a, b in zip(first, second, strict=True):
             assert np.array_equal(a, b)
+
+
+def test_a_snapshot_of_another_kind_of_estimator_is_refused(make):
+    estimator, untouched = filled(make), filled(make)
+    own = type(make().snapshot())
+    others = [filled(maker(kind.values[0])).snapshot() for kind in ESTIMATORS]
+    for state in others:
+        if not isinstance(state, own):
+            with pytest.raises(InputError, match=f"state: expected {own.__name__}, got {type(state).__name__}"):
+                estimator.restore(state)
+    assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
+    assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
 
 
 def test_the_suite_would_notice(make):

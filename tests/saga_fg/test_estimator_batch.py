@@ -5,10 +5,10 @@ import pickle
 import gtsam
 import numpy as np
 import pytest
-from estimator_scenario import Textbook, covariance_error, mean_error, part, random_scenario
+from estimator_scenario import EXACT, Textbook, covariance_error, mean_error, part, random_scenario, tell
 from random_graphs import BUS, CAR, CONE, POLE
 
-from factors import RangeBearing, Robust
+from factors import NonlinearInteraction, RangeBearing, Robust
 from saga_fg import InputError, SceneGraph
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import (
@@ -16,16 +16,9 @@ from saga_fg.estimators import (
     FixedLagSmoother,
     GraduatedNonConvexity,
     Measurements,
+    NodeMotion,
     Observations,
 )
-
-EXACT = 1e-9
-
-
-def tell(estimator, calls):
-    for name, *arguments in calls:
-        getattr(estimator, name)(*arguments)
-    return estimator
 
 
 def punctual(scenario):
@@ -172,6 +165,30 @@ def test_a_snapshot_can_be_stored():
         np.testing.assert_array_equal(a.state, b.state)
         for node in a.nodes:
             np.testing.assert_array_equal(a.covariance([node]), b.covariance([node]))
+
+
+@pytest.mark.parametrize("likelihoods", [True, False])
+def test_functions_that_fail_are_refused_at_once(likelihoods):
+    """Also by a smoother that waits: found later, there would be no way to get rid of them."""
+
+    def refuse(x, others, dt):
+        raise ZeroDivisionError("no idea")
+
+    def told(wrong):
+        smoother = BatchSmoother(likelihoods=likelihoods)
+        smoother.add([1, 2], np.zeros((2, 4)), np.tile(np.eye(4), (2, 1, 1)))
+        apart = discretise(SceneGraph.of([1, 2], CAR), 0.1)
+        smoother.predict(apart)
+        if wrong:
+            with pytest.raises(InputError, match=r"interaction of node 1: ZeroDivisionError\('no idea'\)"):
+                smoother.predict(apart, [NodeMotion(1, (2,), NonlinearInteraction(refuse))])
+            with pytest.raises(InputError, match="the object is at the sensor itself"):
+                smoother.update(Observations([1], [[1.0, 0.0]], RangeBearing(state_dim=4), np.eye(2)))
+        smoother.update(Measurements([1], [[1.0, 0.0]], np.eye(2, 4), np.eye(2)))
+        return smoother.smoothed()
+
+    for moment, expected in zip(told(True), told(False), strict=True):
+        np.testing.assert_array_equal(moment.mean([1, 2]), expected.mean([1, 2]))
 
 
 def test_what_was_not_kept_is_said():

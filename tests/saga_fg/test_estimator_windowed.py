@@ -104,7 +104,7 @@ def test_the_influence_of_the_future_is_what_knowing_the_present_would_change():
         for smoother in (batch, told):
             smoother.predict(transition)
             smoother.update(measurements)
-    recording.restore(batch.snapshot()[0])
+    recording.restore(batch.snapshot().recording)
     told.update(Measurements([0, 1, 2], np.zeros((3, 4)), np.eye(4), 1e-12 * np.eye(4)))  # to know it exactly
     influence = list(future_influence(recording.passes))[::-1]
     for moment, better, s in zip(batch.smoothed(), told.smoothed(), influence, strict=True):
