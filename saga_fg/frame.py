@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Self, get_args
 
 import numpy as np
@@ -21,10 +21,11 @@ LATEST = 1e11  # s; the year 5138 where the epoch is 1970, and more than any clo
 
 @dataclass(frozen=True)
 class Detection:
-    """One detected object. NaN stands for "not measured" in size, yaw and velocity.
+    """One detected object. NaN stands for "not measured" in size, yaw, velocity and range rate.
 
     position: centre (x, y, z), m; size: (length, width, height), m; yaw: rad about z; velocity: (vx, vy), m/s over
-    ground; score: the detector's confidence, any finite number (probability or logit: see the sensor's model).
+    ground; score: the detector's confidence, any finite number (probability or logit: see the sensor's model);
+    range_rate: m/s, see `Detections`.
     """
 
     label: str
@@ -33,6 +34,7 @@ class Detection:
     yaw: float = NAN
     velocity: tuple[float, float] = (NAN, NAN)
     score: float = 1.0
+    range_rate: float = NAN
 
     def __post_init__(self) -> None:
         Detections.of([self])
@@ -40,13 +42,22 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """N detections as columns: `boxes` and their `score` (N,). Iterating gives `Detection`s."""
+    """N detections as columns: `boxes`, their `score` (N,) and `range_rate` (N,). Iterating gives `Detection`s.
+
+    A range rate (m/s; NaN, as by default: not measured) is what a radar says of motion: the component of the velocity
+    *over ground* along the horizontal line of sight from the sensor, positive when the object moves away. Where the
+    radar gives it relative to itself, add the component of the sensor's own velocity along that line first.
+    """
 
     boxes: Boxes
     score: FloatArray
+    range_rate: FloatArray = field(default_factory=lambda: np.array(NAN))  # a single number serves all
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "score", checked("score", self.score, (len(self.boxes),)))
+        n = len(self.boxes)
+        object.__setattr__(self, "score", checked("score", self.score, (n,)))
+        rate = np.full(n, self.range_rate) if np.ndim(self.range_rate) == 0 else self.range_rate
+        object.__setattr__(self, "range_rate", checked("range_rate", rate, (n,), "finite-or-nan"))
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Self:
@@ -58,7 +69,9 @@ class Detections:
             [d.yaw for d in detections],
             [d.velocity for d in detections],
         )
-        return cls(boxes, checked("score", [d.score for d in detections], (len(detections),)))
+        n = len(detections)
+        rate = checked("range_rate", [d.range_rate for d in detections], (n,), "finite-or-nan")
+        return cls(boxes, checked("score", [d.score for d in detections], (n,)), rate)
 
     @classmethod
     def empty(cls) -> Self:
@@ -76,6 +89,7 @@ class Detections:
             yaw=float(b.yaw[row]),
             velocity=tuple(b.velocity[row].tolist()),
             score=float(self.score[row]),
+            range_rate=float(self.range_rate[row]),
         )
 
     def __iter__(self) -> Iterator[Detection]:
@@ -85,11 +99,11 @@ class Detections:
         """The detections of a mask, of row indices or of a slice."""
         boxes = self.boxes.select(rows)
         index = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        return type(self)(boxes, self.score[index])
+        return type(self)(boxes, self.score[index], self.range_rate[index])
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""
-        return type(self)(self.boxes.transformed(target_T_source), self.score)
+        return type(self)(self.boxes.transformed(target_T_source), self.score, self.range_rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +113,8 @@ class Frame:
     timestamp    s, any epoch, the same for all sensors of a scene
     sensor       the sensor's name, e.g. "lidar"
     detections   boxes in `coordinates`: "world", "ego" (vehicle) or "sensor"
-    world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world"
+    world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world" and no range rate
+                 was measured
     token        the dataset's own name of the record, "" if none
 
     Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
@@ -136,6 +151,10 @@ class Frame:
         elif self.coordinates != "world":
             raise InputError(
                 f"world_T_ego: expected a pose, since the detections are in {self.coordinates} coordinates"
+            )
+        elif np.isfinite(self.detections.range_rate).any():
+            raise InputError(
+                "world_T_ego: expected a pose, since range_rate is along the line of sight from the sensor"
             )
 
     def __len__(self) -> int:

@@ -3,7 +3,8 @@ r"""Sensors: all that a sensor contributes to the filter is what it observes, ho
     z = H x + v,   v ~ N(0, R)
     R = s(score)^2 ( position^2 I + (range_noise r)^2 u u^T + (bearing_noise r)^2 n n^T )
 
-with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. A score means
+with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. A radar besides
+measures the range rate u . velocity, with the variance (s(score) range_rate)^2. A score means
 something else for every detector and class; its calibration makes it a probability that compares (Platt 1999),
 
     P(the detection is true) = 1 / (1 + exp(-(offset + slope logit(score)))).
@@ -39,12 +40,13 @@ class NoiseModel:
     range_noise: float = setting(0.0, "standard deviation along the line of sight, m per m of range")
     bearing_noise: float = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
     velocity: float = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
+    range_rate: float = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
     low_score: float = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
     yaw: float = setting(0.2, "standard deviation of the heading, rad")
     height: float = setting(0.2, "standard deviation of the centre's height, m")
 
     def __post_init__(self) -> None:
-        require_positive(self, "position", "velocity", "yaw", "height")
+        require_positive(self, "position", "velocity", "range_rate", "yaw", "height")
         require_between(self, 0, math.inf, "range_noise", "bearing_noise", "low_score")
 
 
@@ -106,7 +108,7 @@ class Sensor:
         default_factory=lambda: {DEFAULT: NoiseModel()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    use_velocity: bool = setting(True, "take in the velocity where the detector measured one")
+    use_velocity: bool = setting(True, "take in the velocity, or the range rate, where one was measured")
     detection_probability: float = setting(0.9, "chance that a visible object in the field of view is detected")
     class_detection: Mapping[str, float] = settings_group(dict, "that chance by class, where it differs")
     score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
@@ -193,6 +195,10 @@ class Sensor:
         """R (N, 2, 2), (m/s)^2."""
         variance = self.deviations(label, "velocity") ** 2 * self._score_factor(label, probability)
         return np.asarray(variance[:, None, None] * np.eye(2))
+
+    def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
+        """(N,), (m/s)^2."""
+        return np.asarray(self.deviations(label, "range_rate") ** 2 * self._score_factor(label, probability))
 
     def _score_factor(self, label: StrArray, probability: FloatArray) -> FloatArray:
         return np.asarray((1 + self.deviations(label, "low_score") * (1 - probability)) ** 2)

@@ -8,6 +8,8 @@ One row per detection. The same columns in every format; only the first three ar
     length, width, height m                                          default unknown
     yaw                   rad, from x towards y                      default unknown
     vx, vy                m/s over ground                            default unknown
+    range_rate            m/s over ground along the horizontal line of sight from the sensor, positive when the object
+                          moves away; needs ego_x, ego_y, ego_yaw    default unknown
     score                 any finite number, higher is surer         default 1
     label                 class name                                 default "object"
     sensor                name of the sensor                         default "sensor"

@@ -13,7 +13,7 @@ from saga_fg.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.errors import InputError
 
 REQUIRED = ("timestamp", "x", "y")
-BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "score")
+BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score")
 POSE = ("ego_x", "ego_y", "ego_z", "ego_yaw")
 TEXT = ("label", "sensor", "scene", "coordinates")
 COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, "empty")

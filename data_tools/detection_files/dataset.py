@@ -149,7 +149,8 @@ def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
     score = np.where(empty, 0.0, raw.numbers("score", 1.0))
     _require(raw, np.isfinite(score), "score", score, "a finite number")
     velocity = np.stack([raw.numbers("vx"), raw.numbers("vy")], axis=-1)
-    return Detections(Boxes(raw.texts("label", "object"), position, size, raw.numbers("yaw"), velocity), score)
+    boxes = Boxes(raw.texts("label", "object"), position, size, raw.numbers("yaw"), velocity)
+    return Detections(boxes, score, np.where(empty, np.nan, raw.numbers("range_rate")))
 
 
 def _pose(raw: RawTable, coordinates: StrArray) -> FloatArray | None:

@@ -3,7 +3,7 @@
 from data_tools.simulator.dataset import SimulatedTraffic
 from data_tools.simulator.nuscenes_export import write_nuscenes
 from data_tools.simulator.scene import simulate_scene
-from data_tools.simulator.settings import SensorSettings, SimulatorSettings, camera, lidar
+from data_tools.simulator.settings import SensorSettings, SimulatorSettings, camera, lidar, radar
 
 __all__ = [
     "SensorSettings",
@@ -11,6 +11,7 @@ __all__ = [
     "SimulatorSettings",
     "camera",
     "lidar",
+    "radar",
     "simulate_scene",
     "write_nuscenes",
 ]

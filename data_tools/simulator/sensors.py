@@ -1,12 +1,15 @@
 """What a sensor reports of the boxes around it: detections with noise, misses, false detections and scores.
 
 Noise is Gaussian along the line of sight and across it, with standard deviations base + slope * range, and
-independent from frame to frame. The logit of a score is, for a true detection,
+independent from frame to frame. A radar adds the range rate: the velocity over ground along the line of sight, of what
+is not there around 0, as of a return from the roadside. The logit of a score is, for a true detection,
 
     true_logit + 2 (visible share - 1) - range / 40 m + noise,          for a false one    clutter_logit + noise.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,10 +73,18 @@ def observe(
         boxes.yaw[seen] + sensor.yaw_noise * rng.standard_normal(n),
         velocity,
     )
+    rate = np.sum(boxes.velocity[seen] * sight, axis=1)
     false, false_logit = _clutter(sensor, world_T_ego, rng)
     order = rng.permutation(n + len(false))
     logits = np.concatenate([logit, false_logit])
-    return Detections(Boxes.concatenate([true, false]), 1 / (1 + np.exp(-logits))).select(order)
+    reported = Boxes.concatenate([true, false])
+    if not sensor.boxes:
+        reported = replace(reported, size=np.full_like(reported.size, np.nan), yaw=np.full(len(reported), np.nan))
+    rates = np.full(len(reported), np.nan)
+    if sensor.range_rate_noise is not None:
+        rates = np.concatenate([rate, np.zeros(len(false))])
+        rates = rates + sensor.range_rate_noise * rng.standard_normal(len(rates))
+    return Detections(reported, 1 / (1 + np.exp(-logits)), rates).select(order)
 
 
 def _clutter(sensor: SensorSettings, world_T_ego: FloatArray, rng: np.random.Generator) -> tuple[Boxes, FloatArray]:

@@ -135,6 +135,10 @@ class SensorSettings:
     velocity_noise: float | None = setting(
         None, "standard deviation of each velocity component, m/s; null: no velocity"
     )
+    range_rate_noise: float | None = setting(
+        None, "standard deviation of the range rate over ground, m/s; null: no range rate"
+    )
+    boxes: bool = setting(True, "whether it measures sizes and headings")
     detection_probability: float = setting(0.97, "chance to detect a clearly visible object close by")
     hidden_share: float = setting(0.15, "visible share up to which an object is never detected")
     clear_share: float = setting(0.35, "visible share from which occlusion does not matter")
@@ -182,6 +186,27 @@ def camera() -> SensorSettings:
         clutter_rate=3.0,
         true_logit=1.2,
         clutter_logit=-1.2,
+        logit_noise=1.0,
+    )
+
+
+def radar() -> SensorSettings:
+    """A front radar: good ranges, poor bearings, the range rate over ground; neither sizes nor headings."""
+    return SensorSettings(
+        rate=14.0,
+        offset=0.017,
+        field_of_view=math.radians(120),
+        position=(3.6, 0.0, 0.5),
+        max_range=60.0,
+        range_noise=(0.3, 0.002),
+        bearing_noise=(0.3, 0.015),
+        height_noise=0.5,
+        range_rate_noise=0.15,
+        boxes=False,
+        detection_probability=0.85,
+        clutter_rate=4.0,
+        true_logit=1.0,
+        clutter_logit=-1.0,
         logit_noise=1.0,
     )
 

@@ -35,6 +35,7 @@ REQUESTS: tuple[Request, ...] = ("status", "subscribe", "reset")
 
 POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
 NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
+MEASURED = (*NUMBERS, "range_rate")  # of a detection
 FRAME_KEYS = ("type", "seq", "timestamp", "sensor", "coordinates", "ego", "detections")
 DEFAULTS = {"z": 0.0, "score": 1.0}
 LONGEST_NAME = 64  # characters of a label or a sensor: names are kept
@@ -119,26 +120,25 @@ def _frame_message(message: Mapping[str, Any], settings: StreamSettings) -> Fram
 
 
 def _detections(rows: Sequence[Any]) -> Detections:
-    numbers = np.empty((len(rows), len(NUMBERS)))
+    numbers = np.empty((len(rows), len(MEASURED)))
     labels = []
     for k, row in enumerate(rows):
         where = f"detections[{k}]"
         if not isinstance(row, dict):
             raise InputError(f"{where}: expected an object, got {_short(row)}")
-        _known(f"{where}.", row, ("label", *NUMBERS))
+        _known(f"{where}.", row, ("label", *MEASURED))
         labels.append(_name(f"{where}.", row, "label", "object"))
         numbers[k] = [
             _number(f"{where}.", row, name, None if name in ("x", "y") else DEFAULTS.get(name, np.nan))
-            for name in NUMBERS
+            for name in MEASURED
         ]
-    columns = dict(zip(NUMBERS, numbers.T, strict=True))
+    columns = dict(zip(MEASURED, numbers.T, strict=True))
 
     def stacked(names: Sequence[str]) -> FloatArray:
         return np.stack([columns[name] for name in names], axis=-1)
 
-    return Detections(
-        Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY)), columns["score"]
-    )
+    boxes = Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY))
+    return Detections(boxes, columns["score"], columns["range_rate"])
 
 
 def _pose(ego: Any) -> FloatArray:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from factors import RangeRate
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import Estimator, FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
@@ -17,6 +18,8 @@ from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.tracking.settings import EstimatorName
+
+LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
 
 class Kinematics(NamedTuple):
@@ -91,8 +94,38 @@ class JointTrackState:
                 if len(rows) == 0:
                     continue
                 k = 4 if velocity else 2
-                H = node_type.selector(POSITION + VELOCITY if velocity else POSITION)
+                H = np.broadcast_to(
+                    node_type.selector(POSITION + VELOCITY if velocity else POSITION), (len(rows), k, node_type.dim)
+                )
                 self._measure(node_type, ids[rows], z[rows, :k], H, R[rows, :k, :k], delay)
+
+    def update_range_rate(
+        self,
+        ids: IntArray,
+        label: StrArray,
+        rate: FloatArray,
+        variance: FloatArray,
+        viewpoint: FloatArray,
+        delay: float,
+    ) -> None:
+        """Take in one range rate each of some tracks, m/s over ground, seen from `viewpoint` (2,) `delay` s ago.
+
+        rate (k,), variance (k,). Every estimator takes the same linear measurement: the range rate linearised at the
+        present estimate, moved back by `delay` along own motion. Left out: tracks within `LEAST_RANGE` of the sensor.
+        """
+        for node_type, rows in self._by_type(label, moving=True):
+            at_p, at_v = node_type.index(POSITION).tolist(), node_type.index(VELOCITY).tolist()
+            x = self._estimator.mean(ids[rows])
+            if delay > 0:
+                x = x @ np.linalg.inv(_own_motion(node_type, delay)[0]).T
+            clear = np.hypot(*(x[:, at_p] - viewpoint).T) >= LEAST_RANGE
+            rows, x = rows[clear], x[clear]
+            if len(rows) == 0:
+                continue
+            model = RangeRate(node_type.dim, tuple(at_p), tuple(at_v), (float(viewpoint[0]), float(viewpoint[1]), 0.0))
+            H = model.jacobian(x)
+            z = rate[rows, None] - model.predict(x) + (H @ x[:, :, None])[:, :, 0]
+            self._measure(node_type, ids[rows], z, H, variance[rows, None, None], delay)
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
@@ -124,13 +157,14 @@ class JointTrackState:
     def _measure(
         self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
     ) -> None:
+        """z (k, m), H (k, m, d), R (k, m, m) of some tracks, `delay` s old."""
         estimator = self._changed()
         if delay > 0 and isinstance(estimator, FixedLagSmoother):
             then = estimator.time - delay
             there = np.array([self._born[track] <= then for track in ids.tolist()]) & (then >= estimator.start)
             if there.any():
-                estimator.update(Measurements(ids[there], z[there], H, R[there]), time=then)
-            ids, z, R = ids[~there], z[~there], R[~there]
+                estimator.update(Measurements(ids[there], z[there], H[there], R[there]), time=then)
+            ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]
         if delay > 0:
             H, R = _moved_to_present(node_type, H, R, delay)
         estimator.update(Measurements(ids, z, H, R))
@@ -166,7 +200,7 @@ def _moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: 
     """A measurement `delay` s old as one of the present state, x(t - delay) = exp(-A delay) x(t) + noise."""
     F, Q = _own_motion(node_type, delay)
     H_past = H @ np.linalg.inv(F)
-    return H_past, R + H_past @ Q @ H_past.T
+    return H_past, R + H_past @ Q @ np.swapaxes(H_past, -1, -2)
 
 
 def _own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,8 @@ UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 @dataclass(frozen=True, eq=False)
 class Observed:
     """m detections: boxes (world), probability (m,), R (m, 4, 4) of position and velocity, standard deviations (m,) of
-    height (m) and heading (rad), whether the velocity was measured (m,), and rows (m,) in the frame's detections."""
+    height (m) and heading (rad), whether the velocity was measured (m,), rows (m,) in the frame's detections, range
+    rate (m,), m/s, NaN where not to be used, its variance (m,), and the place (2,), world, it was seen from, if known."""
 
     boxes: Boxes
     probability: FloatArray
@@ -29,6 +30,9 @@ class Observed:
     z_noise: FloatArray
     yaw_noise: FloatArray
     row: IntArray
+    range_rate: FloatArray
+    range_rate_variance: FloatArray
+    viewpoint: FloatArray | None
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -44,10 +48,22 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
         class_values(classes, name, label[keep]) for name in ("duplicate_distance", "shadow_distance", "shadow_ratio")
     )
     keep = keep[strongest(detections.boxes.select(keep), probability[keep], *limits)]
-    boxes, probability = detections.boxes.select(keep), probability[keep]
+    detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
+    boxes = detections.boxes
     R = np.zeros((len(boxes), 4, 4))
-    R[:, :2, :2] = sensor.detection_covariance(detections.select(keep), sensor.origin(frame))
+    R[:, :2, :2] = sensor.detection_covariance(detections, viewpoint)
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise = np.where(np.isfinite(boxes.yaw), sensor.deviations(boxes.label, "yaw"), UNKNOWN_YAW_NOISE)
     with_velocity = np.isfinite(boxes.velocity[:, 0] + boxes.velocity[:, 1]) & sensor.use_velocity
-    return Observed(boxes, probability, R, with_velocity, sensor.deviations(boxes.label, "height"), yaw_noise, keep)
+    return Observed(
+        boxes,
+        probability,
+        R,
+        with_velocity,
+        sensor.deviations(boxes.label, "height"),
+        yaw_noise,
+        keep,
+        np.where(sensor.use_velocity, detections.range_rate, np.nan),
+        sensor.range_rate_variance(boxes.label, probability),
+        viewpoint,
+    )

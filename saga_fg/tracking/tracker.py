@@ -198,6 +198,7 @@ class Tracker:
         t, d = matching.track, matching.detection
         z = np.concatenate([boxes.position[d, :2] - self._origin, boxes.velocity[d]], axis=1)
         self._state.update(columns.id[t], columns.label[t], z, observed.R[d], observed.with_velocity[d], delay)
+        self._update_range_rate(observed, d, columns.id[t], columns.label[t], delay)
         p = observed.probability[d]
         self._box.update(
             t, boxes.size[d], p, boxes.position[d, 2], observed.z_noise[d], boxes.yaw[d], observed.yaw_noise[d]
@@ -208,6 +209,17 @@ class Tracker:
             speed = np.hypot(*now.velocity.T)
             sigma = np.sqrt(np.trace(now.P_velocity, axis1=1, axis2=2) / 2)
             columns.has_moved[t] |= ((speed > MOVING) & (speed > 3 * sigma))[t]
+
+    def _update_range_rate(
+        self, observed: Observed, rows: IntArray, ids: IntArray, label: StrArray, delay: float
+    ) -> None:
+        """After the position, which says where the line of sight is: the range rates of detections `rows` of tracks."""
+        measured = np.isfinite(observed.range_rate[rows])
+        if observed.viewpoint is None or not measured.any():
+            return
+        rows, ids, label = rows[measured], ids[measured], label[measured]
+        rate, variance = observed.range_rate[rows], observed.range_rate_variance[rows]
+        self._state.update_range_rate(ids, label, rate, variance, observed.viewpoint - self._origin, delay)
 
     def _believe(
         self, observed: Observed, matching: Matching, sensor: Sensor, frame: Frame, elapsed: float, delay: float
@@ -253,6 +265,7 @@ class Tracker:
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
         self._state.add(ids, boxes.label, newborn(observed, born, self._origin, self.settings.classes), delay)
+        self._update_range_rate(observed, born, ids, boxes.label, delay)
         confirmed, accepted = p >= self.settings.existence.confirm, self.sensor(sensor).births == "alone"
         seen = self._time - delay
         self._columns = self._columns.extended(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_tools.simulator.sensors import detection_probability, in_view, observe
-from data_tools.simulator.settings import SensorSettings, camera, lidar
+from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
 from saga_fg.arrays import FloatArray
 from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
@@ -127,3 +127,17 @@ def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> N
 def test_settings_without_sense_are_refused(change: dict[str, float], text: str) -> None:
     with pytest.raises(InputError, match=text):
         replace(lidar(), **change)
+
+
+def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() -> None:
+    sensor = replace(radar(), position=(0.0, 0.0, 0.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
+    bearing, noise = 0.5, sensor.range_rate_noise
+    assert noise is not None
+    truth = cars(30.0 * np.array([[np.cos(bearing), np.sin(bearing)]]))
+    found = detections(sensor, truth, frames=3000)
+    error = np.concatenate([d.range_rate for d in found]) - 5.0 * math.cos(bearing)
+    assert within(error.mean(), 0.0, noise / math.sqrt(3000))
+    assert within(error.std(), noise, noise / math.sqrt(6000))
+    assert all(np.isnan(d.boxes.size).all() and np.isnan(d.boxes.yaw).all() for d in found)
+    false = detections(replace(sensor, clutter_rate=5.0), Boxes.empty())
+    assert np.abs(np.concatenate([d.range_rate for d in false])).max() < 6 * noise
