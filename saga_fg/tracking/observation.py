@@ -21,7 +21,7 @@ UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 class Observed:
     """m detections: boxes (world), probability (m,), R (m, 4, 4) of position and velocity, standard deviations (m,) of
     height (m) and heading (rad), whether the velocity was measured (m,), rows (m,) in the frame's detections, range
-    rate (m,), m/s, NaN where not to be used, its variance (m,), and the place (2,), world, it was seen from, if known."""
+    rate (m,), m/s, NaN where not to be used, its variance (m,), and the place (2,), world, it was seen from."""
 
     boxes: Boxes
     probability: FloatArray

@@ -45,7 +45,7 @@ def test_a_frame_is_read_with_all_its_fields():
             "ego": {"x": 10, "y": 20, "yaw": 0.5},
             "detections": [
                 {"x": 1, "y": 2, "z": 0.5, "length": 4, "width": 2, "height": 1.5, "yaw": 0.1, "vx": 3, "vy": -1,
-                 "label": "truck", "score": 0.25},
+                 "range_rate": -2.5, "label": "truck", "score": 0.25},
                 {"x": -1, "y": 0},
             ],
         }
@@ -64,6 +64,7 @@ def test_a_frame_is_read_with_all_its_fields():
     np.testing.assert_array_equal(boxes.size, [[4, 2, 1.5], [np.nan] * 3])
     np.testing.assert_array_equal(boxes.velocity, [[3, -1], [np.nan] * 2])
     np.testing.assert_array_equal(read.detections.score, [0.25, 1.0])
+    np.testing.assert_array_equal(read.detections.range_rate, [-2.5, np.nan])
 
 
 @pytest.mark.parametrize(
