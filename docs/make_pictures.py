@@ -8,6 +8,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from concept_pictures import write_concept_pictures
+
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.demo import run_demo
@@ -29,7 +31,8 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the demonstration, and of a drive down a simulated street."""
+    """The pictures of the concepts, of the demonstration, and of a drive down a simulated street."""
+    write_concept_pictures(HERE)
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")
