@@ -1,9 +1,9 @@
 """The LiDAR scans of a KITTI tracking sequence: velodyne/NNNN/KKKKKK.bin, one for each frame that has one.
 
 The Velodyne turns clockwise, ten times a second, and looks ahead when the cameras are triggered, which is the time of
-the frame. Its points carry no times; those of their azimuths are given here. The scans as recorded are not compensated
-for the vehicle's motion. Sources: Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013; KISS-ICP, which
-takes the azimuths for times as well.
+the frame. Its points carry no times; those of their azimuths are given here, for scans that are not compensated for the
+vehicle's motion. A copy of the dataset does not say whether its scans are: `timed=False` leaves the times out. Sources:
+Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013; KISS-ICP, which takes azimuths for times as well.
 """
 
 from __future__ import annotations
