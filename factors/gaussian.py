@@ -59,7 +59,7 @@ def gaussian_factor(
 def gaussian_factors(
     keys: ArrayLike, blocks: Sequence[ArrayLike], rhs: ArrayLike, covariances: ArrayLike
 ) -> list[gtsam.JacobianFactor]:
-    """Return n factors of the same shape, || sum_k blocks[k][i] x(keys[i, k]) - rhs[i] ||_covariances[i], i = 1..n.
+    """Return n factors of the same shape, || sum_k `blocks[k][i]` x(keys[i, k]) - rhs[i] ||_covariances[i], i = 1..n.
 
     keys: (n, k), distinct within a row; blocks[k]: (n, m, d_k); rhs: (n, m); covariances: (n, m, m) or one (m, m) for
     all. Whitening and checks are done for all at once, which is what makes them cheap. Raises `FactorError`.
