@@ -44,4 +44,7 @@ def _loaded(path: Path, wanted: Collection[str] | None) -> NDArray[Any] | tuple[
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a broken file ends in whatever the parts of NumPy's reader happen to raise
-        raise InputError(f"expected NumPy's format, with plain arrays: {_first_line(error)}") from error
+        reason = _first_line(error)
+        if "pickle" in reason:  # NumPy would advise to trust the file
+            raise InputError("expected NumPy's format, with plain arrays and no pickled objects") from error
+        raise InputError(f"expected NumPy's format, with plain arrays: {reason}") from error

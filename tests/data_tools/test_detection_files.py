@@ -235,7 +235,7 @@ BROKEN_NPZ: list[tuple[dict[str, Any], str]] = [
     ({"empty": [False] * 4}, "row 2: x: expected a finite number of metres, got nan"),
     (
         {"label": np.array(["a", 1, None, "b"], dtype=object)},
-        "expected NumPy's format, with plain arrays: Object arrays",
+        "expected NumPy's format, with plain arrays and no pickled objects",
     ),
 ]
 
