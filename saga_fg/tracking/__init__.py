@@ -8,6 +8,7 @@ from saga_fg.tracking.settings import (
     ClassSettings,
     EstimatorName,
     ExistenceSettings,
+    FlowSettings,
     GreedySettings,
     TrackerSettings,
 )
@@ -18,6 +19,7 @@ __all__ = [
     "ClassSettings",
     "EstimatorName",
     "ExistenceSettings",
+    "FlowSettings",
     "GreedySettings",
     "GreedyTracker",
     "Journal",

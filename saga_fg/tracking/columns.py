@@ -24,6 +24,7 @@ class TrackColumns:
     has_moved     (n,) was ever seen moving
     looks, hits   (n,) how often a sensor looked where it was, and how often it was detected
     accepted      (n,) born from a sensor that is trusted alone, or confirmed since
+    ready         (n,) its velocity was once known well enough to be reported
     """
 
     id: IntArray
@@ -37,6 +38,7 @@ class TrackColumns:
     looks: FloatArray
     hits: FloatArray
     accepted: BoolArray
+    ready: BoolArray
 
     @classmethod
     def empty(cls) -> Self:
@@ -68,6 +70,7 @@ class TrackColumns:
             np.ones(k),
             np.ones(k),
             np.full(k, accepted),
+            np.zeros(k, dtype=bool),
         )
 
     def select(self, rows: IntArray | BoolArray) -> Self:

@@ -100,6 +100,23 @@ class ExistenceSettings:
 
 
 @dataclass(frozen=True)
+class FlowSettings:
+    """What a new track takes over from traffic that heads the same way, see `saga_fg.tracking.traffic_flow`."""
+
+    weight: float = setting(0.0, "what a neighbour counts for the speed of a new track against knowing nothing; 0: off")
+    ahead_scale: float = setting(15.0, "sigma of the kernel on the distance along the heading, m")
+    lateral_scale: float = setting(2.0, "sigma of the kernel on the distance across the heading, m")
+    heading_scale: float = setting(0.3, "sigma of the kernel on the difference of headings, rad")
+    spread: float = setting(2.0, "standard deviation of the difference between the speeds of neighbours, m/s")
+    known_speed: float = setting(1.5, "tracks whose speed is less certain than this teach nothing, m/s")
+    memory: float = setting(5.0, "where tracks passed is remembered for this long, s")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "weight", "spread", "memory")
+        require_positive(self, "ahead_scale", "lateral_scale", "heading_scale", "known_speed", infinite=True)
+
+
+@dataclass(frozen=True)
 class TrackerSettings:
     """Everything the tracker can be told; `edges` empty is the classical filter of independent objects."""
 
@@ -117,6 +134,11 @@ class TrackerSettings:
     lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
+    flow: FlowSettings = settings_group(FlowSettings, "the speed of new tracks from traffic around them")
+    report_speed_known: float = setting(
+        math.inf,
+        "a track is first reported when the standard deviation of its velocity is below this, m/s; .inf: at once",
+    )
     score_memory: float = setting(0.15, "what a sensor said of a track counts for its score for this long, s")
     confirmations: int = setting(3, "detections that confirm a track born of a weak sensor; another sensor's one does")
     unconfirmed_share: float = setting(
@@ -128,7 +150,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting", "score_memory")
-        require_positive(self, "max_out_of_view", infinite=True)
+        require_positive(self, "max_out_of_view", "report_speed_known", infinite=True)
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))

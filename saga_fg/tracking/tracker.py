@@ -35,6 +35,7 @@ from saga_fg.tracking.observation import Observed, observe
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
+from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +87,7 @@ class Tracker:
         self._columns = TrackColumns.empty()
         none = np.empty(0)
         self._evidence = SensorEvidence()
+        self._flow = TrafficFlow(self.settings.flow)
         self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
 
     def step(self, frame: Frame) -> Tracks:
@@ -113,12 +115,14 @@ class Tracker:
         self._tell("update", frame, observed, matching)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
         self._tell("believe", frame, observed, matching)
+        self._watch_traffic(matching)
         born = self._bear(observed, matching, frame.sensor, delay)
         self._tell("births", frame, observed, matching, born)
         rows = np.concatenate([matching.detection, born])
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self._columns.id) - len(born) :]])
         self.assignment = Assignment(ids, observed.row[rows])
         self._bury()
+        self._columns.ready |= self._speed_deviation() <= self.settings.report_speed_known
         self._tell("deaths", frame, observed, matching)
         tracks = self._report(self._time)
         self._tell("report", frame, observed, matching)
@@ -207,8 +211,7 @@ class Tracker:
             now = self._kinematics()
             self._box.face_motion(now.velocity)
             speed = np.hypot(*now.velocity.T)
-            sigma = np.sqrt(np.trace(now.P_velocity, axis1=1, axis2=2) / 2)
-            columns.has_moved[t] |= ((speed > MOVING) & (speed > 3 * sigma))[t]
+            columns.has_moved[t] |= ((speed > MOVING) & (speed > 3 * self._speed_deviation()))[t]
 
     def _update_range_rate(
         self, observed: Observed, rows: IntArray, ids: IntArray, label: StrArray, delay: float
@@ -251,6 +254,32 @@ class Tracker:
         columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
 
+    def _watch_traffic(self, matching: Matching) -> None:
+        """Where detected tracks pass, for those that are born after them."""
+        if self.settings.flow.weight == 0:
+            return
+        rows, now = matching.track, self._kinematics()
+        yaw = self._box.yaw[rows]
+        ahead = np.nan_to_num(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1))
+        speed = np.einsum("ni,ni->n", ahead, now.velocity[rows])
+        variance = np.einsum("ni,nij,nj->n", ahead, now.P_velocity[rows], ahead)
+        columns = self._columns
+        self._flow.pass_by(
+            Passages(
+                columns.id[rows],
+                columns.label[rows],
+                now.position[rows] + self._origin,
+                yaw,
+                speed,
+                variance,
+                np.full(len(rows), self._time),
+            )
+        )
+
+    def _speed_deviation(self) -> FloatArray:
+        """(n,) standard deviation of the velocity in a mean direction, m/s."""
+        return np.asarray(np.sqrt(np.trace(self._kinematics().P_velocity, axis1=1, axis2=2) / 2))
+
     def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
 
@@ -264,7 +293,8 @@ class Tracker:
         boxes, p = observed.boxes.select(born), observed.probability[born]
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
-        self._state.add(ids, boxes.label, newborn(observed, born, self._origin, self.settings.classes), delay)
+        kinematics = newborn(observed, born, self._origin, self.settings.classes, self._flow)
+        self._state.add(ids, boxes.label, kinematics, delay)
         self._update_range_rate(observed, born, ids, boxes.label, delay)
         confirmed, accepted = p >= self.settings.existence.confirm, self.sensor(sensor).births == "alone"
         seen = self._time - delay
@@ -298,6 +328,7 @@ class Tracker:
             (columns.accepted | (settings.unconfirmed_share > 0))
             & (columns.confirmed | (columns.existence >= settings.existence.report))
             & (coasting <= settings.report_coasting)
+            & columns.ready
         )
         rows = np.flatnonzero(shown)
         position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())

@@ -1,0 +1,114 @@
+"""Speeds of new tracks from the traffic around them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from traffic_frames import frame
+
+from saga_fg import Tracker, TrackerSettings
+from saga_fg.tracking import FlowSettings
+from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
+
+ON = FlowSettings(weight=5.0)
+
+
+def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="car"):
+    n = len(position)
+    return Passages(
+        np.arange(n) if ids is None else np.array(ids),
+        np.full(n, label),
+        np.array(position, dtype=float),
+        np.array(heading, dtype=float),
+        np.array(speed, dtype=float),
+        np.full(n, variance),
+        np.full(n, time),
+    )
+
+
+def speed_at(flow, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
+    mean, variances = flow.speed(
+        np.array([label]), np.array([position]), np.array([heading]), np.array([variance], dtype=float)
+    )
+    return mean[0], variances[0]
+
+
+def remembering(*tables, settings=ON):
+    flow = TrafficFlow(settings)
+    for table in tables:
+        flow.pass_by(table)
+    return flow
+
+
+def test_a_neighbour_in_the_same_place_gives_the_mean_and_variance_of_the_mixture():
+    mean, variance = speed_at(remembering(passages([(0, 0)], [0.0], [12.0])))
+    assert mean == pytest.approx(5 * 12 / 6)
+    assert variance == pytest.approx((25 + 5 * (144 + 0.1 + ON.spread**2)) / 6 - mean**2)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        passages([(0, 0)], [np.pi], [12.0]),
+        passages([(0, 12)], [0.0], [12.0]),
+        passages([(0, 0)], [np.nan], [12.0]),
+        passages([(0, 0)], [0.0], [12.0], variance=100.0),
+        passages([(0, 0)], [0.0], [12.0], label="pedestrian"),
+    ],
+    ids=["oncoming", "other lane", "no heading", "speed unknown", "other class"],
+)
+def test_who_tells_nothing_of_the_speed_leaves_it_unknown(other):
+    assert speed_at(remembering(other)) == (pytest.approx(0.0, abs=1e-4), pytest.approx(25.0, abs=1e-3))
+
+
+def test_neighbours_that_disagree_make_the_speed_uncertain():
+    agreed = speed_at(remembering(passages([(5, 0), (-5, 0)], [0, 0], [12, 12])))
+    split = speed_at(remembering(passages([(5, 0), (-5, 0)], [0, 0], [0, 24])))
+    assert split[0] == pytest.approx(agreed[0])
+    assert split[1] > agreed[1] + 50
+
+
+def test_a_track_counts_once_however_often_it_was_seen():
+    once = remembering(passages([(1, 0)], [0.0], [12.0]))
+    often = remembering(*(passages([(1 + 5 * k, 0)], [0.0], [12.0 + k], time=-0.1 * k, ids=[0]) for k in (3, 2, 1, 0)))
+    assert speed_at(often) == pytest.approx(speed_at(once))
+
+
+def test_passages_are_forgotten():
+    late = passages([(500, 0)], [0.0], [3.0], time=ON.memory + 0.1, ids=[7])
+    assert speed_at(remembering(passages([(0, 0)], [0.0], [12.0]), late))[0] == pytest.approx(0.0, abs=1e-9)
+
+
+@given(turn=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))
+def test_the_world_may_be_turned_and_moved(turn, x, y):
+    c, s = np.cos(turn), np.sin(turn)
+    turned = np.array([(8.0, 1.0), (-3.0, 0.5)]) @ np.array([[c, s], [-s, c]]) + (x, y)
+    here = speed_at(remembering(passages([(8, 1), (-3, 0.5)], [0.1, -0.2], [9, 14])))
+    there = speed_at(remembering(passages(turned, [0.1 + turn, turn - 0.2], [9, 14])), (x, y), turn)
+    assert there == pytest.approx(here, abs=1e-6)
+
+
+def behind_a_leader(settings, newcomer=True):
+    """A car at 12 m/s followed for 2 s; then another appears 15 m behind it. Tracks of the last frame."""
+    tracker = Tracker(settings)
+    for k in range(21):
+        cars = [(12.0 * 0.1 * k, 0.0)] + [(12.0 * 2.0 - 15.0, 0.0)] * (newcomer and k == 20)
+        tracks = tracker.step(frame(0.1 * k, cars))
+    return tracks
+
+
+def test_a_car_that_appears_behind_another_starts_at_its_speed_with_less_doubt():
+    on = behind_a_leader(TrackerSettings(edges=(), flow=ON))
+    off = behind_a_leader(TrackerSettings(edges=()))
+    assert off.boxes.velocity[1] == pytest.approx([0.0, 0.0])
+    assert on.boxes.velocity[1] == pytest.approx([9.0, 0.0], abs=1.5)
+    assert np.trace(on.velocity_covariance[1]) > 10, "it may be parked all the same"
+    np.testing.assert_array_equal(on.boxes.position[0], off.boxes.position[0])
+
+
+def test_reports_wait_until_the_velocity_is_known():
+    waiting = TrackerSettings(edges=(), report_speed_known=1.5)
+    assert behind_a_leader(waiting).id.tolist() == [1]
+    assert behind_a_leader(replace(waiting, report_speed_known=np.inf)).id.tolist() == [1, 2]
