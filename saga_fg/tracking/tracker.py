@@ -45,7 +45,7 @@ class Snapshot:
     """A tracker at one moment, see `Tracker.snapshot`."""
 
     state: Any
-    own: tuple[TrackColumns, BoxFilter, SensorEvidence]
+    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow]
     numbers: tuple[float, FloatArray, int, int]
     graph: SceneGraph | None
     assignment: Assignment
@@ -150,14 +150,14 @@ class Tracker:
 
     def snapshot(self) -> Snapshot:
         """All that the tracker knows; what it does later leaves it as it is."""
-        own = copy.deepcopy((self._columns, self._box, self._evidence))
+        own = copy.deepcopy((self._columns, self._box, self._evidence, self._flow))
         numbers = (self._time, self._origin, self._next_id, self.late_frames)
         return Snapshot(self._state.snapshot(), own, numbers, self.graph, self.assignment)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from where a tracker of the same settings was; as often as wanted from one snapshot."""
         self._state.restore(snapshot.state)
-        self._columns, self._box, self._evidence = copy.deepcopy(snapshot.own)
+        self._columns, self._box, self._evidence, self._flow = copy.deepcopy(snapshot.own)
         self._time, self._origin, self._next_id, self.late_frames = snapshot.numbers
         self.graph, self.assignment = snapshot.graph, snapshot.assignment
 

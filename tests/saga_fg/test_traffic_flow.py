@@ -112,3 +112,15 @@ def test_reports_wait_until_the_velocity_is_known():
     waiting = TrackerSettings(edges=(), report_speed_known=1.5)
     assert behind_a_leader(waiting).id.tolist() == [1]
     assert behind_a_leader(replace(waiting, report_speed_known=np.inf)).id.tolist() == [1, 2]
+
+
+def test_a_snapshot_remembers_the_traffic():
+    settings = TrackerSettings(edges=(), flow=ON)
+    tracker, fresh = Tracker(settings), Tracker(settings)
+    for k in range(20):
+        tracker.step(frame(0.1 * k, [(1.2 * k, 0.0)]))
+    fresh.restore(tracker.snapshot())
+    later = frame(2.0, [(24.0, 0.0), (9.0, 0.0)])
+    expected = tracker.step(later).boxes.velocity
+    assert expected[1, 0] > 5
+    np.testing.assert_array_equal(fresh.step(later).boxes.velocity, expected)
