@@ -3,7 +3,8 @@
 size      running mean weighted by detection probability
 height    scalar Kalman filter, random walk
 heading   scalar Kalman filter on the circle, random walk; a detector's heading may be off by half a turn, so that a
-          measurement is first turned to the side of the estimate, and the estimate to the side of the motion
+          measurement is first turned to the side of the estimate. On which side is the front, the detections vote,
+          each with its probability, and a clear motion decides
 """
 
 from __future__ import annotations
@@ -17,11 +18,15 @@ from saga_fg.geometry import wrap_angle
 
 HEIGHT_DRIFT = 0.1  # standard deviation after one second, m
 MOVING = 2.0  # speed from which the motion tells front from rear, m/s
+MOST_VOTES = 5.0  # that the past has, so that it can be outvoted
 
 
 @dataclass(eq=False)
 class BoxFilter:
-    """Columns over n tracks: size (n, 3), size_weight (n,), z, z_variance, yaw, yaw_variance (n,); NaN is unknown."""
+    """Columns over n tracks: size (n, 3), size_weight, z, z_variance, yaw, yaw_variance, votes (n,); NaN is unknown.
+
+    votes: for the front being where yaw points, less those against it; >= 0
+    """
 
     size: FloatArray
     size_weight: FloatArray
@@ -29,6 +34,12 @@ class BoxFilter:
     z_variance: FloatArray
     yaw: FloatArray
     yaw_variance: FloatArray
+    votes: FloatArray
+
+    @classmethod
+    def empty(cls) -> BoxFilter:
+        none = np.empty(0)
+        return cls(np.empty((0, 3)), none, none, none, none, none, none)
 
     @classmethod
     def born(
@@ -42,7 +53,8 @@ class BoxFilter:
     ) -> BoxFilter:
         """Filters of new tracks from their first detections; noises are standard deviations."""
         known = np.isfinite(size).all(axis=1)
-        return cls(size.copy(), np.where(known, weight, 0.0), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2)
+        votes = np.where(np.isfinite(yaw), weight, 0.0)
+        return cls(size.copy(), np.where(known, weight, 0.0), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2, votes)
 
     def select(self, rows: IntArray | BoolArray) -> BoxFilter:
         return BoxFilter(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -74,19 +86,28 @@ class BoxFilter:
         gain = self.z_variance[rows] / (self.z_variance[rows] + z_noise**2)
         self.z[rows] += gain * (z - self.z[rows])
         self.z_variance[rows] *= 1 - gain
-        self._update_yaw(rows, yaw, yaw_noise**2)
+        self._update_yaw(rows, yaw, yaw_noise**2, weight)
 
-    def _update_yaw(self, rows: IntArray, yaw: FloatArray, variance: FloatArray) -> None:
-        rows, yaw, variance = rows[np.isfinite(yaw)], yaw[np.isfinite(yaw)], variance[np.isfinite(yaw)]
+    def _update_yaw(self, rows: IntArray, yaw: FloatArray, variance: FloatArray, weight: FloatArray) -> None:
+        measured = np.isfinite(yaw)
+        rows, yaw, variance, weight = rows[measured], yaw[measured], variance[measured], weight[measured]
         first = ~np.isfinite(self.yaw[rows])
         self.yaw[rows[first]], self.yaw_variance[rows[first]] = yaw[first], variance[first]
         difference = wrap_angle(yaw - self.yaw[rows])
-        difference = np.where(np.abs(difference) > np.pi / 2, wrap_angle(difference + np.pi), difference)
+        against = np.abs(difference) > np.pi / 2
+        difference = np.where(against, wrap_angle(difference + np.pi), difference)
         gain = np.where(first, 0.0, self.yaw_variance[rows] / (self.yaw_variance[rows] + variance))
         self.yaw[rows] = wrap_angle(self.yaw[rows] + gain * difference)
         self.yaw_variance[rows] *= 1 - gain
+        self.votes[rows] = np.minimum(self.votes[rows] + np.where(against, -weight, weight), MOST_VOTES)
+        self._turn(self.votes < 0)
 
     def face_motion(self, velocity: FloatArray) -> None:
-        """Turn headings round that point against a clear motion; velocity (n, 2)."""
+        """Turn headings round that point against a clear motion; velocity (n, 2), zero where it is not clear."""
         along = np.cos(self.yaw) * velocity[:, 0] + np.sin(self.yaw) * velocity[:, 1]
-        self.yaw = np.where(along < -MOVING, wrap_angle(self.yaw + np.pi), self.yaw)
+        self._turn(along < -MOVING)
+        self.votes = np.where(np.abs(along) > MOVING, MOST_VOTES, self.votes)
+
+    def _turn(self, rows: BoolArray) -> None:
+        self.yaw = np.where(rows, wrap_angle(self.yaw + np.pi), self.yaw)
+        self.votes = np.abs(self.votes)

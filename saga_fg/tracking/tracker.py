@@ -85,10 +85,9 @@ class Tracker:
         self._origin = np.zeros(2)
         self._next_id = 1
         self._columns = TrackColumns.empty()
-        none = np.empty(0)
         self._evidence = SensorEvidence()
         self._flow = TrafficFlow(self.settings.flow)
-        self._box = BoxFilter(np.empty((0, 3)), none, none, none, none, none)
+        self._box = BoxFilter.empty()
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far."""
@@ -209,9 +208,10 @@ class Tracker:
         )
         if len(columns.id):
             now = self._kinematics()
-            self._box.face_motion(now.velocity)
             speed = np.hypot(*now.velocity.T)
-            columns.has_moved[t] |= ((speed > MOVING) & (speed > 3 * self._speed_deviation()))[t]
+            moves = (speed > MOVING) & (speed > 3 * self._speed_deviation())
+            self._box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
+            columns.has_moved[t] |= moves[t]
 
     def _update_range_rate(
         self, observed: Observed, rows: IntArray, ids: IntArray, label: StrArray, delay: float

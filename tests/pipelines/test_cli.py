@@ -114,7 +114,10 @@ def test_names_are_split_at_commas() -> None:
 def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
     """Interrupted while it works: exit code 130, one line, no file and no temporary."""
     command = [*SAGA_FG, "demo", "--output", str(tmp_path / "out"), "--scenes", "50"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells let background jobs ignore it
+    )  # fmt: skip
     while not list(tmp_path.iterdir()) and process.poll() is None:  # the temporary folder: the work has begun
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)

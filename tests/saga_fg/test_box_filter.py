@@ -118,3 +118,24 @@ def test_only_the_rows_named_are_touched():
     assert box.z[1] > 3.0
     chosen = box.select(np.array([True, False, True]))
     assert chosen.yaw.tolist() == [0.0, 1.0]
+
+
+def test_the_front_is_where_most_detections_say_it_is():
+    box = born(yaw=3.0, weight=0.9)  # the first one is wrong
+    update(box, yaw=3.0 - np.pi, weight=0.8)
+    assert float(wrap_angle(box.yaw[0] - 3.0)) == pytest.approx(0, abs=1e-9)
+    update(box, yaw=3.0 - np.pi, weight=0.8)
+    assert float(wrap_angle(box.yaw[0] - 3.0)) == pytest.approx(-np.pi, abs=1e-9)
+    for _ in range(20):
+        update(box, yaw=3.0 - np.pi, weight=0.9)
+    update(box, yaw=3.0, weight=0.9)  # one wrong one changes nothing
+    assert float(wrap_angle(box.yaw[0] - 3.0)) == pytest.approx(-np.pi, abs=1e-9)
+
+
+def test_a_clear_motion_outvotes_the_detections():
+    box = born(yaw=0.0, weight=0.9)
+    box.face_motion(np.array([[-5.0, 0.0]]))
+    update(box, yaw=0.0, weight=0.9)
+    assert abs(float(wrap_angle(box.yaw[0]))) == pytest.approx(np.pi)
+    box.face_motion(np.zeros((1, 2)))
+    assert abs(float(wrap_angle(box.yaw[0]))) == pytest.approx(np.pi)

@@ -30,6 +30,9 @@ def observed(found, probability, noise=0.3):
         with_velocity=flat.astype(bool),
         z_noise=flat,
         yaw_noise=flat,
+        range_rate=np.full(n, np.nan),
+        range_rate_variance=flat,
+        viewpoint=None,
     )
 
 
