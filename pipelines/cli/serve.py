@@ -15,7 +15,7 @@ from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOpt
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.serving import Address
+    from pipelines.serving import Address, StreamTracker
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 
@@ -52,10 +52,22 @@ def serve(
       saga-fg serve --listen 127.0.0.1:7447 --reorder 0.1
       saga-fg status
     """
-    from pipelines.serving import SocketServer, StreamSettings, StreamTracker, parse_address, serve_pipe
+    from threadpoolctl import threadpool_limits
+
+    from pipelines.serving import StreamSettings, StreamTracker
 
     settings = configured("file", config, method, estimator, lag)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), StreamSettings(reorder=reorder))
+    # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
+    with threadpool_limits(limits=1, user_api="blas"):
+        _serve(stream, listen, allow_remote)
+    typer.echo(_summary(stream.status()), err=True)
+
+
+def _serve(stream: StreamTracker[Any], listen: str | None, allow_remote: bool) -> None:
+    """Until the source ends or the service is told to stop."""
+    from pipelines.serving import SocketServer, parse_address, serve_pipe
+
     if listen is None:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # as an interrupt: finish what has come in
         try:
@@ -68,7 +80,6 @@ def serve(
         if not address.is_local and not allow_remote:
             raise InputError(f"--listen {listen}: other machines could connect there; --allow-remote if that is meant")
         SocketServer(stream, address, _say_ready).run()
-    typer.echo(_summary(stream.status()), err=True)
 
 
 def status(

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from threadpoolctl import threadpool_limits
-
 from pipelines.bench.measuring import resident_memory
 from pipelines.serving.clock import Clock
 from pipelines.serving.latency import Latencies
@@ -140,8 +138,7 @@ class StreamTracker(Generic[Client]):
 
     def _step(self, held: _Held[Client]) -> tuple[Client, Answer]:
         try:
-            with threadpool_limits(1, user_api="blas"):
-                tracks = self._tracker.step(held.message.frame)
+            tracks = self._tracker.step(held.message.frame)
         except InputError as error:
             return held.client, self.refused(error) | about(held.message)
         answer = tracks_message(tracks, held.message)
