@@ -3,7 +3,7 @@
 from data_tools.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES
 from data_tools.nuscenes.dataset import NuScenes
 from data_tools.nuscenes.result_files import ResultMeta
-from data_tools.nuscenes.scored_scenes import read_scored_scenes
+from data_tools.nuscenes.scored_scenes import ScoredScene, read_scored_scenes
 from data_tools.nuscenes.splits import split_scenes
 from data_tools.nuscenes.tracking_results import (
     TrackedBoxes,
@@ -19,6 +19,7 @@ __all__ = [
     "TRACKING_CLASSES",
     "NuScenes",
     "ResultMeta",
+    "ScoredScene",
     "TrackedBoxes",
     "TrackingResults",
     "merge_tracking_results",

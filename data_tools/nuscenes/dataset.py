@@ -32,6 +32,7 @@ class NuScenes:
     detections         sensor name -> detection-result JSON (official format)
     scenes             names of the scenes to read, None for all
     ground_truth       whether to read the annotations as well
+    folder, records    of the tables: where they are, and the chosen scenes by name
 
     Everything is read and checked at construction; only the chosen scenes are kept. A sample that a detection file does
     not list was not looked at by that sensor and gets no frame (a list without boxes gives an empty frame).
@@ -47,10 +48,10 @@ class NuScenes:
         ground_truth: bool = False,
     ) -> None:
         self._dataroot, self._version = dataroot, version
-        folder = table_folder(dataroot, version)
+        self.folder = folder = table_folder(dataroot, version)
         tables = read_scenes(folder, scenes)
-        self._records: dict[str, SceneRecord] = tables.records
-        wanted = {token for record in self._records.values() for token in record.tokens}
+        self.records: dict[str, SceneRecord] = tables.records
+        wanted = {token for record in self.records.values() for token in record.tokens}
         self._paths = {sensor: Path(path) for sensor, path in detections.items()}
         self._results: dict[str, ResultFile] = {}
         for sensor, path in self._paths.items():
@@ -61,16 +62,16 @@ class NuScenes:
                     "%s: lists %d of %d samples, the others get no frame", path, len(wanted) - missing, len(wanted)
                 )
         if scenes is not None:
-            for name in self._records:
+            for name in self.records:
                 self._check_seen(name)
         self._annotations: dict[str, list[Annotations]] | None = (
-            read_annotations(folder, self._records) if ground_truth else None
+            read_annotations(folder, self.records) if ground_truth else None
         )
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """The names of the chosen scenes, in the order they were given or, without a choice, of the table."""
-        return tuple(self._records)
+        return tuple(self.records)
 
     @property
     def meta(self) -> ResultMeta:
@@ -83,10 +84,10 @@ class NuScenes:
 
     def scene(self, name: str) -> Scene:
         """One of the chosen scenes; raises `InputError` for another name."""
-        if name not in self._records:
+        if name not in self.records:
             raise InputError(f"{self._dataroot}: {unknown('scene', name, self.scenes)}")
         self._check_seen(name)
-        record = self._records[name]
+        record = self.records[name]
         frames = [
             frame
             for token, time, pose in zip(record.tokens, record.timestamps.tolist(), record.world_T_ego, strict=True)
@@ -106,7 +107,7 @@ class NuScenes:
         return frames
 
     def _check_seen(self, name: str) -> None:
-        tokens = self._records[name].tokens
+        tokens = self.records[name].tokens
         for sensor, result in self._results.items():
             if not any(token in result.boxes.rows for token in tokens):
                 raise InputError(

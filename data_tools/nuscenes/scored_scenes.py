@@ -2,36 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from data_tools.metrics.nuscenes_tracking import NuScenesTrackingScene
 from data_tools.metrics.track_table import TrackTable
-from data_tools.nuscenes.annotations import read_annotations
 from data_tools.nuscenes.bicycle_racks import read_bicycle_racks
-from data_tools.nuscenes.scenes import SceneRecord, read_scenes
-from data_tools.nuscenes.tables import table_folder
+from data_tools.nuscenes.dataset import NuScenes
+from data_tools.nuscenes.scenes import SceneRecord
 from data_tools.nuscenes.tracking_results import MAX_BOXES, TrackingResults, read_tracking_results
 from saga_fg.boxes import Boxes
-from saga_fg.dataset import Annotations
+from saga_fg.dataset import Annotations, Scene
 from saga_fg.errors import InputError
 
 
+@dataclass(frozen=True, eq=False)
+class ScoredScene:
+    """One scene: as recorded, with ground truth, and detections if they were given; and as the metrics compare it."""
+
+    scene: Scene
+    tracking: NuScenesTrackingScene
+
+
 def read_scored_scenes(
-    result: str | Path, dataroot: str | Path, version: str, scenes: Collection[str] | None = None
-) -> dict[str, NuScenesTrackingScene]:
+    result: str | Path,
+    dataroot: str | Path,
+    version: str,
+    scenes: Collection[str] | None = None,
+    detections: Mapping[str, str | Path] | None = None,
+) -> dict[str, ScoredScene]:
     """The chosen scenes by name (None: all), each with its ground truth and the tracks that file `result` has for it.
+
+    detections  files by sensor, as `NuScenes` takes them
 
     Raises `InputError` for missing or broken files, and for a result that lacks a sample of these scenes or has more
     than 500 boxes in one: the official evaluation takes neither.
     """
-    folder = table_folder(dataroot, version)
-    records = read_scenes(folder, scenes).records
+    dataset = NuScenes(dataroot, version, detections or {}, scenes, ground_truth=True)
     found = read_tracking_results(result)
-    truth, racks = read_annotations(folder, records), read_bicycle_racks(folder, records)
-    return {name: _scored(str(result), record, truth[name], racks[name], found) for name, record in records.items()}
+    racks = read_bicycle_racks(dataset.folder, dataset.records)
+    read = {name: dataset.scene(name) for name in dataset.scenes}
+    return {
+        name: ScoredScene(
+            scene, _scored(str(result), dataset.records[name], scene.ground_truth or (), racks[name], found)
+        )
+        for name, scene in read.items()
+    }
 
 
 def _scored(

@@ -81,7 +81,7 @@ def parity(python: str, result: Path, dataroot: Path, version: str, split: str) 
     with one_thread():
         begin = time.process_time()
         scored = read_scored_scenes(result, dataroot, version, split_scenes(dataroot, version, split))
-        ours = nuscenes_tracking_metrics(list(scored.values()))
+        ours = nuscenes_tracking_metrics([each.tracking for each in scored.values()])
         seconds = time.process_time() - begin
     theirs = official_figures(python, result, dataroot, version, split)
     where, difference = max(differences(ours, theirs.figures), key=lambda named: named[1])

@@ -84,13 +84,16 @@ class NuScenesSet:
             path = Path(folder) / "tracks.json"
             write_tracking_results(path, ((run.scene, run.tracks) for run in runs.values()), self.dataset.meta)
             scored = read_scored_scenes(path, self._dataroot, VERSION, tuple(runs))
-        scenes = list(scored.values())
+        scenes = [each.tracking for each in scored.values()]
 
         def figures_of(rows: Sequence[int]) -> dict[str, float]:
             f = nuscenes_tracking_metrics([scenes[row] for row in rows]).overall
             return {"AMOTA": f.amota, "AMOTP": f.amotp, "MOTA": f.mota, "IDS": f.ids, "FRAG": f.frag}
 
-        errors = (nuscenes_label_errors(scene, placed_detections(runs[name].scene)) for name, scene in scored.items())
+        errors = (
+            nuscenes_label_errors(scene, placed_detections(runs[name].scene))
+            for name, scene in zip(scored, scenes, strict=True)
+        )
         return Score(figures_of, tuple(errors))
 
 
@@ -121,7 +124,7 @@ class KittiSet:
                     figures |= {f"{name} sAMOTA": f.samota, f"{name} MOTA": f.mota, f"{name} IDS": float(f.ids)}
             return figures
 
-        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES, True) for each in scored.values()))
+        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()))
 
 
 class SimulatedSet:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
 
 import typer
 
@@ -15,6 +15,10 @@ from pipelines.cli.tables import JsonFile, show_tables
 from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
 from pipelines.figures import FigureTable
 from saga_fg.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.evaluation import KittiEvaluation, NuScenesEvaluation
+    from saga_fg.arrays import FloatArray
 
 evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
@@ -84,14 +88,17 @@ def nuscenes(
       saga-fg evaluate nuscenes tracks.json --dataroot data/nuscenes --split mini_train \\
           --detections lidar=megvii.json --hota --json figures.json
     """
+    from data_tools.nuscenes import read_scored_scenes
     from pipelines.evaluation import evaluate_nuscenes
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
     files = sensor_files(detections or [])
-    evaluation = _report(
-        lambda: evaluate_nuscenes(result, dataroot, version, chosen, files, hota, innovations), json_file
-    )
-    _draw(evaluation, plots)
+
+    def run() -> NuScenesEvaluation:
+        scored = read_scored_scenes(result, dataroot, version, chosen, files)
+        return evaluate_nuscenes(scored, hota, _innovations_of(result) if innovations else None)
+
+    _draw(_report(run, json_file), plots)
 
 
 @evaluate_app.command()
@@ -125,14 +132,17 @@ def kitti(
       saga-fg evaluate kitti results --dataroot data/kitti --sequences 0000,0011 --iou 0.5 \\
           --detections data/kitti/detections/pointrcnn --hota --json figures.json
     """
+    from data_tools.kitti.scored_sequences import read_scored_sequences
     from pipelines.evaluation import evaluate_kitti
 
     chosen = names("--sequences", sequences) if sequences is not None else None
     overlaps, labels = _overlaps(iou), names("--classes", classes)
-    evaluation = _report(
-        lambda: evaluate_kitti(result, dataroot, chosen, labels, overlaps, detections, hota, innovations), json_file
-    )
-    _draw(evaluation, plots)
+
+    def run() -> KittiEvaluation:
+        scored = read_scored_sequences(result, dataroot, chosen, detections)
+        return evaluate_kitti(scored, labels, overlaps, hota, _innovations_of(result) if innovations else None)
+
+    _draw(_report(run, json_file), plots)
 
 
 @evaluate_app.command()
@@ -237,6 +247,14 @@ def _report(run: Callable[[], AnyEvaluation], json_file: Path | None, doing: str
     if json_file is not None:
         write_figures(json_file, evaluation.figures())
     return evaluation
+
+
+def _innovations_of(result: Path) -> dict[str, FloatArray]:
+    """Those of the journal beside the result, by class."""
+    from pipelines.evaluation.innovations import journal_innovations
+    from pipelines.explaining import journal_of
+
+    return journal_innovations(journal_of(result))
 
 
 def _draw(evaluation: Drawn, plots: Path | None) -> None:

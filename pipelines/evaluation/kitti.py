@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_tools.kitti.scored_sequences import ScoredSequence, read_scored_sequences
+from data_tools.kitti.scored_sequences import ScoredSequence
 from data_tools.metrics import (
     KittiTrackingFigures,
     KittiTrackingSequence,
@@ -20,9 +19,8 @@ from data_tools.metrics import (
 )
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
-from pipelines.evaluation.innovations import innovation_json, innovation_table, journal_innovations
+from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.evaluation.placed_detections import placed_detections
-from pipelines.explaining import journal_of
 from pipelines.figures import FigureTable, cell
 from saga_fg.arrays import FloatArray
 
@@ -68,23 +66,18 @@ class KittiEvaluation:
 
 
 def evaluate_kitti(
-    result: str | Path,
-    dataroot: str | Path,
-    sequences: Collection[str] | None = None,
+    scored: Mapping[str, ScoredSequence],
     classes: Sequence[str] = CLASSES,
     ious: Sequence[float] = IOUS,
-    detections: str | Path | None = None,
     with_hota: bool = False,
-    with_innovations: bool = False,
+    innovations: Mapping[str, FloatArray] | None = None,
 ) -> KittiEvaluation:
-    """Score the results NNNN.txt of folder `result` in the chosen sequences (None: all it has).
+    """Score the tracks of the sequences that were read; errors are judged at the labels that their detections match.
 
-    detections  folder of the detections, to judge errors on the labels that they match
+    innovations  of the journal of the run, by class, to be among the figures
 
-    Raises `InputError` for missing or broken files; `MissingExtraError` for HOTA without trackeval.
-    Innovations are read from the journal beside the result.
+    Raises `MissingExtraError` for HOTA without trackeval.
     """
-    scored = read_scored_sequences(result, dataroot, sequences, detections)
     pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
     tracking: dict[str, ByIou] = {}
     for label in classes:
@@ -95,17 +88,17 @@ def evaluate_kitti(
     return KittiEvaluation(
         tuple(scored),
         tracking,
-        LabelErrors.pool(kitti_label_errors(each, classes, detections is not None) for each in scored.values()),
+        LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
         hota([(each.truth, each.found) for each in scored.values()], best) if with_hota else (),
-        journal_innovations(journal_of(Path(result))) if with_innovations else {},
+        innovations or {},
     )
 
 
-def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str], with_detections: bool) -> LabelErrors:
-    """The errors at all labels of the classes in one sequence."""
+def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str]) -> LabelErrors:
+    """The errors at the labels of the classes in one sequence: those that a detection matches, if there are any."""
     truth = scored.truth.select(np.flatnonzero(np.isin(scored.truth.boxes.label, classes)))
     velocity = label_velocities(truth, scored.scene.timestamps, REACH)
-    return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if with_detections else None)
+    return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if scored.scene.frames else None)
 
 
 def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:

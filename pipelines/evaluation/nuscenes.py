@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,13 +19,12 @@ from data_tools.metrics import (
     label_velocities,
     nuscenes_tracking_metrics,
 )
-from data_tools.nuscenes import NuScenes, read_scored_scenes
+from data_tools.nuscenes import ScoredScene
 from data_tools.plots import recall_sweep
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
-from pipelines.evaluation.innovations import innovation_json, innovation_table, journal_innovations
+from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.evaluation.placed_detections import PlacedBoxes, placed_detections
-from pipelines.explaining import journal_of
 from pipelines.figures import FigureTable, cell, count
 from saga_fg.arrays import FloatArray
 
@@ -71,34 +69,24 @@ class NuScenesEvaluation:
 
 
 def evaluate_nuscenes(
-    result: str | Path,
-    dataroot: str | Path,
-    version: str,
-    scenes: Collection[str] | None = None,
-    detections: Mapping[str, Path] | None = None,
-    with_hota: bool = False,
-    with_innovations: bool = False,
+    scored: Mapping[str, ScoredScene], with_hota: bool = False, innovations: Mapping[str, FloatArray] | None = None
 ) -> NuScenesEvaluation:
-    """Score the tracks of file `result` in the chosen scenes (None: all of the tables).
+    """Score the tracks of the scenes that were read; errors are judged at the labels that their detections match.
 
-    detections  files by sensor, to judge errors on the labels that they match
+    innovations  of the journal of the run, by class, to be among the figures
 
-    Raises `InputError` for missing or broken files, and for a result that lacks a sample of these scenes;
-    `MissingExtraError` for HOTA without trackeval. Innovations are read from the journal beside the result.
+    Raises `MissingExtraError` for HOTA without trackeval.
     """
-    scored = read_scored_scenes(result, dataroot, version, scenes)
-    seen: dict[str, PlacedBoxes] = {}
-    if detections:
-        dataset = NuScenes(dataroot, version, detections, tuple(scored))
-        seen = {name: placed_detections(dataset.scene(name)) for name in scored}
-    tracking = nuscenes_tracking_metrics(list(scored.values()))
-    pairs = [(_in_range(scene, scene.truth), _in_range(scene, scene.found)) for scene in scored.values()]
+    tracking = nuscenes_tracking_metrics([each.tracking for each in scored.values()])
     return NuScenesEvaluation(
         tuple(scored),
         tracking,
-        LabelErrors.pool(nuscenes_label_errors(scene, seen.get(name)) for name, scene in scored.items()),
-        hota(pairs, _best_thresholds(tracking)) if with_hota else (),
-        journal_innovations(journal_of(Path(result))) if with_innovations else {},
+        LabelErrors.pool(
+            nuscenes_label_errors(each.tracking, placed_detections(each.scene) if each.scene.frames else None)
+            for each in scored.values()
+        ),
+        hota([_in_range(each.tracking) for each in scored.values()], _best_thresholds(tracking)) if with_hota else (),
+        innovations or {},
     )
 
 
@@ -114,12 +102,16 @@ def nuscenes_table(title: str, metrics: NuScenesTrackingMetrics) -> FigureTable:
     return FigureTable(title, _COLUMNS, tuple((name, *_cells(figures)) for name, figures in rows))
 
 
-def _in_range(scene: NuScenesTrackingScene, table: TrackTable) -> TrackTable:
-    """The boxes within the distance from the vehicle up to which their class is scored."""
+def _in_range(scene: NuScenesTrackingScene) -> tuple[TrackTable, TrackTable]:
+    """Truth and tracks within the distance from the vehicle up to which their class is scored."""
     limits = NuScenesTrackingSettings().class_range
-    reach = np.array([limits.get(label, 0.0) for label in table.boxes.label.tolist()])
-    offset = table.boxes.position[:, :2] - scene.ego_position[table.moment]
-    return table.select(np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) < reach))
+
+    def near(table: TrackTable) -> TrackTable:
+        reach = np.array([limits.get(label, 0.0) for label in table.boxes.label.tolist()])
+        offset = table.boxes.position[:, :2] - scene.ego_position[table.moment]
+        return table.select(np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) < reach))
+
+    return near(scene.truth), near(scene.found)
 
 
 def _best_thresholds(metrics: NuScenesTrackingMetrics) -> dict[str, float]:

@@ -32,7 +32,7 @@ from saga_fg.geometry import yaw_of
 from saga_fg.sensor import Sensor, sensor_model
 
 Rows = list[list[int | None]]
-UNMEASURED = 1.0  # side of the square an object of unknown size is drawn as, m
+UNMEASURED = 1.0  # side of the cube an object of unknown size is drawn as, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
     """The scene as the module's docstring says, ready for JSON."""
     scene = report.scene
     origin = scene.world_T_ego[0, :2, 3] if len(scene) else np.zeros(2)
-    shown = _latest_detections(scene, report.sensors)
+    shown = latest_detections(scene, report.sensors)
     truth = [t.boxes for t in scene.ground_truth] if scene.ground_truth is not None else None
     names = [table.boxes.label for table in report.tracks.values()] + [b.label for b in (*(truth or ()), *shown[0])]
     labels = np.unique(np.concatenate([np.empty(0, dtype="<U1"), *names]))
@@ -134,7 +134,7 @@ def _box_columns(boxes: Boxes, labels: StrArray, origin: FloatArray) -> FloatArr
     return np.column_stack([np.searchsorted(labels, boxes.label), place, 100 * size, 1000 * np.nan_to_num(boxes.yaw)])
 
 
-def _latest_detections(scene: Scene, sensors: Mapping[str, Sensor]) -> tuple[list[Boxes], list[FloatArray]]:
+def latest_detections(scene: Scene, sensors: Mapping[str, Sensor]) -> tuple[list[Boxes], list[FloatArray]]:
     """Of each moment: the boxes of all frames since the moment before, and their scores."""
     times = np.array([frame.timestamp for frame in scene.frames])
     at = np.searchsorted(scene.timestamps, times - 1e-6)

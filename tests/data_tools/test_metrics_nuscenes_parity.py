@@ -41,7 +41,9 @@ def assert_equal(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_random_drives(devkit: str, tmp_path: Path, seed: int) -> None:
     result = write_random_drive(tmp_path / "drive", seed)
-    ours = nuscenes_tracking_metrics(list(read_scored_scenes(result, tmp_path / "drive", VERSION).values()))
+    ours = nuscenes_tracking_metrics(
+        [each.tracking for each in read_scored_scenes(result, tmp_path / "drive", VERSION).values()]
+    )
     assert ours.overall.ids > 0
     assert math.isnan(ours.per_class["trailer"].amota)
     assert_equal(ours, official_figures(devkit, result, tmp_path / "drive", VERSION, "drive").figures)
@@ -78,7 +80,9 @@ def test_a_recording(devkit: str, recordings: Path, tmp_path: Path) -> None:
     scenes = [dataset.scene(name) for name in names]
     tracked = [(scene, noisy_tracks(scene.ground_truth or [], rng)) for scene in scenes]
     write_tracking_results(tmp_path / "result.json", tracked, ResultMeta(use_lidar=True))
-    ours = nuscenes_tracking_metrics(list(read_scored_scenes(tmp_path / "result.json", root, VERSION, names).values()))
+    ours = nuscenes_tracking_metrics(
+        [each.tracking for each in read_scored_scenes(tmp_path / "result.json", root, VERSION, names).values()]
+    )
     assert ours.overall.ids > 0
     assert_equal(ours, official_figures(devkit, tmp_path / "result.json", root, VERSION, "camera").figures)
 

@@ -37,7 +37,9 @@ def content_with_rack() -> dict[str, list[dict[str, Any]]]:
 def test_truth_tracks_and_racks_of_each_sample(tmp_path: Path) -> None:
     root = write_tables(tmp_path, content_with_rack())
     results = {"a0": [tracked("a0"), tracked("a0", "u")], "a1": [], "a2": [tracked("a2")], "b0": []}
-    (scene,) = read_scored_scenes(write(tmp_path / "r.json", results), root, VERSION, ["scene-0103"]).values()
+    (scored,) = read_scored_scenes(write(tmp_path / "r.json", results), root, VERSION, ["scene-0103"]).values()
+    scene = scored.tracking
+    assert [len(truth) for truth in scored.scene.ground_truth or ()] == [2, 1, 2]  # seen or not
     assert np.diff(scene.timestamps) == pytest.approx([0.5, 0.5])
     assert scene.ego_position.tolist() == [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]]
     assert scene.truth.moment.tolist() == [0, 0, 2, 2]  # the car has no point at a1, the barrier is not tracked

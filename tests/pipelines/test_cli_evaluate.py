@@ -43,7 +43,9 @@ def test_nuscenes_figures_are_those_of_the_metrics(drive: Path, tmp_path: Path) 
     )
     assert result.exit_code == 0, result.output
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {"recall.png", "errors.png"}
-    metrics = nuscenes_tracking_metrics(list(read_scored_scenes(drive / "result.json", drive, VERSION).values()))
+    metrics = nuscenes_tracking_metrics(
+        [each.tracking for each in read_scored_scenes(drive / "result.json", drive, VERSION).values()]
+    )
     figures = json.loads(file.read_text())
     assert figures["scenes"] == ["scene-0", "scene-1"]
     assert figures["overall"]["amota"] == metrics.overall.amota
