@@ -3,6 +3,7 @@
 from data_tools.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES
 from data_tools.nuscenes.dataset import NuScenes
 from data_tools.nuscenes.result_files import ResultMeta
+from data_tools.nuscenes.scans import NuScenesScans, nuscenes_scans
 from data_tools.nuscenes.scored_scenes import ScoredScene, read_scored_scenes
 from data_tools.nuscenes.splits import split_scenes
 from data_tools.nuscenes.tracking_results import (
@@ -18,11 +19,13 @@ __all__ = [
     "DETECTION_CLASSES",
     "TRACKING_CLASSES",
     "NuScenes",
+    "NuScenesScans",
     "ResultMeta",
     "ScoredScene",
     "TrackedBoxes",
     "TrackingResults",
     "merge_tracking_results",
+    "nuscenes_scans",
     "read_scored_scenes",
     "read_tracking_results",
     "split_scenes",

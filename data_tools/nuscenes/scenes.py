@@ -121,7 +121,7 @@ def _poses(folder: Path, wanted: Collection[str]) -> dict[str, FloatArray]:
         raise InputError(f"{folder / 'sample_data.json'}: sample {missing}: expected a {LIDAR} keyframe, there is none")
     needed = set(pose_of.values())
     poses = {
-        token: _transform(folder, token, translation, rotation)
+        token: _pose(folder, token, translation, rotation)
         for token, translation, rotation in read_table(folder, "ego_pose", ("token", "translation", "rotation"))
         if token in needed
     }
@@ -131,12 +131,20 @@ def _poses(folder: Path, wanted: Collection[str]) -> dict[str, FloatArray]:
     return {sample: poses[pose] for sample, pose in pose_of.items()}
 
 
-def _transform(folder: Path, token: str, translation: Any, rotation: Any) -> FloatArray:
+def _pose(folder: Path, token: str, translation: Any, rotation: Any) -> FloatArray:
     with located(f"{folder / 'ego_pose.json'}: record {token}"):
-        transform = np.eye(4)
-        transform[:3, :3] = quaternion_rotation(checked_quaternions("rotation", [rotation]))[0]
-        try:
-            transform[:3, 3] = translation
-        except (TypeError, ValueError) as error:
-            raise InputError(f"translation: expected three numbers in m, got {translation!r}") from error
-        return checked_transform("pose", transform)
+        return rigid_transform(translation, rotation)
+
+
+def rigid_transform(translation: Any, rotation: Any) -> FloatArray:
+    """The (4, 4) transform of a record: translation in m, rotation a quaternion (w, x, y, z).
+
+    Raises `InputError` for anything but three and four finite numbers.
+    """
+    transform = np.eye(4)
+    transform[:3, :3] = quaternion_rotation(checked_quaternions("rotation", [rotation]))[0]
+    try:
+        transform[:3, 3] = translation
+    except (TypeError, ValueError) as error:
+        raise InputError(f"translation: expected three numbers in m, got {translation!r}") from error
+    return checked_transform("pose", transform)

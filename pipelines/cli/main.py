@@ -20,6 +20,7 @@ from pipelines.cli.simulate import simulate
 from pipelines.cli.slam import slam_app
 from pipelines.cli.smooth import smooth_app
 from pipelines.cli.track import track_app
+from pipelines.cli.view import view_app
 
 app = typer.Typer(
     cls=ReportingGroup,
@@ -34,6 +35,7 @@ app.add_typer(smooth_app, name="smooth")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(learn_app, name="learn")
 app.add_typer(report_app, name="report")
+app.add_typer(view_app, name="view")
 app.add_typer(bench_app, name="bench")
 app.add_typer(slam_app, name="slam")
 app.command()(explain)

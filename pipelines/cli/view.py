@@ -1,0 +1,159 @@
+"""`saga-fg view`: a result in space, in the viewer rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipelines.cli.options import Verbose, apart, chosen_scenes, names, sensor_files
+from pipelines.cli.reporting import ReportingGroup, working
+
+if TYPE_CHECKING:
+    from pipelines.view import SceneView
+
+view_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
+
+Save = Annotated[
+    Path | None,
+    typer.Option("--save", help="Write a file for rerun instead of opening the viewer.", metavar="FILE.rrd"),
+]
+Spacing = Annotated[
+    float, typer.Option("--spacing", min=0.0, help="Thin the LiDAR's points to this, m; 0 leaves them out.")
+]
+
+
+@view_app.callback()
+def view() -> None:
+    """See a result in space: boxes, tracks, ellipses, edges, truth, LiDAR points, landmarks (extra [view]: rerun)."""
+
+
+@view_app.command()
+def nuscenes(
+    result: Annotated[Path, typer.Argument(help="Tracking-result JSON, of any tracker.")],
+    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")],
+    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
+    split: Annotated[
+        str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
+    ] = None,
+    scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
+    detections: Annotated[
+        list[str] | None,
+        typer.Option("--detections", help="Detections the tracks were made of, to see them too.", metavar="NAME=FILE"),
+    ] = None,
+    spacing: Spacing = 0.1,
+    save: Save = None,
+    verbose: Verbose = False,
+) -> None:
+    """See a nuScenes tracking result, with the ground truth and the LiDAR scans where their files are there.
+
+    \b
+    Examples:
+      saga-fg view nuscenes tracks.json --dataroot data/nuscenes --scenes scene-0103
+      saga-fg view nuscenes tracks.json --dataroot data/nuscenes --split mini_train \\
+          --detections lidar=megvii.json --save tracks.rrd
+    """
+    from pipelines.view.sources import nuscenes_view
+
+    chosen, files = chosen_scenes(dataroot, version, split, scenes), sensor_files(detections or [])
+    if save is not None:
+        apart(save, result, *files.values())
+    _show(result, save, lambda: nuscenes_view(result, dataroot, version, chosen, files, spacing))
+
+
+@view_app.command()
+def kitti(
+    result: Annotated[Path, typer.Argument(help="Folder of results NNNN.txt, of any tracker.")],
+    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/, label_02/ ...")],
+    sequences: Annotated[
+        str | None, typer.Option("--sequences", help="Sequences with commas between them; all results if left out.")
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option("--detections", help="Folder of the detections the tracks were made of.")
+    ] = None,
+    slam: Annotated[
+        Path | None, typer.Option("--slam", help="Folder that `saga-fg slam kitti` wrote, of the only sequence.")
+    ] = None,
+    spacing: Spacing = 0.1,
+    save: Save = None,
+    verbose: Verbose = False,
+) -> None:
+    """See KITTI tracking results, with the labels, the scans of velodyne/ if it is there, and a map with landmarks.
+
+    \b
+    Example:
+      saga-fg view kitti results --dataroot data/kitti --sequences 0000 --slam slam --save drive.rrd
+    """
+    from pipelines.view.sources import kitti_view
+
+    chosen = names("--sequences", sequences) if sequences is not None else None
+    _show(result, save, lambda: kitti_view(result, dataroot, chosen, detections, spacing), slam)
+
+
+@view_app.command()
+def file(
+    result: Annotated[Path, typer.Argument(help="Table of tracks: .csv, .ndjson or .jsonl.")],
+    detections: Annotated[
+        Path | None, typer.Option("--detections", help="Table of the detections the tracks were made of.")
+    ] = None,
+    save: Save = None,
+    verbose: Verbose = False,
+) -> None:
+    """See a table of tracks.
+
+    \b
+    Example:
+      saga-fg view file tracks.csv --detections detections.csv
+    """
+    from pipelines.view.sources import table_view
+
+    if save is not None:
+        apart(save, result, *([detections] if detections is not None else []))
+    _show(result, save, lambda: table_view(result, detections))
+
+
+@view_app.command()
+def slam(
+    result: Annotated[Path, typer.Argument(help="Folder that a command of `saga-fg slam` wrote.")],
+    save: Save = None,
+    verbose: Verbose = False,
+) -> None:
+    """See a run of SLAM: the paths, the map, the landmarks.
+
+    \b
+    Example:
+      saga-fg view slam slam --save map.rrd
+    """
+    _show(result, save, list, result)
+
+
+def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView]], slam: Path | None = None) -> None:
+    """Write or open the scenes that `make` gives, with the map of a run of SLAM."""
+    from data_tools.atomic_files import check_writable
+    from pipelines.view import load_rerun, log_scene, log_slam, read_slam_view, show_view, write_view
+    from saga_fg.errors import InputError
+
+    load_rerun()
+    if save is not None:
+        check_writable(save)
+    with working("making the view"):
+        scenes, driven = make(), read_slam_view(slam) if slam is not None else None
+        roots = [each.report.scene.name for each in scenes]
+        if driven is not None and len(scenes) > 1:
+            raise InputError(f"--slam {slam}: expected one sequence, got {', '.join(roots)}; choose it by --sequences")
+
+        def draw(stream: Any) -> None:
+            for each in scenes:
+                log_scene(stream, each)
+            if driven is not None:
+                root = f"{roots[0]}/slam" if roots else "slam"
+                log_slam(stream, driven, root, scenes[0].report.scene.world_T_ego[0, :3, 3] if scenes else None)
+
+        if save is None:
+            show_view(result.name, roots or ["slam"], draw)
+        else:
+            write_view(save, result.name, roots or ["slam"], draw)
+    if save is not None:
+        typer.echo(f"{save}: {save.stat().st_size / 1e6:.1f} MB; open it with: rerun {save}")
