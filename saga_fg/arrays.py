@@ -6,6 +6,8 @@ number is needed, ever reaches the numerics (or GTSAM, which would crash the int
 
 from __future__ import annotations
 
+from collections.abc import Container
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +21,8 @@ BoolArray = NDArray[np.bool_]
 StrArray = NDArray[np.str_]
 
 Values = Literal["finite", "finite-or-nan", "any"]
+_REMEMBERED = 1 << 16  # bytes; tables of whole recordings are not kept
+_MOST = np.iinfo(np.int64).max
 
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: Values = "finite") -> FloatArray:
@@ -35,9 +39,7 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: 
         raise InputError(f"{name}: expected numbers, got {_short(value)}") from error
     if array.shape == (0,) and not shape[0]:
         array = array.reshape((0, *(n or 0 for n in shape[1:])))
-    if array.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
-    ):
+    if array.shape != shape and not _fits(array.shape, shape):
         raise InputError(f"{name}: expected shape {_shape(shape)}, got {array.shape}")
     if values != "any":
         bad = ~np.isfinite(array) if values == "finite" else np.isinf(array)
@@ -92,6 +94,8 @@ def checked_labels(name: str, value: Any, length: int | None = None) -> StrArray
 def checked_ids(name: str, value: ArrayLike, length: int | None = None) -> IntArray:
     """Return `value` as a read-only int64 array of unique entries, of shape (length,)."""
     array = checked_rows(name, value, length)
+    if (array[1:] > array[:-1]).all():  # ascending, as ids are given out
+        return array
     unique, counts = np.unique(array, return_counts=True)
     if len(unique) != len(array):
         raise InputError(f"{name}: expected unique ids, {int(unique[counts > 1][0])} occurs more than once")
@@ -103,7 +107,7 @@ def checked_rows(name: str, value: ArrayLike, length: int | None = None) -> IntA
     array = _listed(value)
     if array.size == 0:
         array = np.empty(0, dtype=np.int64)
-    if array.dtype.kind not in "iu" or array.ndim != 1 or (array > np.iinfo(np.int64).max).any():
+    if array.dtype.kind not in "iu" or array.ndim != 1 or (array.dtype.kind == "u" and (array > _MOST).any()):
         raise InputError(f"{name}: expected a list of integers, got {_short(value)}")
     if length is not None and len(array) != length:
         raise InputError(f"{name}: expected {length} entries, got {len(array)}")
@@ -118,6 +122,10 @@ def _listed(value: Any) -> NDArray[Any]:
         return np.asarray(value)
     except ValueError:
         return np.asarray(value, dtype=object)
+
+
+def _fits(got: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(got) == len(shape) and all(n is None or n == m for n, m in zip(shape, got, strict=True))
 
 
 def _shape(shape: tuple[int | None, ...]) -> str:
@@ -139,11 +147,25 @@ def from_upper_triangle(entries: FloatArray) -> FloatArray:
     return entries[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
 
 
-def distinct(label: StrArray) -> tuple[list[str], IntArray]:
-    """The labels that occur, in order of appearance, and the number (n,) of each row's among them.
+def distinct(label: StrArray) -> tuple[tuple[str, ...], IntArray]:
+    """The labels that occur, in order of appearance, and the number (n,) of each row's among them, read-only.
 
-    For the handful of classes in a frame this is several times as fast as sorting the strings.
+    Asked for again and again of the few tables that a frame has, it looks up what it has found before.
     """
+    look = _distinct if label.nbytes < _REMEMBERED else _distinct.__wrapped__
+    return look(np.ascontiguousarray(label).tobytes(), label.dtype.str, len(label))
+
+
+@lru_cache(maxsize=256)
+def _distinct(label: bytes, dtype: str, count: int) -> tuple[tuple[str, ...], IntArray]:
     number: dict[str, int] = {}
-    index = [number.setdefault(name, len(number)) for name in label.tolist()]
-    return list(number), np.array(index, dtype=np.int64)
+    names = np.frombuffer(label, dtype=dtype, count=count).tolist()
+    index = np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)
+    index.flags.writeable = False
+    return tuple(number), index
+
+
+def of_classes(label: StrArray, classes: Container[str]) -> BoolArray:
+    """(n,) which labels are among `classes`."""
+    names, index = distinct(label)
+    return np.array([name in classes for name in names], dtype=bool)[index]

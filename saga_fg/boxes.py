@@ -43,9 +43,9 @@ class Boxes:
         if (size <= 0).any():
             row = int(np.argwhere(size <= 0)[0][0])
             raise InputError(f"size[{row}]: expected positive length, width, height in m, got {size[row].tolist()}")
-        for name, given, limit in (("position", self.position, MAX_POSITION), ("velocity", self.velocity, MAX_SPEED)):
-            columns = 3 if name == "position" else 2
-            values = checked(name, given, (n, columns), "finite" if name == "position" else "finite-or-nan")
+        position = checked("position", self.position, (n, 3))
+        velocity = checked("velocity", self.velocity, (n, 2), "finite-or-nan")
+        for name, values, limit in (("position", position, MAX_POSITION), ("velocity", velocity, MAX_SPEED)):
             if (np.abs(values) > limit).any():
                 row = int(np.argwhere(np.abs(values) > limit)[0][0])
                 raise InputError(f"{name}[{row}]: expected numbers within {limit:g}, got {values[row].tolist()}")
@@ -53,10 +53,10 @@ class Boxes:
         yaw.flags.writeable = False
         for name, array in (
             ("label", label),
-            ("position", checked("position", self.position, (n, 3))),
+            ("position", position),
             ("size", size),
             ("yaw", yaw),
-            ("velocity", checked("velocity", self.velocity, (n, 2), "finite-or-nan")),
+            ("velocity", velocity),
         ):
             object.__setattr__(self, name, array)
 

@@ -62,11 +62,16 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     b = np.zeros(int(offsets[-1]))
     F: list[Blocks] = []
     Q: list[Blocks] = []
-    for d in np.unique(graph.dims[~coupled]).tolist():  # nodes that nobody acts on share their kind's dynamics
-        rows = np.flatnonzero(~coupled & (graph.dims == d))
-        numbers, of_row = np.unique(kind[rows], return_inverse=True)
+    alike: dict[tuple[int, bool], list[int]] = {}  # nodes that nobody acts on share their kind's dynamics
+    for k in np.flatnonzero(np.bincount(kind[~coupled])).tolist():
+        alike.setdefault((kinds[k].dim, kinds[k].nilpotency is None), []).append(k)
+    for numbers in alike.values():
+        place = np.full(len(kinds), -1)
+        place[numbers] = np.arange(len(numbers))
+        rows = np.flatnonzero(~coupled & (place[kind] >= 0))
+        of_row = place[kind[rows]]
         generators, diffusions = (np.stack([getattr(kinds[k], n) for k in numbers]) for n in ("generator", "diffusion"))
-        (own,), noise = _phi_and_noise(generators, diffusions, dt, 0)
+        (own,), noise = _phi_and_noise(generators, diffusions, dt, 0, _nilpotency([kinds[k] for k in numbers]))
         F.append(Blocks(rows, rows, own[of_row]))
         Q.append(Blocks(rows, rows, noise[of_row]))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
@@ -131,23 +136,37 @@ def _own_dynamics(
     return M, Qc, c
 
 
-def _phi_and_noise(M: FloatArray, Qc: FloatArray, dt: float, order: int) -> tuple[list[FloatArray], FloatArray]:
-    """phi_0 ... phi_order of M dt (each (m, d, d)), and Q = int_0^dt exp(M s) Qc exp(M^T s) ds."""
-    norm = float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt
-    doublings = max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS))) if norm > 0 else 0
+def _nilpotency(kinds: list[NodeType]) -> int | None:
+    """Smallest k with A^k = 0 for all these types, None if there is none."""
+    steps = [t.nilpotency for t in kinds]
+    return None if None in steps else max(step for step in steps if step is not None)
+
+
+def _phi_and_noise(
+    M: FloatArray, Qc: FloatArray, dt: float, order: int, nilpotency: int | None = None
+) -> tuple[list[FloatArray], FloatArray]:
+    """phi_0 ... phi_order of M dt (each (m, d, d)), and Q = int_0^dt exp(M s) Qc exp(M^T s) ds.
+
+    Where M^nilpotency = 0 the series end.
+    """
+    degree, noise_degree, doublings = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, 0
+    if nilpotency is not None:
+        degree, noise_degree = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1)
+    elif (norm := float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt) > 0:
+        doublings = max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS)))
     h = dt / 2**doublings
     Z = M * h
     eye = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
     # phi_k(Z) = sum_j Z^j / (j + k)!, by Horner from the highest order down; lower ones by phi_k = Z phi_{k+1} + I/k!
-    phi = eye / math.factorial(order + _TAYLOR_DEGREE)
-    for j in range(_TAYLOR_DEGREE - 1, -1, -1):
+    phi = eye / math.factorial(order + degree)
+    for j in range(degree - 1, -1, -1):
         phi = Z @ phi + eye / math.factorial(order + j)
     phis = [phi]
     for k in range(order - 1, -1, -1):
         phis.insert(0, Z @ phis[0] + eye / math.factorial(k))
     term = Qc * h
     Q = term
-    for j in range(2, _TAYLOR_DEGREE + 2):
+    for j in range(2, noise_degree + 1):
         half = Z @ term
         term = (half + np.swapaxes(half, -1, -2)) / j
         Q = Q + term
@@ -178,11 +197,11 @@ def _coupling_blocks(
     at = position[target]
     used = {int(k): kinds[k] for k in np.unique(kind[source])}
     A_j = np.stack([kinds[k].generator for k in kind[source]])
-    steps = [t.nilpotency for t in used.values()]
-    if any(step is None for step in steps):
+    steps = _nilpotency(list(used.values()))
+    if steps is None:
         return Blocks(target, source, _van_loan(M[at], C, A_j, dt))
     values = np.zeros_like(C)
-    for k in range(max(step for step in steps if step is not None)):
+    for k in range(steps):
         values += dt ** (k + 1) * (phi[k + 1][at] @ C)
         C = C @ A_j
     return Blocks(target, source, values)

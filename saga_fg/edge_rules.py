@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
 from saga_fg.errors import InputError
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
@@ -62,7 +62,7 @@ class Neighbours:
         require_positive(self, "distance_scale", "heading_scale", "speed_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        able = np.isin(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
+        able = of_classes(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
         target, source, distance = _close_pairs(nodes.position, able, self.max_distance)
         turn = wrap_angle(nodes.heading[target] - nodes.heading[source])
         difference = np.hypot(*(nodes.velocity[target] - nodes.velocity[source]).T)
@@ -89,7 +89,7 @@ class Following:
         require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        able = np.isin(nodes.label, self.classes)
+        able = of_classes(nodes.label, self.classes)
         target, source, _ = _close_pairs(nodes.position, able, self.max_gap)
         offset = nodes.position[source] - nodes.position[target]
         heading = nodes.heading[target]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
@@ -97,9 +97,15 @@ class Detections:
 
     def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
         """The detections of a mask, of row indices or of a slice."""
-        boxes = self.boxes.select(rows)
-        index = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        return type(self)(boxes, self.score[index], self.range_rate[index])
+        index: Any = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
+        chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
+        for name, column in (
+            ("boxes", self.boxes.select(index)),
+            ("score", self.score[index]),
+            ("range_rate", self.range_rate[index]),
+        ):
+            object.__setattr__(chosen, name, column)
+        return chosen
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""

@@ -133,11 +133,11 @@ class NodeType:
         if not np.allclose(Qc, Qc.T) or np.linalg.eigvalsh(Qc)[0] < -1e-12 * max(1.0, float(np.abs(Qc).max())):
             raise InputError(f"node type {self.name}: diffusion: expected a symmetric positive semidefinite matrix")
 
-    @property
+    @cached_property
     def components(self) -> tuple[str, ...]:
         return self.motion.components
 
-    @property
+    @cached_property
     def dim(self) -> int:
         """Size d of the state."""
         return len(self.components)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,13 +42,15 @@ class BlockGaussian:
 
     def extended(self, layout: Layout, means: FloatArray, covariances: FloatArray) -> BlockGaussian:
         """With the further nodes of `layout`, independent of all others: means (k, d), covariances (k, d, d)."""
-        partition = self.partition.extended(layout)
-        old = np.arange(len(self.layout))
-        blocks = regrouped(self.blocks, self.partition, partition, old)
-        new = np.arange(len(old), len(layout))
-        if len(new):
-            blocks[partition.group[new[0]]][partition.row[new]] = covariances
-        return BlockGaussian(partition, np.concatenate([self.mean, means.ravel()]), blocks)
+        if len(means) == 0:
+            return self
+        sizes, size = [places.shape[1] for places in self.partition.groups], covariances.shape[1]
+        at, blocks = bisect_left(sizes, size), list(self.blocks)
+        if size in sizes:  # components of one size are in the order of their first nodes
+            blocks[at] = np.concatenate([blocks[at], covariances])
+        else:
+            blocks.insert(at, np.array(covariances))
+        return BlockGaussian(self.partition.extended(layout), np.concatenate([self.mean, means.ravel()]), tuple(blocks))
 
     def without(self, rows: IntArray) -> BlockGaussian:
         """With the nodes at `rows` integrated out."""
@@ -56,10 +59,16 @@ class BlockGaussian:
         keep = np.ones(len(self.layout), dtype=bool)
         keep[rows] = False
         kept = np.flatnonzero(keep)
-        partition = self.partition.restricted(self.layout.without(rows), kept)
-        where = np.full(len(keep), -1)
-        where[kept] = np.arange(len(kept))
-        blocks = regrouped(self.blocks, self.partition, partition, where)
+        old = self.partition
+        partition = old.restricted(self.layout.without(rows), kept)
+        if old.count - partition.count == len(rows):  # nodes without partners go, all others stay as they are
+            gone = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
+            left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, gone, strict=True))
+            blocks = tuple(P for P in left if len(P))
+        else:
+            where = np.full(len(keep), -1)
+            where[kept] = np.arange(len(kept))
+            blocks = regrouped(self.blocks, old, partition, where)
         return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
 
     def decoupled(self) -> BlockGaussian:
@@ -105,10 +114,11 @@ def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray)
     """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
     d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
     result = np.empty((len(rows), d, d))
-    if partition.size and len(partition.groups) == 1:
-        slot = partition.slot[rows]
-        own: FloatArray = partition.by_nodes(blocks[0])[partition.row[rows], slot, slot]
-        return own
+    if partition.size:
+        own = np.empty((len(partition.layout), d, d))
+        for (nodes, row, slot), block in zip(partition.homes, blocks, strict=True):
+            own[nodes] = partition.by_nodes(block)[row, slot, slot]
+        return own if len(rows) == len(own) and (rows == np.arange(len(own))).all() else own[rows]
     for number, members, at in partition.members(rows, d):
         row = partition.row[rows[members]]
         result[members] = blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]]

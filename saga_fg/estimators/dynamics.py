@@ -182,7 +182,7 @@ class Dynamics:
 
 def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
     """The prior after the interval. Raises `InputError` where it is not finite."""
-    partition = dynamics.joined(x.partition)
+    partition = dynamics.joined(x.partition).packed
     mean, blocks = dynamics.propagated(x.over(partition))
     mean += dynamics.b
     dynamics.add_noise(partition, blocks)

@@ -18,6 +18,9 @@ from scipy.sparse.csgraph import connected_components
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.layout import Layout
 
+_FEW = 4  # components of a size that are not worth a batched operation of their own
+_PACK = 64  # states that such components together may have
+
 
 @dataclass(frozen=True, eq=False)
 class Partition:
@@ -84,6 +87,12 @@ class Partition:
         return self.offset // self.size
 
     @cached_property
+    def homes(self) -> tuple[tuple[IntArray, IntArray, IntArray], ...]:
+        """For each group, the nodes in it, the rows of their components and their slots there. Only with `size`."""
+        nodes = [np.flatnonzero(self.group == number) for number in range(len(self.groups))]
+        return tuple((of_group, self.row[of_group], self.slot[of_group]) for of_group in nodes)
+
+    @cached_property
     def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]:
         layout, label = self.layout, self.label
         none = np.empty(0, dtype=np.int64)
@@ -97,7 +106,8 @@ class Partition:
         offset = np.empty(len(label), dtype=np.int64)
         offset[order] = first - start[label[order]]
         places = np.repeat(layout.offsets[:-1][order] - first, layout.dims[order]) + np.arange(layout.size)
-        sizes, group = np.unique(size, return_inverse=True)
+        sizes = np.flatnonzero(np.bincount(size))
+        group = np.searchsorted(sizes, size)
         row = np.empty(len(size), dtype=np.int64)
         groups = []
         for number, s in enumerate(sizes.tolist()):
@@ -128,13 +138,36 @@ class Partition:
         pairs = scipy.sparse.coo_array((np.ones(int(across.sum())), (a[across], b[across])), (self.count, self.count))
         return Partition(self.layout, connected_components(pairs, directed=False)[1].astype(np.int64)[self.label])
 
+    @cached_property
+    def packed(self) -> Partition:
+        """With small components of several nodes, of sizes that few others have, put together.
+
+        That spares a batched operation for each size. What moves alone stays alone, to the last digit.
+        """
+        nodes = np.bincount(self.label)
+        size = np.bincount(self.label, weights=self.layout.dims).astype(np.int64)
+        rare = np.flatnonzero((nodes > 1) & (np.bincount(size)[size] < _FEW))
+        order = rare[np.argsort(size[rare], kind="stable")]
+        chosen = order[np.cumsum(size[order]) <= _PACK]
+        if len(chosen) < 2:
+            return self
+        number = np.arange(len(size))
+        number[chosen] = chosen.min()
+        return Partition(self.layout, _without_gaps(number[self.label]))
+
     def extended(self, layout: Layout) -> Partition:
         """With the further nodes at the end of `layout`, each a component of its own."""
         return Partition(layout, np.concatenate([self.label, self.count + np.arange(len(layout) - len(self.layout))]))
 
     def restricted(self, layout: Layout, rows: IntArray) -> Partition:
         """Of the nodes at `rows` alone, which are those of `layout`."""
-        return Partition(layout, np.unique(self.label[rows], return_inverse=True)[1].astype(np.int64))
+        return Partition(layout, _without_gaps(self.label[rows]))
+
+
+def _without_gaps(label: IntArray) -> IntArray:
+    """The labels (n,) >= 0 renumbered in their order, from 0 without gaps."""
+    used = np.bincount(label) > 0
+    return np.asarray((np.cumsum(used) - 1)[label])
 
 
 BlockDiagonal = tuple[FloatArray, ...]  # (c, s, s) for each group of a partition
