@@ -158,11 +158,12 @@ def distinct(label: StrArray) -> tuple[tuple[str, ...], IntArray]:
 
 @lru_cache(maxsize=256)
 def _distinct(label: bytes, dtype: str, count: int) -> tuple[tuple[str, ...], IntArray]:
-    number: dict[str, int] = {}
-    names = np.frombuffer(label, dtype=dtype, count=count).tolist()
-    index = np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)
+    of_row = np.frombuffer(label, dtype=dtype, count=count).tolist()
+    names = tuple(dict.fromkeys(of_row))
+    number = dict(zip(names, range(len(names)), strict=True))
+    index = np.array([number[name] for name in of_row], dtype=np.int64)
     index.flags.writeable = False
-    return tuple(number), index
+    return names, index
 
 
 def of_classes(label: StrArray, classes: Container[str]) -> BoolArray:

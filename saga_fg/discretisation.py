@@ -35,7 +35,7 @@ import scipy.sparse
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
-from saga_fg.node import NodeType
+from saga_fg.node import NodeType, distinct_types
 from saga_fg.scene_graph import Edges, SceneGraph
 from saga_fg.transition import Blocks, Transition
 
@@ -54,7 +54,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         raise InputError(f"dt: expected a finite number of seconds >= 0, got {dt!r}")
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
-    kinds, kind = _kinds(graph)
+    kinds, kind = distinct_types(graph.types)
     coupled = np.asarray(graph.diffusion_scale != 1.0)
     for edges in graph.edges:
         coupled[edges.target[edges.rate > 0]] = True
@@ -110,18 +110,12 @@ def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArr
     return G, c, Qc
 
 
-def _kinds(graph: SceneGraph) -> tuple[list[NodeType], IntArray]:
-    """The distinct node types of the graph, and the number (n,) of each node's."""
-    number: dict[int, int] = {}
-    kind = np.array([number.setdefault(id(t), len(number)) for t in graph.types], dtype=np.int64)
-    return [graph.types[int(np.argmax(kind == k))] for k in range(len(number))], kind
-
-
 def _own_dynamics(
     graph: SceneGraph, rows: IntArray, kinds: list[NodeType], kind: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M (m, d, d), Qc (m, d, d), c (m, d) of the nodes `rows`, whose states have equal size."""
-    numbers, of_row = np.unique(kind[rows], return_inverse=True)
+    numbers = np.flatnonzero(np.bincount(kind[rows]))
+    of_row = np.searchsorted(numbers, kind[rows])
     M = np.stack([kinds[k].generator for k in numbers])[of_row]
     Qc = np.stack([kinds[k].diffusion for k in numbers])[of_row] * graph.diffusion_scale[rows, None, None]
     c = np.zeros(M.shape[:2])

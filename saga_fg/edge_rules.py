@@ -19,6 +19,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_row
 from saga_fg.errors import InputError
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
+from saga_fg.node import distinct_types
 from saga_fg.scene_graph import Edges, SceneGraph
 from saga_fg.settings import require_between, require_positive, setting, settings_group
 
@@ -122,14 +123,15 @@ def build_graph(
     groups: list[Edges] = []
     total_rate = np.zeros(len(nodes))
     if len(nodes) > 1:
-        kinds: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
-        kind = np.array([kinds.setdefault(t.components, len(kinds)) for t in nodes.types])
+        kinds, kind = distinct_types(nodes.types)
+        first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
+        kind = np.array([first.setdefault(t.components, len(first)) for t in kinds])[kind]
         for rule in rules:
             target, source, rate = _checked_pairs(rule, nodes)
             keep = rate >= min_rate
             target, source, rate = target[keep], source[keep], rate[keep]
-            pair_kind = kind[target] * len(kinds) + kind[source]
-            for k in np.unique(pair_kind):
+            pair_kind = kind[target] * len(first) + kind[source]
+            for k in np.flatnonzero(np.bincount(pair_kind)):
                 mine = pair_kind == k
                 t, s = target[mine], source[mine]
                 if rule.interaction.applies(nodes.types[t[0]], nodes.types[s[0]]):

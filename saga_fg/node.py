@@ -180,3 +180,11 @@ class NodeType:
         H = np.zeros((len(names), self.dim))
         H[np.arange(len(names)), self.index(names)] = 1.0
         return H
+
+
+def distinct_types(types: Sequence[NodeType]) -> tuple[list[NodeType], IntArray]:
+    """The distinct ones of n node types, in order of appearance, and the number (n,) of each among them."""
+    ids = [id(t) for t in types]
+    found = dict.fromkeys(ids)
+    number = dict(zip(found, range(len(found)), strict=True))
+    return [types[ids.index(one)] for one in found], np.array([number[i] for i in ids], dtype=np.int64)

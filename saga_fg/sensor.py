@@ -173,13 +173,11 @@ class Sensor:
         Where each has an origin (N, 2) of its own that is the position itself, range and bearing add no noise.
         """
         offset = position - origin
-        distance = np.hypot(*offset.T)
-        u = offset / np.maximum(distance, 1e-9)[:, None]
-        n = np.stack([-u[:, 1], u[:, 0]], axis=-1)
-        along = (self.deviations(label, "range_noise") * distance)[:, None] * u
-        across = (self.deviations(label, "bearing_noise") * distance)[:, None] * n
-        R = (self.deviations(label, "position") ** 2)[:, None, None] * np.eye(2)
-        R = R + along[:, :, None] * along[:, None, :] + across[:, :, None] * across[:, None, :]
+        square = (self.deviations(label, "position") ** 2)[:, None, None]
+        # along and across the line of sight u: (a r u)(a r u)^T + (b r n)(b r n)^T = b^2 r^2 I + (a^2 - b^2) r^2 u u^T
+        along, across = self.deviations(label, "range_noise") ** 2, self.deviations(label, "bearing_noise") ** 2
+        square = square + (across * np.einsum("ni,ni->n", offset, offset))[:, None, None]
+        R = square * np.eye(2) + (along - across)[:, None, None] * (offset[:, :, None] * offset[:, None, :])
         return np.asarray(R * self._score_factor(label, probability)[:, None, None])
 
     def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:

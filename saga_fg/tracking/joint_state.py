@@ -56,6 +56,12 @@ class JointTrackState:
             self._types[label] = alike or NodeType(type(motion).__name__, motion)
         return self._types[label]
 
+    def types_of(self, label: StrArray) -> tuple[NodeType, ...]:
+        """The node type of each row (n,)."""
+        classes, index = distinct(label)
+        types = [self.type_of(c) for c in classes]
+        return tuple([types[k] for k in index.tolist()])
+
     def add(self, ids: IntArray, label: StrArray, now: Kinematics, delay: float = 0.0) -> None:
         """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1."""
         for node_type, rows in self._by_type(label, delay > 0):

@@ -278,7 +278,8 @@ class Tracker:
 
     def _speed_deviation(self) -> FloatArray:
         """(n,) standard deviation of the velocity in a mean direction, m/s."""
-        return np.asarray(np.sqrt(np.trace(self._kinematics().P_velocity, axis1=1, axis2=2) / 2))
+        P = self._kinematics().P_velocity
+        return np.asarray(np.sqrt((P[:, 0, 0] + P[:, 1, 1]) / 2))
 
     def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
@@ -375,12 +376,12 @@ class Tracker:
         return NodeTable(
             columns.id,
             columns.label,
-            tuple(self._state.type_of(str(c)) for c in columns.label),
+            self._state.types_of(columns.label),
             position,
             velocity,
             heading,
             np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
-            np.trace(P_velocity, axis1=1, axis2=2) / 2,
+            (P_velocity[:, 0, 0] + P_velocity[:, 1, 1]) / 2,
             columns.has_moved,
         )
 
