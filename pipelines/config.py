@@ -13,7 +13,15 @@ from pipelines.tracking import OnlineTracker
 from saga_fg.node import ConstantVelocity
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.settings import settings_group
-from saga_fg.tracking import EstimatorName, GreedySettings, GreedyTracker, Observer, Tracker, TrackerSettings
+from saga_fg.tracking import (
+    AssociationName,
+    EstimatorName,
+    GreedySettings,
+    GreedyTracker,
+    Observer,
+    Tracker,
+    TrackerSettings,
+)
 from saga_fg.tracking.settings import settings_of
 
 Method = Literal["saga", "kf", "centerpoint"]
@@ -35,6 +43,13 @@ class TrackConfig:
         tracker = self.tracker
         tracker = replace(tracker, estimator=estimator or tracker.estimator, lag=tracker.lag if lag is None else lag)
         return replace(self, tracker=tracker)
+
+    def with_association(self, method: AssociationName | None) -> TrackConfig:
+        """The same with another way to match detections to tracks; None leaves what is there."""
+        if method is None:
+            return self
+        association = replace(self.tracker.association, method=method)
+        return replace(self, tracker=replace(self.tracker, association=association))
 
     def with_acceleration_noise(self, noise: Mapping[str, float]) -> TrackConfig:
         """The same with constant velocity and this noise (m^2/s^3) for each class; `default` serves the rest."""

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from pipelines.cli.bench_association import association
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_fusion import fusion
 from pipelines.cli.bench_joint import joint
@@ -31,6 +32,7 @@ bench_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mo
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
 
 
+bench_app.command()(association)
 bench_app.command()(estimators)
 bench_app.command()(fusion)
 bench_app.command()(service)

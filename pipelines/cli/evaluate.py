@@ -12,7 +12,7 @@ import typer
 from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_files
 from pipelines.cli.reporting import ReportingGroup, progress_bar, working
 from pipelines.cli.tables import JsonFile, show_tables
-from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
+from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, LagOption, MethodOption, configured
 from pipelines.figures import FigureTable
 from saga_fg.errors import InputError
 
@@ -152,6 +152,7 @@ def simulated(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    association: AssociationOption = None,
     config: Config = None,
     simulator: Annotated[
         Path | None,
@@ -172,7 +173,7 @@ def simulated(
     from pipelines.configuration import load_settings
     from pipelines.evaluation import evaluate_simulated
 
-    settings = configured("simulated", config, method, estimator, lag)
+    settings = configured("simulated", config, method, estimator, lag, association)
     traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
     dataset = SimulatedTraffic(traffic, scenes, seed)
     new_tracker = partial(settings.new_tracker, method)

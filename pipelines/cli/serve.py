@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.tracking_options import EstimatorOption, LagOption, MethodOption, configured
+from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, LagOption, MethodOption, configured
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def serve(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    association: AssociationOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -56,7 +57,7 @@ def serve(
 
     from pipelines.serving import StreamSettings, StreamTracker
 
-    settings = configured("file", config, method, estimator, lag)
+    settings = configured("file", config, method, estimator, lag, association)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), StreamSettings(reorder=reorder))
     # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
     with threadpool_limits(limits=1, user_api="blas"):

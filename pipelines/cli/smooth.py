@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,10 +12,12 @@ from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import counted
-from pipelines.cli.tracking_options import MethodOption
+from pipelines.cli.tracking_options import AssociationOption, MethodOption, association_fits
 
 if TYPE_CHECKING:
-    from pipelines.smoothing import SmoothedScene
+    from pipelines.config import Family
+    from pipelines.smoothing import SmoothConfig, SmoothedScene
+    from saga_fg.tracking import AssociationName
 
 smooth_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
@@ -44,6 +47,7 @@ def nuscenes(
     ] = None,
     scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
     method: MethodOption = "saga",
+    association: AssociationOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -62,9 +66,9 @@ def nuscenes(
     from data_tools.label_files import merge_label_parts
     from data_tools.nuscenes import NuScenes, merge_tracking_results
     from pipelines.scale_out import HeldScene, SmoothTask
-    from pipelines.smoothing import load_smooth_config, smooth_dataset, write_nuscenes_run
+    from pipelines.smoothing import smooth_dataset, write_nuscenes_run
 
-    settings = load_smooth_config("nuscenes", config)
+    settings = _configured("nuscenes", config, method, association)
     chosen = chosen_scenes(dataroot, version, split, scenes)
     dataset = NuScenes(dataroot, version, sensor_files(detections), chosen)
     if at_scale(workers, ray):
@@ -96,6 +100,7 @@ def kitti(
         str | None, typer.Option("--sequences", help="Sequences with commas between them; all if left out.")
     ] = None,
     method: MethodOption = "saga",
+    association: AssociationOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -111,9 +116,9 @@ def kitti(
     """
     from data_tools.kitti import KittiTracking
     from pipelines.scale_out import KittiInput, SmoothTask
-    from pipelines.smoothing import load_smooth_config, smooth_dataset, write_kitti_run
+    from pipelines.smoothing import smooth_dataset, write_kitti_run
 
-    settings = load_smooth_config("kitti", config)
+    settings = _configured("kitti", config, method, association)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
     if at_scale(workers, ray):
         inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
@@ -136,6 +141,7 @@ def simulated(
         typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE"),
     ] = None,
     method: MethodOption = "saga",
+    association: AssociationOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -152,9 +158,9 @@ def simulated(
     from data_tools.simulator import SimulatedTraffic, SimulatorSettings
     from pipelines.configuration import load_settings
     from pipelines.scale_out import SimulatedInput, SmoothTask
-    from pipelines.smoothing import load_smooth_config, smooth_dataset, write_labels
+    from pipelines.smoothing import smooth_dataset, write_labels
 
-    settings = load_smooth_config("simulated", config)
+    settings = _configured("simulated", config, method, association)
     traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
     dataset = SimulatedTraffic(traffic, scenes, seed)
     if at_scale(workers, ray):
@@ -174,6 +180,7 @@ def file(
         str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
     ] = None,
     method: MethodOption = "saga",
+    association: AssociationOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -192,9 +199,9 @@ def file(
     from data_tools.detection_files import read_detections
     from data_tools.remote_files import local_copy
     from pipelines.scale_out import DetectionFileInput, SmoothTask
-    from pipelines.smoothing import load_smooth_config, smooth_dataset, write_labels
+    from pipelines.smoothing import smooth_dataset, write_labels
 
-    settings = load_smooth_config("file", config)
+    settings = _configured("file", config, method, association)
     if at_scale(workers, ray):
         urls = several(detections, scenes)
         task = SmoothTask(settings, method, "table", f".{table}")
@@ -219,3 +226,12 @@ def _show(output: Path, runs: tuple[SmoothedScene, ...]) -> None:
         f"{total.dropped} dropped with {counted(total.dropped_objects, 'object')}; "
         f"{counted(total.joined, 'tracklet')} joined to others"
     )
+
+
+def _configured(family: Family, config: Path | None, method: str, association: AssociationName | None) -> SmoothConfig:
+    """The settings of a run: the family's, the file's, then the options'."""
+    from pipelines.smoothing import load_smooth_config
+
+    association_fits(method, association)
+    settings = load_smooth_config(family, config)
+    return replace(settings, tracking=settings.tracking.with_association(association))

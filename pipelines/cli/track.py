@@ -11,7 +11,15 @@ from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, 
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import Summary
-from pipelines.cli.tracking_options import EstimatorOption, ExplainOption, LagOption, MethodOption, configured, journal
+from pipelines.cli.tracking_options import (
+    AssociationOption,
+    EstimatorOption,
+    ExplainOption,
+    LagOption,
+    MethodOption,
+    configured,
+    journal,
+)
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -37,6 +45,7 @@ def nuscenes(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    association: AssociationOption = None,
     explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -65,7 +74,7 @@ def nuscenes(
     from pipelines.tracking import track_dataset
 
     chosen = chosen_scenes(dataroot, version, split, scenes)
-    settings = configured("nuscenes", config, method, estimator, lag)
+    settings = configured("nuscenes", config, method, estimator, lag, association)
     files = sensor_files(detections)
     apart(output, *files.values())
     dataset = NuScenes(dataroot, version, files, chosen)
@@ -102,6 +111,7 @@ def kitti(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    association: AssociationOption = None,
     explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -120,7 +130,7 @@ def kitti(
     from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("kitti", config, method, estimator, lag)
+    settings = configured("kitti", config, method, estimator, lag, association)
     dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
     kept = journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
@@ -146,6 +156,7 @@ def file(
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
+    association: AssociationOption = None,
     explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -172,7 +183,7 @@ def file(
     from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("file", config, method, estimator, lag)
+    settings = configured("file", config, method, estimator, lag, association)
     kept = journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
         urls = several(detections, scenes)

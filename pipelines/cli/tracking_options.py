@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from saga_fg.errors import InputError
-from saga_fg.tracking import EstimatorName
+from saga_fg.tracking import AssociationName, EstimatorName
 
 if TYPE_CHECKING:
     from pipelines.config import Family, Method, TrackConfig
@@ -33,6 +33,14 @@ LagOption = Annotated[
     float | None,
     typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
 ]
+AssociationOption = Annotated[
+    AssociationName | None,
+    typer.Option(
+        "--association",
+        help="How detections are matched to tracks. hungarian: least total cost; greedy: the cheapest pair first; "
+        "graph: relative positions count as well.  [default: as configured]",
+    ),
+]
 ExplainOption = Annotated[
     bool,
     typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
@@ -40,14 +48,26 @@ ExplainOption = Annotated[
 
 
 def configured(
-    family: Family, config: Path | None, method: Method, estimator: EstimatorName | None, lag: float | None
+    family: Family,
+    config: Path | None,
+    method: Method,
+    estimator: EstimatorName | None,
+    lag: float | None,
+    association: AssociationName | None = None,
 ) -> TrackConfig:
     """The settings of a run: the family's, the file's, then the options'."""
     from pipelines.config import load_config
 
     settings = load_config(family, config)
     _estimator_fits(method, estimator, lag, settings.tracker.estimator)
-    return settings.with_estimator(estimator, lag)
+    association_fits(method, association)
+    return settings.with_estimator(estimator, lag).with_association(association)
+
+
+def association_fits(method: str, association: str | None) -> None:
+    """Raise `InputError` where --association would have no effect."""
+    if method == "centerpoint" and association is not None:
+        raise InputError("--association: the method centerpoint has its own")
 
 
 def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:

@@ -4,6 +4,7 @@ from saga_fg.tracking.greedy import GreedyTracker
 from saga_fg.tracking.journal import Journal
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.settings import (
+    AssociationName,
     AssociationSettings,
     ClassSettings,
     EstimatorName,
@@ -15,6 +16,7 @@ from saga_fg.tracking.settings import (
 from saga_fg.tracking.tracker import Tracker
 
 __all__ = [
+    "AssociationName",
     "AssociationSettings",
     "ClassSettings",
     "EstimatorName",

@@ -16,6 +16,7 @@ from saga_fg.discretisation import discretise
 from saga_fg.estimators import Estimator, FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
+from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.tracking.settings import EstimatorName
 
@@ -151,6 +152,27 @@ class JointTrackState:
             P[rows] = H @ self._estimator.covariance(ids[rows]) @ H.T + R
         return position, P
 
+    def cross_covariances_before(self, ids: IntArray, label: StrArray, delay: float) -> CrossCovariances:
+        """Of the positions `delay` s ago, by own motion, of all pairs of tracks that are correlated (rows of `ids`)."""
+        groups = self._by_type(label, moving=True)
+        group, start = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
+        for number, (node_type, rows) in enumerate(groups):
+            group[rows], start[rows] = number, node_type.dim
+        start = np.cumsum(start) - start
+        joint = self._estimator.joint_covariance(ids)
+        x, y = (start + np.array([node_type.index(POSITION)[k] for node_type, _ in groups])[group] for k in (0, 1))
+        tied = (joint[np.ix_(x, x)] != 0) | (joint[np.ix_(y, y)] != 0)
+        first, second = np.nonzero(np.triu(tied, 1))
+        past = [_position_before(node_type, delay) for node_type, _ in groups]
+        C = np.zeros((len(first), 2, 2))
+        for a, H_a in enumerate(past):
+            for b, H_b in enumerate(past):
+                mine = np.flatnonzero((group[first] == a) & (group[second] == b))
+                rows = start[first[mine], None] + np.arange(H_a.shape[1])
+                columns = start[second[mine], None] + np.arange(H_b.shape[1])
+                C[mine] = H_a @ joint[rows[:, :, None], columns[:, None, :]] @ H_b.T
+        return CrossCovariances(first, second, C)
+
     def snapshot(self) -> Any:
         """The state as a value."""
         return self._estimator.snapshot(), dict(self._born)
@@ -207,6 +229,12 @@ def _moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: 
     F, Q = _own_motion(node_type, delay)
     H_past = H @ np.linalg.inv(F)
     return H_past, R + H_past @ Q @ np.swapaxes(H_past, -1, -2)
+
+
+def _position_before(node_type: NodeType, delay: float) -> FloatArray:
+    """(2, d) that takes the present state to the position `delay` s ago, by own motion."""
+    H = node_type.selector(POSITION)
+    return H @ np.linalg.inv(_own_motion(node_type, delay)[0]) if delay > 0 else H
 
 
 def _own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -11,6 +11,10 @@ below 1 say that they are no more than indications. lambda is how many false det
 as many as the frame's own scores admit, so that it fits any detector. A track that nobody believes in can't take a
 strong detection from afar, least of all among many weak ones, and of two detections the stronger one is preferred.
 
+The assignment is the one of least total cost (`hungarian`), is made cheapest pair first (`greedy`), or registers the
+graph observed to the graph predicted (`graph`): to the costs above come those of `saga_fg.pairwise_costs` between the
+pairs, of all classes, whose tracks the filter knows to be displaced alike.
+
 Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
 Generalized Intersection over Union, CVPR 2019.
 """
@@ -18,17 +22,32 @@ Generalized Intersection over Union, CVPR 2019.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, distinct
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, distinct
 from saga_fg.association import Matching, assign, assign_greedily, gate, mahalanobis
 from saga_fg.boxes import Boxes
 from saga_fg.overlap import giou_3d
+from saga_fg.pairwise_costs import CrossCovariances, pair_costs
+from saga_fg.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import AssociationSettings, TrackerSettings, settings_of
 
 LEAST_CLUTTER = 0.05  # false detections to be reckoned with, however sure the detector is
+
+
+class _ClassCosts(NamedTuple):
+    """Of one class: rows of its tracks (n,) and detections (m,), and for each pair (n, m) the squared distance, the
+    cost less that of leaving both alone, and whether it is inside the gate."""
+
+    track: IntArray
+    detection: IntArray
+    d2: FloatArray
+    gain: FloatArray
+    possible: BoolArray
 
 
 def associate(
@@ -38,6 +57,7 @@ def associate(
     observed: Observed,
     settings: TrackerSettings,
     clutter_area: float,
+    cross: CrossCovariances | None = None,
 ) -> Matching:
     """The pairs of a frame.
 
@@ -45,8 +65,30 @@ def associate(
     P          (n, 2, 2) covariance of their positions
     expected   (n,) chance that the track is detected: its existence times that of an object to be detected
     clutter_area  of the module, m^2, of the sensor that speaks
+    cross      covariances of the positions of tracks with each other, which the method `graph` needs
     """
-    pairs = [Matching.empty()]
+    costs = list(_costs(predicted, P, expected, observed, settings, clutter_area))
+    if not costs:
+        return Matching.empty()
+    if settings.association.method == "graph" and cross is not None:
+        return _registered(costs, predicted, P, observed, cross, settings.association.pair_weight)
+    match = assign_greedily if settings.association.method == "greedy" else assign
+    pairs = []
+    for each in costs:
+        row, column = match(each.gain, each.possible, 0.0)
+        pairs.append(Matching(each.track[row], each.detection[column], each.d2[row, column]))
+    return Matching.concatenate(pairs)
+
+
+def _costs(
+    predicted: Boxes,
+    P: FloatArray,
+    expected: FloatArray,
+    observed: Observed,
+    settings: TrackerSettings,
+    clutter_area: float,
+) -> Iterator[_ClassCosts]:
+    """Class by class, of those that are both predicted and observed."""
     (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(observed.boxes.label)
     for label in classes:
         if label not in seen:
@@ -64,10 +106,35 @@ def associate(
         unmatched = _unmatched(expected[t], observed.probability[d], settings.association, clutter_area)
         if unmatched is None:
             unmatched = cost.max(initial=0.0) + 1.0
-        match = assign if settings.association.method == "hungarian" else assign_greedily
-        row, column = match(cost, possible, unmatched)
-        pairs.append(Matching(t[row], d[column], d2[row, column]))
-    return Matching.concatenate(pairs)
+        yield _ClassCosts(t, d, d2, cost - unmatched, possible)
+
+
+def _registered(
+    costs: list[_ClassCosts],
+    predicted: Boxes,
+    P: FloatArray,
+    observed: Observed,
+    cross: CrossCovariances,
+    weight: float,
+) -> Matching:
+    """The matching of all classes together of least unary and pairwise cost."""
+    at = [np.nonzero(each.possible) for each in costs]
+    track, detection, d2, gain = (
+        np.concatenate(parts)
+        for parts in zip(
+            *(
+                (each.track[row], each.detection[column], each.d2[row, column], each.gain[row, column])
+                for each, (row, column) in zip(costs, at, strict=True)
+            ),
+            strict=True,
+        )
+    )
+    innovation = observed.boxes.position[detection, :2] - predicted.position[track, :2]
+    S = P[track] + observed.R[detection, :2, :2]
+    pairs = pair_costs(track, detection, innovation, S, cross)
+    pairs = pairs._replace(cost=weight * pairs.cost)
+    chosen = QuadraticMatching(track, detection, gain, pairs).solve()
+    return Matching(track[chosen], detection[chosen], d2[chosen])
 
 
 def _unmatched(

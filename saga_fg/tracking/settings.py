@@ -17,6 +17,7 @@ from saga_fg.sensor import DEFAULT
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
+AssociationName = Literal["hungarian", "greedy", "graph"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,10 @@ def class_values(classes: Mapping[str, ClassSettings], name: str, label: StrArra
 class AssociationSettings:
     """How detections are matched to tracks, see `saga_fg.tracking.matching`; gates and caps are the classes'."""
 
-    method: Literal["hungarian", "greedy"] = setting("hungarian", "least total cost, or the cheapest pair first")
+    method: AssociationName = setting(
+        "hungarian", "least total cost, the cheapest pair first, or graph: what pairs say of each other counts too"
+    )
+    pair_weight: float = setting(1.0, "how much that counts, 1 by its face value, 0 not; used with method: graph")
     clutter_area: float = setting(
         math.inf, "what is false in a frame is spread over this area, m^2; .inf: any pair inside the gate is a match"
     )
@@ -73,9 +77,9 @@ class AssociationSettings:
     score_weight: float = setting(0.5, "how much the probability of a detection counts, 1 by its face value, 0 not")
 
     def __post_init__(self) -> None:
-        require_one_of(self, "method", ("hungarian", "greedy"))
+        require_one_of(self, "method", get_args(AssociationName))
         require_positive(self, "clutter_area", infinite=True)
-        require_between(self, 0, math.inf, "existence_weight", "score_weight")
+        require_between(self, 0, math.inf, "existence_weight", "score_weight", "pair_weight")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.interactions import NodeTable
+from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
@@ -190,11 +191,19 @@ class Tracker:
         columns = self._columns
         if len(columns.id) == 0 or len(observed) == 0:
             return Matching.empty()
-        position, P = self._state.positions_before(columns.id, columns.label, delay)
+        position, P, cross = self._predicted_positions(delay)
         predicted = self._boxes(np.arange(len(columns.id)), position, np.full_like(position, np.nan))
         expected = columns.existence * sensor.detection_chance(columns.label)
         area = self.settings.association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
-        return associate(predicted, P, expected, observed, self.settings, area)
+        return associate(predicted, P, expected, observed, self.settings, area, cross)
+
+    def _predicted_positions(self, delay: float) -> tuple[FloatArray, FloatArray, CrossCovariances | None]:
+        """Of all tracks `delay` s ago; with the covariances between them where they are needed."""
+        ids, label = self._columns.id, self._columns.label
+        position, P = self._state.positions_before(ids, label, delay)
+        if self.settings.association.method != "graph":
+            return position, P, None
+        return position, P, self._state.cross_covariances_before(ids, label, delay)
 
     def _update(self, observed: Observed, matching: Matching, delay: float) -> None:
         columns, boxes = self._columns, observed.boxes

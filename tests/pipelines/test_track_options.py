@@ -21,6 +21,7 @@ def run(*arguments: str) -> tuple[int, str]:
     ("arguments", "message"),
     [
         (("--method", "centerpoint", "--estimator", "isam2"), "has no estimator"),
+        (("--method", "centerpoint", "--association", "graph"), "has its own"),
         (("--lag", "1"), "goes with --estimator fixed-lag"),
         (("--estimator", "kalman", "--lag", "1"), "goes with --estimator fixed-lag"),
     ],
@@ -49,3 +50,15 @@ def test_a_place_without_digits_is_refused(tmp_path: Path) -> None:
     code, text = run(str(detections), "--output", str(tmp_path / "tracks.csv"))
     assert code == 2
     assert "within 1e+09" in text
+
+
+def test_the_way_of_matching_is_an_option(tmp_path: Path) -> None:
+    """Two cars cross at one place: told to take the nearest pair first, the tracker does something else."""
+    detections = tmp_path / "detections.csv"
+    detections.write_text("timestamp,x,y\n0.0,0.0,0.0\n0.0,3.0,0.0\n0.5,2.0,0.0\n0.5,6.0,0.0\n")
+    tracks = {}
+    for method in ("hungarian", "greedy", "graph"):
+        output = tmp_path / f"{method}.csv"
+        assert run(str(detections), "--output", str(output), "--association", method)[0] == 0
+        tracks[method] = output.read_text()
+    assert tracks["graph"] == tracks["hungarian"] != tracks["greedy"]

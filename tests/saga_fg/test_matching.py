@@ -5,6 +5,7 @@ import pytest
 
 from saga_fg import Boxes, TrackerSettings
 from saga_fg.association import assign_greedily
+from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.matching import associate
 from saga_fg.tracking.observation import Observed
@@ -36,7 +37,8 @@ def observed(found, probability, noise=0.3):
     )
 
 
-def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None, **association):
+def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None, shared=0.0, **association):
+    """`shared`: the share of their variance that tracks have in common."""
     n = len(tracks)
     settings = TrackerSettings(
         classes or {"default": ClassSettings(max_distance=20.0)}, association=AssociationSettings(**association)
@@ -49,6 +51,7 @@ def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None,
         observed(found, probability),
         settings,
         settings.association.clutter_area,
+        CrossCovariances(*np.triu_indices(n, 1), np.tile(shared * sigma**2 * np.eye(2), (n * (n - 1) // 2, 1, 1))),
     )
     return sorted(zip(matching.track.tolist(), matching.detection.tolist(), strict=True))
 
@@ -103,6 +106,45 @@ def test_overlap_decides_between_detections_equally_far():
 @pytest.mark.parametrize(("method", "chosen"), [("hungarian", [(0, 0), (1, 1)]), ("greedy", [(1, 0)])])
 def test_greed_takes_the_nearest_pair_first(method, chosen):
     assert pairs(boxes([0.0, 3.0]), boxes([2.0, 6.0]), method=method) == chosen
+
+
+ROW = np.arange(0.0, 25.0, 5.0)  # a group in a row, one behind the other
+
+
+def test_a_group_that_is_displaced_as_one_keeps_its_order():
+    """Everybody is nine tenths of the spacing further on: one by one, the detection of the one behind is nearer."""
+    told = {"sigma": 1.5, "clutter_area": 1e4, "score_weight": 0.0, "existence_weight": 0.0}
+    swapped, kept = [(k + 1, k) for k in range(4)], [(k, k) for k in range(5)]
+    tracks, found = boxes(ROW), boxes(ROW + 4.5)
+    assert [
+        pair for pair in pairs(tracks, found, method="hungarian", shared=0.98, **told) if pair in swapped
+    ] == swapped
+    assert pairs(tracks, found, method="graph", shared=0.98, **told) == kept
+
+
+def test_the_one_that_is_missed_leaves_the_others_where_they_are():
+    told = {"sigma": 1.5, "clutter_area": 1e4, "score_weight": 0.0, "existence_weight": 0.0}
+    seen = np.array([0, 1, 3, 4])
+    chosen = pairs(boxes(ROW), boxes(ROW[seen] + 4.5), method="graph", shared=0.98, **told)
+    assert chosen == [(int(k), row) for row, k in enumerate(seen)]
+
+
+def test_the_graph_ties_classes_together():
+    """The bus has but one detection; that the cars moved alike says which is whose."""
+    tracks, found = boxes([0.0, 5.0, 30.0], ["car", "car", "bus"]), boxes([4.0, 9.0, 34.0], ["car", "car", "bus"])
+    told = {"sigma": 3.0, "clutter_area": 1e4, "score_weight": 0.0, "existence_weight": 0.0}
+    assert pairs(tracks, found, method="graph", shared=0.98, **told) == [(0, 0), (1, 1), (2, 2)]
+
+
+@pytest.mark.parametrize("changed", [{"shared": 0.0}, {"shared": 0.9, "pair_weight": 0.0}])
+def test_without_anything_in_common_the_graph_matches_as_hungarian(changed):
+    rng = np.random.default_rng(0)
+    told = {"sigma": 2.0, "clutter_area": 1e3}
+    for _ in range(20):
+        tracks, found = (
+            boxes(rng.uniform(0, 15, 6), rng.choice(["car", "bus"], 6), y=rng.normal(size=6)) for _ in "ab"
+        )
+        assert pairs(tracks, found, method="graph", **changed, **told) == pairs(tracks, found, **told)
 
 
 def test_greedy_assignment_in_the_order_of_cost():

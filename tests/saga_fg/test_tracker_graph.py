@@ -7,7 +7,7 @@ from traffic_frames import columns, frame, run, seen, straight
 from saga_fg import ConstantVelocity, Detections, Frame, InputError, Tracker, TrackerSettings
 from saga_fg.edge_rules import Following, Neighbours, Pairs
 from saga_fg.interactions import SharedVelocity
-from saga_fg.tracking import ClassSettings
+from saga_fg.tracking import AssociationSettings, ClassSettings
 
 PATIENT = {
     "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_coasting=10.0)},
@@ -146,3 +146,30 @@ def test_an_empty_table_of_detections_with_a_graph():
     run(tracker, seen(np.random.default_rng(0), braking_platoon, np.arange(0, 1, 0.1)))
     nothing = tracker.step(Frame(1.0, "lidar", Detections.empty()))
     assert nothing.id.tolist() == [1, 2, 3, 4]
+
+
+def braking_behind_a_wall(method, estimator="kalman", gap=4.5):
+    """Ids of five cars before and after they pass behind a wall, where all of them brake."""
+    rng = np.random.default_rng(0)
+    edges = (Neighbours(rate=1.0, distance_scale=20.0, speed_scale=np.inf),)
+    association = AssociationSettings(method=method, clutter_area=1e4, existence_weight=0.0)
+    far = {"default": ClassSettings(motion=ConstantVelocity(10.0), max_coasting=10.0, max_distance=15.0)}
+    told = PATIENT | {"classes": far}
+    tracker = Tracker(TrackerSettings(edges=edges, association=association, estimator=estimator, **told))
+    ids = []
+    for t in np.arange(0.0, 5.21, 0.2):
+        if 3.1 < t < 5.1:
+            continue
+        position = braking_platoon(t, n=5, gap=gap) + 0.1 * rng.normal(size=(5, 2))
+        tracks = tracker.step(frame(t, position))
+        tracks = tracks.select(tracks.coasting == 0)
+        ids.append(tracks.id[np.argsort(-tracks.boxes.position[:, 0])].tolist())
+    return ids[-2], ids[-1]
+
+
+def test_a_group_that_braked_unseen_keeps_its_identities_by_its_shape():
+    before, after = braking_behind_a_wall("hungarian")
+    assert after != before, "the test would show nothing"
+    for estimator in ("kalman", "isam2", "fixed-lag"):
+        before, after = braking_behind_a_wall("graph", estimator)
+        assert after == before == [1, 2, 3, 4, 5]
