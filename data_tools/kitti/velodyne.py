@@ -24,6 +24,8 @@ from saga_fg.geometry import inverse_transform
 class KittiScans:
     """The scans of a sequence, the first `most` or all of them, read one at a time; `timed`: with times of points.
 
+    With `blind` there is one for each GPS/IMU record, without any points, for what needs none.
+
     frames         (K,) their frame numbers, in order; timestamps (K,) s
     ego_T_lidar    (4, 4) place of the sensor on the vehicle
     world_T_ego    (K, 4, 4) pose of the vehicle by GPS/IMU at each scan
@@ -31,30 +33,40 @@ class KittiScans:
     Raises `InputError` where there are none, and for a scan without a GPS/IMU record.
     """
 
-    def __init__(self, dataroot: str | Path, sequence: str, timed: bool = True, most: int | None = None) -> None:
+    def __init__(
+        self, dataroot: str | Path, sequence: str, timed: bool = True, most: int | None = None, blind: bool = False
+    ) -> None:
         root = Path(dataroot)
         root = root / "training" if (root / "training").is_dir() else root
         dataset = KittiTracking(dataroot, sequences=[sequence])
         calibration = dataset.calibration(sequence)
-        folder = root / "velodyne" / sequence
-        self._files = tuple(sorted(path for path in folder.glob("*.bin") if path.stem.isdigit()))[:most]
-        if not self._files:
-            raise InputError(f"{folder}: expected LiDAR scans KKKKKK.bin, there are none")
-        self.frames = np.array([int(path.stem) for path in self._files], dtype=np.int64)
         poses = dataset.scene(sequence).world_T_ego
-        if self.frames[-1] >= len(poses):
-            raise InputError(f"{self._files[-1]}: expected frames 0 to {len(poses) - 1}, as there are GPS/IMU records")
+        self._files = () if blind else _files(root / "velodyne" / sequence, len(poses))[:most]
+        frames = range(len(poses))[:most] if blind else [int(path.stem) for path in self._files]
+        self.frames = np.array(frames, dtype=np.int64)
         self.timestamps: FloatArray = self.frames.astype(np.float64) * FRAME_PERIOD
         self.world_T_ego: FloatArray = poses[self.frames]
         self.ego_T_lidar: FloatArray = inverse_transform(calibration.camera_T_imu) @ calibration.camera_T_velodyne
         self._timed = timed
 
     def __len__(self) -> int:
-        return len(self._files)
+        return len(self.frames)
 
     def __getitem__(self, row: int) -> Scan:
+        if not self._files:
+            return Scan(np.empty((0, 3)), np.empty(0))
         scan = read_scan(self._files[row])
         return replace(scan, time=azimuth_times(scan.points, FRAME_PERIOD)) if self._timed else scan
 
     def __iter__(self) -> Iterator[Scan]:
         return (self[row] for row in range(len(self)))
+
+
+def _files(folder: Path, records: int) -> tuple[Path, ...]:
+    """The scans in a folder, in order."""
+    files = tuple(sorted(path for path in folder.glob("*.bin") if path.stem.isdigit()))
+    if not files:
+        raise InputError(f"{folder}: expected LiDAR scans KKKKKK.bin, there are none")
+    if int(files[-1].stem) >= records:
+        raise InputError(f"{files[-1]}: expected frames 0 to {records - 1}, as there are GPS/IMU records")
+    return files

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,16 @@ MARGIN = 30.0  # m around the paths
 
 
 def scan_map_from_above(
-    points: FloatArray, paths: Mapping[str, FloatArray], poles: FloatArray, walls: FloatArray
+    points: FloatArray,
+    paths: Mapping[str, FloatArray],
+    poles: FloatArray,
+    walls: FloatArray,
+    tracks: Sequence[FloatArray] = (),
 ) -> Any:
     """A matplotlib `Figure`; everything in world coordinates, m.
 
-    points  (N, 3); paths (K, 3), each under its name; poles (P, 2); walls (W, 2, 2) their two ends
+    points  (N, 3); paths (K, 3), each under its name; poles (P, 2); walls (W, 2, 2) their two ends; tracks (n, 2) of
+    objects
     """
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -35,6 +40,9 @@ def scan_map_from_above(
         ax.plot(
             *poles.T, "o", color="#ff7f0e", markersize=4, markeredgecolor="black", markeredgewidth=0.4, label="poles"
         )
+    if tracks:
+        ax.add_collection(LineCollection(list(tracks), colors="#2ca02c", linewidths=1.2, label="objects"))
+        ax.plot(*np.array([track[-1] for track in tracks]).T, "s", color="#2ca02c", markersize=3)
     for (name, path), colour in zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False):
         ax.plot(*path[:, :2].T, color=colour, linewidth=1.5, label=name)
     driven = np.concatenate([path[:, :2] for path in paths.values()])

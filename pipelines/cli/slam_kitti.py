@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Verbose
-from pipelines.cli.reporting import progress_bar
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import progress_bar, working
 from pipelines.cli.summary import counted
 
 
@@ -26,39 +26,72 @@ def kitti(
     landmarks: Annotated[
         bool, typer.Option("--landmarks/--no-landmarks", help="Walls and poles as nodes of the graph.")
     ] = True,
+    objects: Annotated[
+        bool, typer.Option("--objects", help="The objects of a detector as nodes of the same graph.")
+    ] = False,
+    detections: Annotated[
+        Path | None,
+        typer.Option(
+            "--detections",
+            help="Folder of a detector: Car/, Pedestrian/, Cyclist/; DATAROOT/detections/pointrcnn if not given.",
+        ),
+    ] = None,
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
+    config: Config = None,
     verbose: Verbose = False,
 ) -> None:
-    """LiDAR SLAM on a KITTI sequence: poses, walls and poles in one graph.
+    """LiDAR SLAM on a KITTI sequence: poses, walls, poles and, with --objects, what moves, in one graph.
 
     Writes the trajectory (KITTI and TUM formats), covariances.csv, the map and the landmarks (map.ply, landmarks.ply,
-    landmarks.json), a picture from above (above.png) and the errors against GPS/IMU (metrics.json).
+    landmarks.json), the objects in the world (tracks.csv), a picture from above (above.png) and the errors against
+    GPS/IMU (metrics.json). With --objects and --odometry oxts a sequence needs no scans.
 
     \b
     Examples:
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --output slam
-      saga-fg slam kitti --dataroot data/kitti --odometry oxts --no-landmarks --output slam
+      saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
+      saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
     from data_tools.atomic_files import atomic_directory
-    from data_tools.kitti import KittiScans
+    from data_tools.kitti import KittiScans, KittiTracking
+    from pipelines.config import load_config
     from pipelines.slam.kitti import write_lidar_slam
     from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+    from pipelines.slam.with_objects import with_objects
+    from saga_fg.errors import InputError
 
-    recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans)
+    if detections is not None and not objects:
+        raise InputError("--detections: expected with --objects only")
+    frames, tracker = [], load_config("kitti", config)
+    if objects:
+        detector = detections or dataroot / "detections" / "pointrcnn"
+        frames = list(KittiTracking(dataroot, detector, [sequence]).scene(sequence).frames)
+    training = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
+    blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
+    recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
     if not output.exists():
         with atomic_directory(output):
             pass  # a folder that cannot be written is said before the work, not after it
         output.rmdir()
     with progress_bar() as progress:
-        result = lidar_slam(recorded, odometry, LidarSlamSettings(landmarks=landmarks), progress)
-    figures = write_lidar_slam(output, result, recorded)
+        settings = LidarSlamSettings(landmarks=landmarks and not blind, loop_closures=not blind)
+        result = lidar_slam(recorded, odometry, settings, progress)
+    if objects:
+        with working("objects"):
+            figures = write_lidar_slam(output, with_objects(result, recorded, frames, tracker, settings), recorded)
+    else:
+        figures = write_lidar_slam(output, result, recorded)
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
-    typer.echo(f"{output}: {', '.join([*counts, counted(figures['loops'], 'loop')])}")
-    for name in ("odometry", "online", "trajectory"):
-        e = figures[name]
+    counts.append(counted(figures["loops"], "loop"))
+    if objects:
+        counts.append(counted(figures["objects"], "object"))
+    typer.echo(f"{output}: {', '.join(counts)}")
+    for name in ("odometry", "online", *(["without_objects"] if objects else []), "trajectory"):
+        e, what = figures[name], name.replace("_", " ")
         typer.echo(
-            f"{name} against GPS/IMU: ATE {e['ate']:.3f} m, RPE {e['relative_translation']:.3f} m and "
+            f"{what} against GPS/IMU: ATE {e['ate']:.3f} m, RPE {e['relative_translation']:.3f} m and "
             f"{57.29578 * e['relative_rotation']:.3f} deg per {e['relative_distance']:g} m, end {e['end_error']:.3f} m"
         )
-    typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")
+    if not blind:
+        typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")

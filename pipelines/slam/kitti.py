@@ -8,7 +8,8 @@ covariances.csv             of the sensor's pose at the keyframes: time, then th
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 landmarks.json              kind, number of sightings, coordinates and covariance of each landmark
 landmarks.ply               the same to look at: points along the poles and on the seen pieces of the walls
-above.png                   map, paths and landmarks from above
+tracks.csv                  with objects: those in the world at every moment of the graph, see `object_tracks`
+above.png                   map, paths, landmarks and the objects' tracks from above
 metrics.json                errors of the trajectories against the recording's own poses, and the map's sharpness
 
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
@@ -30,7 +31,9 @@ from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam
+from pipelines.slam.object_tracks import tracks, tracks_csv
 from pipelines.slam.sightings import POLE
+from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.arrays import FloatArray
 from saga_fg.geometry import transform_points
 from saga_fg.landmarks import Landmark
@@ -42,12 +45,13 @@ _COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
 def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
     """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts."""
     truth = Trajectory(scans.timestamps, scans.world_T_ego)
+    residual = scan_to_map_residual(result.clouds, result.world_T_lidar)
     kinds = [landmark.kind.name for landmark in result.landmarks]
     return {
         "keyframes": len(result.keyframes),
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
         "loops": len(result.loops),
-        "scan_to_map_residual": scan_to_map_residual(result.clouds, result.world_T_lidar),
+        "scan_to_map_residual": residual if np.isfinite(residual) else None,
         **{
             name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
             for name in ("odometry", "online", "trajectory")
@@ -55,10 +59,16 @@ def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
     }
 
 
-def write_lidar_slam(output: Path, result: LidarSlam, scans: ScanSequence, spacing: float = 0.2) -> dict[str, Any]:
+def write_lidar_slam(
+    output: Path, found: LidarSlam | SlamWithObjects, scans: ScanSequence, spacing: float = 0.2
+) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics. `spacing` of the map's points, m."""
+    result, objects = (found, None) if isinstance(found, LidarSlam) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
     figures = metrics(result, scans)
+    if isinstance(found, SlamWithObjects):
+        figures["objects"] = len(tracks(found.estimate))
+        figures["without_objects"] = metrics(found.alone, scans)["trajectory"]
     with atomic_directory(output) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
         for name, trajectory in (
@@ -69,7 +79,10 @@ def write_lidar_slam(output: Path, result: LidarSlam, scans: ScanSequence, spaci
         write_ply(folder / "map.ply", points)
         _write_landmarks(folder, result)
         paths = {"GPS/IMU": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
-        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _wall_ends(result))
+        if objects is not None:
+            write_text(folder / "tracks.csv", tracks_csv(objects))
+        driven = () if objects is None else tuple(tracks(objects).values())
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _wall_ends(result), driven)
         write_bytes(folder / "above.png", png(figure))
         write_text(folder / "metrics.json", json.dumps(figures, indent=1) + "\n")
     return figures

@@ -14,29 +14,34 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import gtsam
 import numpy as np
 
-from data_tools.lidar import constant_velocity, deskewed, voxel_downsample
+from data_tools.lidar import voxel_downsample
 from data_tools.trajectories import Trajectory
 from factors import Linearisable, ResidualFactors, Robust, Solution, between_factor, pose, pose_prior_factor, solve
 from pipelines.scan_sequence import ScanSequence
+from pipelines.slam.drive import LEAST, Drive, drive_by_lidar, drive_by_poses
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, find_loops
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings
+from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.sightings import Seen, SightingSettings, landmarks_seen
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.ego import JointSettings, OdometryNoise, landmark_key, pose_key
 from saga_fg.geometry import inverse_transform
-from saga_fg.landmarks import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting
+from saga_fg.landmarks import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting, sighting_factors
 from saga_fg.settings import require_positive, setting, settings_group
 
 OdometrySource = Literal["lidar", "oxts"]
-_LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: what no registration gets better than, rad and m
 _START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
+# slow errors of an odometry that has hardly any; what else it does is in its covariances
+CALIBRATED = OdometryNoise(
+    turn_noise=1e-3, distance_noise=0.01, scale=1e-3, scale_drift=1e-4, bias=1e-4, bias_drift=1e-5
+)
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,7 @@ class LidarSlamSettings:
     loop_closures: bool = setting(True, "whether loops are looked for")
     robust_scale: float = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
     map_spacing: float = setting(0.25, "a scan is thinned to this for the accumulated map, m")
+    objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "of objects in the same graph")
     oxts_rotation: float = setting(1e-3, "standard deviation of a motion by GPS/IMU between scans, rad")
     oxts_translation: float = setting(0.03, "and of its translation, m")
 
@@ -62,9 +68,9 @@ class LidarSlamSettings:
 class LidarSlam:
     """What a run made of K scans, M of them keyframes. World coordinates are those of the recording's first pose.
 
+    drive        what the odometry says; keyframes (M,) are rows among the scans
     odometry     (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
                  when the keyframe came
-    keyframes    (M,) rows of the keyframes among the scans
     covariances  (M, 6, 6) of the sensor's pose at the keyframes, (rotation, translation) in its frame, rad^2, m^2
     landmarks    of the map, those seen more than once
     sightings    what was seen, of which of them, from which keyframe
@@ -73,10 +79,10 @@ class LidarSlam:
     clouds       M arrays (N, 3), thinned, without skew, in the sensor's frame; world_T_lidar (M, 4, 4) their places
     """
 
+    drive: Drive
     odometry: Trajectory
     trajectory: Trajectory
     online: Trajectory
-    keyframes: IntArray
     covariances: FloatArray
     landmarks: Sequence[Landmark]
     sightings: Sequence[Sighting]
@@ -85,15 +91,10 @@ class LidarSlam:
     clouds: Sequence[FloatArray]
     world_T_lidar: FloatArray
 
-
-@dataclass(frozen=True, eq=False)
-class _Drive:
-    """Odometry: poses (K, 4, 4) of the sensor, motion covariances (K, 6, 6), keyframe rows, their points."""
-
-    poses: FloatArray
-    covariances: FloatArray
-    keyframes: list[int]
-    points: list[FloatArray]
+    @property
+    def keyframes(self) -> IntArray:
+        """(M,) rows of the keyframes among the scans."""
+        return np.array(self.drive.keyframes, dtype=np.int64)
 
 
 def lidar_slam(
@@ -107,8 +108,11 @@ def lidar_slam(
     """
     s = settings or LidarSlamSettings()
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
-    drive = _by_lidar(scans, start, s, progress) if source == "lidar" else _by_oxts(scans, s, progress)
-    motions = _motions(drive)
+    if source == "lidar":
+        drive = drive_by_lidar(scans, start, s.odometry, progress)
+    else:
+        drive = drive_by_poses(scans, s.oxts_rotation, s.oxts_translation, s.odometry, progress)
+    motions = drive.motions(drive.keyframes)
     mapper = LandmarkMapper(drive.poses[0], _START, s.mapper)
     online, seen = [], list[list[Seen]]()
     for k, points in enumerate(drive.points):
@@ -125,14 +129,14 @@ def lidar_slam(
     loops = find_loops(clouds, landmark_map.world_T_pose, s.loops) if s.loop_closures else []
     solution = _solved(landmark_map, motions, loops, Robust("geman-mcclure", s.robust_scale))
     count = len(drive.keyframes)
-    world_T_lidar = np.array([solution.values.atPose3(_pose_key(k)).matrix() for k in range(count)])
+    world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
     return LidarSlam(
+        drive,
         _trajectory(scans, drive.poses),
-        _trajectory(scans, _carried(drive, world_T_lidar)),
-        _trajectory(scans, _carried(drive, np.array(online))),
-        np.array(drive.keyframes, dtype=np.int64),
-        np.array([solution.covariance([_pose_key(k)]) for k in range(count)]),
-        _updated([mark for mark in landmark_map.landmarks if mark.confirmed], solution),
+        _trajectory(scans, drive.carried(world_T_lidar)),
+        _trajectory(scans, drive.carried(np.array(online))),
+        np.array([solution.covariance([pose_key(k)]) for k in range(count)]),
+        updated((mark for mark in landmark_map.landmarks if mark.confirmed), solution),
         landmark_map.sightings,
         [each.extent for scan in seen for each in scan],
         loops,
@@ -141,49 +145,17 @@ def lidar_slam(
     )
 
 
-def _by_lidar(scans: ScanSequence, start: FloatArray, s: LidarSlamSettings, progress: Progress | None) -> _Drive:
-    odometry = LidarOdometry(s.odometry)
-    drive = _Drive(np.empty((len(scans), 4, 4)), np.empty((len(scans), 6, 6)), [], [])
-    for k, timestamp in enumerate(scans.timestamps.tolist()):
-        step = odometry.step(scans[k], timestamp)
-        drive.poses[k], drive.covariances[k] = start @ step.map_T_lidar, step.covariance + _LEAST
-        if step.keyframe:
-            drive.keyframes.append(k)
-            drive.points.append(step.scan.points)
-        if progress is not None:
-            progress("odometry", k + 1, len(scans))
-    return drive
-
-
-def _by_oxts(scans: ScanSequence, s: LidarSlamSettings, progress: Progress | None) -> _Drive:
-    poses = scans.world_T_ego @ scans.ego_T_lidar
-    noise = np.diag([s.oxts_rotation] * 3 + [s.oxts_translation] * 3) ** 2
-    drive = _Drive(poses, np.broadcast_to(noise, (len(scans), 6, 6)), [], [])
-    for k in range(len(scans)):
-        moved = inverse_transform(poses[drive.keyframes[-1]]) @ poses[k] if k else np.eye(4)
-        if k == 0 or np.linalg.norm(moved[:3, 3]) >= s.odometry.keyframe_distance:
-            scan = scans[k].within(s.odometry.nearest, s.odometry.reach)
-            before = max(k - 1, 0)
-            if scan.time is not None:
-                duration = float(scans.timestamps[before + 1] - scans.timestamps[before])
-                scan = deskewed(scan, constant_velocity(inverse_transform(poses[before]) @ poses[before + 1], duration))
-            drive.keyframes.append(k)
-            drive.points.append(scan.points)
-        if progress is not None:
-            progress("reading", k + 1, len(scans))
-    return drive
-
-
-def _motions(drive: _Drive) -> list[tuple[FloatArray, FloatArray]]:
-    """From each keyframe to the next: motion (4, 4), and the covariances of the steps added up at its end (6, 6)."""
-    motions = []
-    for a, b in zip(drive.keyframes[:-1], drive.keyframes[1:], strict=True):
-        total = np.zeros((6, 6))
-        for k in range(a + 1, b + 1):
-            Ad = gtsam.Pose3(inverse_transform(drive.poses[b]) @ drive.poses[k]).AdjointMap()
-            total += Ad @ drive.covariances[k] @ Ad.T
-        motions.append((inverse_transform(drive.poses[a]) @ drive.poses[b], (total + total.T) / 2))
-    return motions
+def graph_of(
+    sightings: Iterable[Sighting], loops: Sequence[LoopClosure], moments: Sequence[int], robust: Robust
+) -> tuple[gtsam.NonlinearFactorGraph, list[Linearisable]]:
+    """Factors of landmarks seen from keyframes and of loops between these, whose poses have the keys of `moments`."""
+    graph, factors = sighting_factors(
+        (pose_key(moments[s.pose]), landmark_key(s.landmark), s.observation) for s in sightings
+    )
+    for loop in loops:
+        keys = (pose_key(moments[loop.first]), pose_key(moments[loop.second]))
+        graph.add(between_factor(*keys, loop.first_T_second, loop.covariance + LEAST, robust))
+    return graph, [replace(f, robust=robust) if isinstance(f, ResidualFactors) else f for f in factors]
 
 
 def _solved(
@@ -193,60 +165,30 @@ def _solved(
     robust: Robust,
 ) -> Solution:
     """The whole graph, from where the mapper left it."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(pose_prior_factor(_pose_key(0), landmark_map.world_T_pose[0], _START))
+    poses = landmark_map.world_T_pose
+    certain = {landmark.number: landmark for landmark in landmark_map.landmarks if landmark.confirmed}
+    sightings = (s for s in landmark_map.sightings if s.landmark in certain)
+    graph, factors = graph_of(sightings, loops, range(len(poses)), robust)
+    graph.add(pose_prior_factor(pose_key(0), poses[0], _START))
     for k, (motion, covariance) in enumerate(motions):
-        graph.add(between_factor(_pose_key(k), _pose_key(k + 1), motion, covariance))
-    for loop in loops:
-        keys = (_pose_key(loop.first), _pose_key(loop.second))
-        graph.add(between_factor(*keys, loop.first_T_second, loop.covariance + _LEAST, robust))
-    for k, world_T_pose in enumerate(landmark_map.world_T_pose):
-        values.insert(_pose_key(k), pose("world_T_pose", world_T_pose))
-    for landmark in landmark_map.landmarks:
-        if landmark.confirmed:
-            values.insert(_landmark_key(landmark.number), landmark.state)
-    factors: list[Linearisable] = []
-    by_kind: dict[str, list[Sighting]] = {}
-    certain = {landmark.number for landmark in landmark_map.landmarks if landmark.confirmed}
-    for sighting in (s for s in landmark_map.sightings if s.landmark in certain):
-        by_kind.setdefault(sighting.observation.kind.name, []).append(sighting)
-    for sightings in by_kind.values():
-        made = sightings[0].observation.kind.factors(
-            np.array([[_pose_key(s.pose), _landmark_key(s.landmark)] for s in sightings], dtype=np.int64),
-            np.stack([s.observation.value for s in sightings]),
-            np.stack([s.observation.covariance for s in sightings]),
-        )
-        if isinstance(made, gtsam.NonlinearFactorGraph):
-            graph.push_back(made)
-        else:
-            factors += [replace(f, robust=robust) if isinstance(f, ResidualFactors) else f for f in made]
+        graph.add(between_factor(pose_key(k), pose_key(k + 1), motion, covariance))
+    values = gtsam.Values()
+    for k, world_T_pose in enumerate(poses):
+        values.insert(pose_key(k), pose("world_T_pose", world_T_pose))
+    for number, landmark in certain.items():
+        values.insert(landmark_key(number), landmark.state)
     return solve(graph, factors, values)
 
 
-def _updated(landmarks: Sequence[Landmark], solution: Solution) -> list[Landmark]:
-    """The landmarks where the last solution has them."""
-    updated = []
+def updated(landmarks: Iterable[Landmark], solution: Solution) -> list[Landmark]:
+    """The landmarks where a solution has them."""
+    found = []
     for mark in landmarks:
-        key = _landmark_key(mark.number)
+        key = landmark_key(mark.number)
         state, covariance = mark.kind.variable.read(solution.values, key), solution.covariance([key])
-        updated.append(Landmark(mark.number, mark.kind, state, covariance, mark.sightings, mark.confirmed))
-    return updated
-
-
-def _carried(drive: _Drive, world_T_keyframe: FloatArray) -> FloatArray:
-    """Poses (K, 4, 4) of all scans, each fixed to the keyframe before it."""
-    of = np.searchsorted(drive.keyframes, np.arange(len(drive.poses)), side="right") - 1
-    reference = drive.poses[np.array(drive.keyframes)[of]]
-    return np.asarray(world_T_keyframe[of] @ inverse_transform(reference) @ drive.poses)
+        found.append(replace(mark, state=state, covariance=covariance))
+    return found
 
 
 def _trajectory(scans: ScanSequence, world_T_lidar: FloatArray) -> Trajectory:
     return Trajectory(scans.timestamps, world_T_lidar @ inverse_transform(scans.ego_T_lidar))
-
-
-def _pose_key(index: int) -> int:
-    return int(gtsam.symbol("x", index))
-
-
-def _landmark_key(number: int) -> int:
-    return int(gtsam.symbol("l", number))

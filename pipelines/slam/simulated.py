@@ -22,6 +22,7 @@ from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import SurroundingSettings
 from data_tools.trajectories import write_kitti_poses, write_tum_poses
 from pipelines.slam.joint import JointRun
+from pipelines.slam.object_tracks import tracks, tracks_csv
 
 
 def street() -> SimulatorSettings:
@@ -38,7 +39,7 @@ def write_joint(output: Path, run: JointRun) -> None:
         write_tum_poses(folder / "joint.tum", run.joint)
         write_kitti_poses(folder / "joint.txt", run.joint, folder / "times.txt")
         write_text(folder / "covariances.csv", _covariances(run))
-        write_text(folder / "tracks.csv", _tracks(run))
+        write_text(folder / "tracks.csv", tracks_csv(run.estimate))
         errors = {"odometry": asdict(odometry), "joint": asdict(joint)}
         write_text(folder / "errors.json", json.dumps(errors, indent=1) + "\n")
         write_bytes(folder / "above.png", png(picture(run)))
@@ -47,12 +48,8 @@ def write_joint(output: Path, run: JointRun) -> None:
 def picture(run: JointRun) -> Any:
     """The paths from above, and where objects were last seen."""
     paths = {"truth": run.truth.positions, "odometry": run.odometry.positions, "joint": run.joint.positions}
-    last = {
-        name: place
-        for objects in run.estimate.objects
-        for name, place in zip(objects.id.tolist(), objects.position, strict=True)
-    }
-    return paths_from_above(paths, {"objects": np.array(list(last.values())).reshape(-1, 2)})
+    last = np.array([track[-1] for track in tracks(run.estimate).values()]).reshape(-1, 2)
+    return paths_from_above(paths, {"objects": last})
 
 
 def _covariances(run: JointRun) -> str:
@@ -60,16 +57,4 @@ def _covariances(run: JointRun) -> str:
     rows = [",".join(["timestamp", *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))])]
     for time, P in zip(run.estimate.timestamps.tolist(), run.estimate.pose_covariances, strict=True):
         rows.append(",".join([f"{time:.6f}", *(f"{x:.6g}" for x in P[upper])]))
-    return "\n".join(rows) + "\n"
-
-
-def _tracks(run: JointRun) -> str:
-    rows = ["timestamp,id,x,y,vx,vy,sigma_x,sigma_y,sigma_vx,sigma_vy"]
-    for moment, (time, objects) in enumerate(zip(run.estimate.timestamps, run.estimate.objects, strict=True)):
-        sigma = np.sqrt(np.diagonal(run.estimate.object_covariances(moment), axis1=1, axis2=2))
-        table = np.concatenate([objects.position, objects.velocity, sigma], axis=1)
-        rows += [
-            f"{time:.6f},{name}," + ",".join(f"{x:.4f}" for x in row)
-            for name, row in zip(objects.id.tolist(), table, strict=True)
-        ]
     return "\n".join(rows) + "\n"

@@ -2,16 +2,20 @@
 
 from saga_fg.ego.batch import estimate_jointly
 from saga_fg.ego.estimate import JointEstimate, ObjectStates
-from saga_fg.ego.landmarks import Observations
+from saga_fg.ego.graph import pose_key
+from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_key
 from saga_fg.ego.odometry import Odometry, OdometryNoise
 from saga_fg.ego.settings import JointSettings
 
 __all__ = [
     "JointEstimate",
     "JointSettings",
+    "LandmarkPart",
     "ObjectStates",
     "Observations",
     "Odometry",
     "OdometryNoise",
     "estimate_jointly",
+    "landmark_key",
+    "pose_key",
 ]

@@ -36,26 +36,32 @@ def estimate_jointly(
     new_tracker: Callable[[], Tracker],
     settings: JointSettings | None = None,
     start: FloatArray | None = None,
-    landmarks: Observations | None = None,
+    landmarks: Observations | LandmarkPart | None = None,
 ) -> JointEstimate:
     """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
 
     odometry: between the frames' times; new_tracker: gives a fresh tracker, which registers detections; start: first
-    pose (4, 4), by default the identity; landmarks: what is observed of them at each of the n moments. Detections are
-    in ego or sensor coordinates, or in those of the world with the pose they were transformed by. Raises `InputError`
-    where frames, odometry and landmarks do not fit together.
+    pose (4, 4), by default the identity; landmarks: what is observed of them at each of the n moments, or their part of
+    the graph where somebody knows already which observation is of which. Detections are in ego or sensor coordinates,
+    or in those of the world with the pose they were transformed by. Raises `InputError` where frames, odometry and
+    landmarks do not fit together.
     """
     settings = settings or JointSettings()
     check_times(frames, odometry)
-    if landmarks is not None and len(landmarks) != len(frames):
+    if landmarks is None:
+        landmarks = [()] * len(frames)
+    if not isinstance(landmarks, LandmarkPart) and len(landmarks) != len(frames):
         raise InputError(f"landmarks: expected what is observed at {len(frames)} moments, got {len(landmarks)}")
     path = odometry.path(start)
     slow = SlowErrors(settings.odometry.scale, settings.odometry.bias)
     estimate = None
     for _ in range(settings.rounds):
-        moments = register(frames, path, odometry.a_T_b, new_tracker(), settings.motion_noise)
+        moments = register(frames, path, odometry, new_tracker(), settings.motion_noise)
         standing = standing_probabilities(moments, path, slow, settings)
-        seen = landmark_part(landmarks or [()] * len(frames), path, settings.landmark_reach)
+        if isinstance(landmarks, LandmarkPart):
+            seen = landmarks
+        else:
+            seen = landmark_part(landmarks, path, settings.landmark_reach)
         estimate = _solved(list(enumerate(moments)), path, standing, seen, settings)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None

@@ -18,9 +18,10 @@ from saga_fg.interactions import POSITION, VELOCITY
 
 @dataclass(frozen=True, eq=False)
 class ObjectStates:
-    """Objects of a moment: id (n,), position (n, 2), m, and velocity (n, 2), m/s, in the world."""
+    """Objects of a moment: id (n,), n classes, position (n, 2), m, and velocity (n, 2), m/s, in the world."""
 
     id: IntArray
+    label: tuple[str, ...]
     position: FloatArray
     velocity: FloatArray
 
@@ -34,6 +35,7 @@ class JointEstimate:
     errors        (n, 2) of the odometry: scale, bias of the yaw rate (rad/s)
     objects       n tables
     converged     whether the last step was short enough
+    solution      of the graph, with the keys of `saga_fg.ego.graph`
     """
 
     timestamps: FloatArray
@@ -41,8 +43,8 @@ class JointEstimate:
     errors: FloatArray
     objects: tuple[ObjectStates, ...]
     converged: bool
+    solution: Solution
     _record: Keyed
-    _linear: gtsam.GaussianFactorGraph
 
     @cached_property
     def pose_covariances(self) -> FloatArray:
@@ -70,11 +72,11 @@ class JointEstimate:
         try:
             return np.asarray(self._tree.marginalCovariance(key))
         except RuntimeError:  # Cholesky squares the condition number, which objects hardly seen make large
-            return marginal_moments(self._linear, [key], "qr")[1]
+            return marginal_moments(self.solution.linear, [key], "qr")[1]
 
     @cached_property
     def _tree(self) -> gtsam.GaussianBayesTree:
-        return self._linear.eliminateMultifrontal()
+        return self.solution.linear.eliminateMultifrontal()
 
 
 def read_estimate(record: Keyed, solution: Solution) -> JointEstimate:
@@ -86,8 +88,8 @@ def read_estimate(record: Keyed, solution: Solution) -> JointEstimate:
         errors=np.stack([values.atVector(error_key(k)) for k, _ in record]),
         objects=tuple(read_objects(k, moment, values) for k, moment in record),
         converged=solution.converged,
+        solution=solution,
         _record=record,
-        _linear=solution.linear,
     )
 
 
@@ -97,4 +99,4 @@ def read_objects(k: int, moment: EgoMoment, values: gtsam.Values) -> ObjectState
     state = np.zeros((len(objects.id), 4))
     for row, (name, node_type) in enumerate(zip(objects.id.tolist(), objects.types, strict=True)):
         state[row] = values.atVector(object_key(k, name))[node_type.index(POSITION + VELOCITY)]
-    return ObjectStates(objects.id, state[:, :2], state[:, 2:])
+    return ObjectStates(objects.id, objects.label, state[:, :2], state[:, 2:])

@@ -31,7 +31,7 @@ from factors import (
     relative_detection_factors,
 )
 from saga_fg.arrays import FloatArray
-from saga_fg.ego.record import EgoMoment
+from saga_fg.ego.record import EgoMoment, motion_covariances
 from saga_fg.ego.settings import JointSettings
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
@@ -103,7 +103,7 @@ def nonlinear_factors(
         rows = np.array([[pose_key(j), pose_key(k), error_key(j), error_key(k)] for j, k in pairs], dtype=np.uint64)
         steps = np.stack([moment.a_T_b for _, moment in record[1:]])
         dt = np.diff([moment.time for _, moment in record])
-        noise = settings.odometry.covariances(np.linalg.norm(steps[:, :3, 3], axis=1), dt)
+        noise = motion_covariances([moment for _, moment in record], settings)
         factors.append(odometry_factors(rows, steps, dt, noise))
     factors += _detections(record, settings)
     if standing is not None:

@@ -1,8 +1,8 @@
 """Landmarks in the joint graph: poles, planes, points of `saga_fg.landmarks`, seen from the vehicle's poses.
 
-Which observation is of which landmark is decided along the path assumed so far: the nearest landmark of the kind, by
-where it was last seen, within `reach`; else a new one. A pose drifts little between two views of one thing, and the
-question is asked anew along the path found.
+Whoever knows which observation is of which landmark gives a `LandmarkPart`. Else that is decided along the path assumed
+so far: the nearest landmark of the kind, by where it was last seen, within `reach`; else a new one. A pose drifts
+little between two views of one thing, and the question is asked anew along the path found.
 """
 
 from __future__ import annotations
@@ -16,14 +16,18 @@ import numpy as np
 from factors import Linearisable
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.graph import pose_key
-from saga_fg.landmarks import LandmarkType, Observation
+from saga_fg.landmarks import LandmarkType, Observation, sighting_factors
 
 Observations = Sequence[Sequence[Observation]]
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkPart:
-    """What landmarks add to the graph: native factors, our own, and where each landmark is to begin with, by key."""
+    """What landmarks add to the graph: native factors, our own, and where each landmark is to begin with, by key.
+
+    Keys are those of `pose_key` and `landmark_key`. Other factors between poses, such as loop closures, may be among
+    them.
+    """
 
     graph: gtsam.NonlinearFactorGraph
     factors: list[Linearisable]
@@ -37,10 +41,10 @@ def landmark_key(number: int) -> int:
 
 def landmark_part(observations: Observations, path: FloatArray, reach: float) -> LandmarkPart:
     """Factors of observations of each moment (n) along a path (n, 4, 4); reach in m."""
-    part = LandmarkPart(gtsam.NonlinearFactorGraph(), [], gtsam.Values())
+    start = gtsam.Values()
     places: dict[LandmarkType, list[FloatArray]] = {}
     keys: dict[LandmarkType, list[int]] = {}
-    seen: dict[LandmarkType, list[tuple[int, int, Observation]]] = {}
+    seen: list[tuple[int, int, Observation]] = []
     for moment, (now, pose) in enumerate(zip(observations, path, strict=True)):
         for observation in now:
             kind = observation.kind
@@ -51,19 +55,11 @@ def landmark_part(observations: Observations, path: FloatArray, reach: float) ->
             distance = np.linalg.norm(np.reshape(known, (-1, 2)) - place, axis=1)
             if len(known) == 0 or distance.min() > reach:
                 number = len(known)
-                keys.setdefault(kind, []).append(landmark_key(part.start.size()))
+                keys.setdefault(kind, []).append(landmark_key(start.size()))
                 known.append(place)
-                part.start.insert(keys[kind][number], state)
+                start.insert(keys[kind][number], state)
             else:
                 number = int(np.argmin(distance))
                 known[number] = place
-            seen.setdefault(kind, []).append((moment, keys[kind][number], observation))
-    for kind, sightings in seen.items():
-        rows = np.array([[pose_key(moment), key] for moment, key, _ in sightings])
-        observed = np.stack([observation.value for _, _, observation in sightings])
-        made = kind.factors(rows, observed, np.stack([observation.covariance for _, _, observation in sightings]))
-        if isinstance(made, gtsam.NonlinearFactorGraph):
-            part.graph.push_back(made)
-        else:
-            part.factors.extend(made)
-    return part
+            seen.append((pose_key(moment), keys[kind][number], observation))
+    return LandmarkPart(*sighting_factors(seen), start)

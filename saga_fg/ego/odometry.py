@@ -17,7 +17,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray, checked
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances
 from saga_fg.errors import InputError
 from saga_fg.geometry import checked_transform, inverse_transform
 from saga_fg.settings import require_positive, setting
@@ -43,7 +43,7 @@ class OdometryNoise:
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
         """(n, 8, 8) of increments over `distance` (n,) m and `dt` (n,) s > 0.
 
-        Rows: rotation (rad), translation (m), change of scale, change of bias (rad/s).
+        Rows: rotation (rad), translation in the frame of the earlier pose (m), change of scale, change of bias (rad/s).
         """
         tilt, turn = self.tilt_noise**2 * dt, self.turn_noise**2 * dt
         shift = self.distance_noise**2 * distance + self.time_noise**2 * dt
@@ -56,11 +56,14 @@ class OdometryNoise:
 class Odometry:
     """timestamps (n,) s, strictly increasing; a_T_b (n - 1, 4, 4): each pose in the frame of the one before.
 
-    Raises `InputError` for times that do not increase and increments that are not rigid.
+    covariances: (n - 1, 6, 6) of the increments where the device states them, as scan registration does: (rotation
+    vector, translation) in the frame of the later pose, rad^2, m^2; None where `OdometryNoise` is all that is known.
+    Raises `InputError` for times that do not increase, increments that are not rigid, and covariances that are none.
     """
 
     timestamps: FloatArray
     a_T_b: FloatArray
+    covariances: FloatArray | None = None
 
     def __post_init__(self) -> None:
         timestamps = checked("timestamps", self.timestamps, (None,))
@@ -69,6 +72,9 @@ class Odometry:
         increments = checked("a_T_b", self.a_T_b, (len(timestamps) - 1, 4, 4))
         for k, increment in enumerate(increments):
             checked_transform(f"a_T_b[{k}]", increment)
+        if self.covariances is not None:
+            covariances = checked_covariances("covariances", self.covariances, len(increments), 6)
+            object.__setattr__(self, "covariances", covariances)
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "a_T_b", increments)
 

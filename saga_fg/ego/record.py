@@ -14,6 +14,8 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.discretisation import discretise
+from saga_fg.ego.odometry import Odometry
+from saga_fg.ego.settings import JointSettings
 from saga_fg.errors import InputError
 from saga_fg.frame import Detections, Frame
 from saga_fg.geometry import inverse_transform
@@ -38,13 +40,15 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """Those of a moment: id (n,), sorted; types: n node types."""
+    """Those of a moment: id (n,), sorted; types: n node types; label: their n classes."""
 
     id: IntArray
     types: tuple[NodeType, ...]
+    label: tuple[str, ...]
 
     def select(self, rows: IntArray) -> Objects:
-        return Objects(self.id[rows], tuple(self.types[row] for row in rows.tolist()))
+        chosen = rows.tolist()
+        return Objects(self.id[rows], tuple(self.types[k] for k in chosen), tuple(self.label[k] for k in chosen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,7 @@ class EgoMoment:
 
     time        s
     a_T_b       (4, 4) odometry from the moment before; the identity for the first one
+    covariance  (6, 6) of it, as in `Odometry`, where the device states one
     objects     that there are
     seen        detections of them
     transition  of the objects that were there at the moment before as well; None if there are none
@@ -63,6 +68,7 @@ class EgoMoment:
     objects: Objects
     seen: Seen
     transition: Transition | None
+    covariance: FloatArray | None = None
 
 
 class Registration:
@@ -79,8 +85,10 @@ class Registration:
         """The tracker, as of the last frame."""
         return self._tracker
 
-    def add(self, frame: Frame, world_T_ego: FloatArray, a_T_b: FloatArray) -> EgoMoment:
-        """Take in a frame seen from `world_T_ego` (4, 4), after the vehicle moved by a_T_b (4, 4).
+    def add(
+        self, frame: Frame, world_T_ego: FloatArray, a_T_b: FloatArray, covariance: FloatArray | None = None
+    ) -> EgoMoment:
+        """Take in a frame seen from `world_T_ego` (4, 4), after the vehicle moved by a_T_b (4, 4), covariance (6, 6).
 
         Raises `InputError` for a frame that is not later than the last one, or in world coordinates without a pose.
         """
@@ -99,7 +107,7 @@ class Registration:
             objects = _joined(last.objects.select(np.flatnonzero(stay)), objects)
             if len(graph):
                 transition = discretise(graph, frame.timestamp - last.time)
-        self._last = EgoMoment(frame.timestamp, a_T_b, objects, seen, transition)
+        self._last = EgoMoment(frame.timestamp, a_T_b, objects, seen, transition, covariance)
         return self._last
 
     def _seen(self, frame: Frame, detections: Detections) -> tuple[Seen, list[str]]:
@@ -119,23 +127,24 @@ class Registration:
             if name not in self._types:
                 motion = self._tracker.class_settings(name).motion
                 self._types[name] = NodeType(type(motion).__name__, motion)
-        return Objects(seen.id, tuple(self._types[name] for name in label))
+        return Objects(seen.id, tuple(self._types[name] for name in label), tuple(label))
 
 
 def register(
     frames: Sequence[Frame],
     world_T_ego: FloatArray,
-    increments: FloatArray,
+    odometry: Odometry,
     tracker: Tracker,
     motion_noise: float = 1.0,
 ) -> list[EgoMoment]:
-    """The record of `frames` (n) along a path (n, 4, 4) with odometry (n - 1, 4, 4).
+    """The record of `frames` (n) along a path (n, 4, 4), with odometry between them.
 
     Objects are there from the first to the last time they are seen.
     """
     registration = Registration(tracker, motion_noise)
-    steps = np.concatenate([np.eye(4)[None], increments])
-    record = [registration.add(*one) for one in zip(frames, world_T_ego, steps, strict=True)]
+    steps = [np.eye(4), *odometry.a_T_b]
+    covariances = [None] * len(steps) if odometry.covariances is None else [None, *odometry.covariances]
+    record = [registration.add(*one) for one in zip(frames, world_T_ego, steps, covariances, strict=True)]
     last = {int(name): k for k, moment in enumerate(record) for name in moment.seen.id}
     trimmed = []
     for k, moment in enumerate(record):
@@ -146,6 +155,22 @@ def register(
             transition = discretise(graph, transition.dt) if len(graph) else None
         trimmed.append(replace(moment, objects=moment.objects.select(np.flatnonzero(kept)), transition=transition))
     return trimmed
+
+
+def motion_covariances(record: Sequence[EgoMoment], settings: JointSettings) -> FloatArray:
+    """(n - 1, 8, 8) of the increments to n moments, each from the one before, as in `OdometryNoise.covariances`.
+
+    Where the device states covariances, rotation and translation are by these.
+    """
+    later = record[1:]
+    distance = np.array([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in later])
+    P = settings.odometry.covariances(distance, np.diff([moment.time for moment in record]))
+    for row, moment in enumerate(later):
+        if moment.covariance is not None:
+            axes = np.eye(6)
+            axes[3:, 3:] = moment.a_T_b[:3, :3]
+            P[row, :6, :6] = axes @ moment.covariance @ axes.T
+    return P
 
 
 def in_ego(frame: Frame, sensor: Sensor) -> Detections:
@@ -165,5 +190,6 @@ def _joined(before: Objects, seen: Objects) -> Objects:
     """Objects of a moment: those that stayed and those that are new, sorted by id."""
     new = np.flatnonzero(~np.isin(seen.id, before.id))
     fresh = seen.select(new)
-    both = Objects(np.concatenate([before.id, fresh.id]), (*before.types, *fresh.types))
+    ids = np.concatenate([before.id, fresh.id])
+    both = Objects(ids, (*before.types, *fresh.types), (*before.label, *fresh.label))
     return both.select(np.argsort(both.id))

@@ -16,13 +16,11 @@ class JointSettings:
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "how good the odometry is")
     start_noise: float = setting(1e-3, "standard deviation of the first pose, m and rad")
-    standing_window: float = setting(6.0, "time over which an object is judged to stand or to move, s")
-    moving_speed: float = setting(
-        0.5, "deviation of a velocity component of the slowest objects that count as moving, m/s"
-    )
+    standing_window: float = setting(3.0, "time over which an object is judged to stand or to move, s")
+    moving_speed: float = setting(5.0, "deviation of a velocity component of objects that move, m/s")
     standing_drift: float = setting(0.05, "how far an object that stands may wander, m after one second")
     standing_speed: float = setting(0.1, "standard deviation of the velocity of an object that stands, m/s")
-    motion_noise: float = setting(10.0, "factor on the noise of the objects' motion: many brake at the same time")
+    motion_noise: float = setting(1000.0, "factor on the noise of the objects' motion: traffic brakes and turns as one")
     outlier_scale: float = setting(3.0, "detections farther off than this count less (Cauchy), standard deviations")
     landmark_reach: float = setting(2.5, "a landmark seen farther than this from where it was last is another one, m")
     keyframe_period: float = setting(0.15, "frames that follow a keyframe within this time are passed over, s")

@@ -4,10 +4,16 @@ Around each detection of an object, within a window, D is the mean place of the 
 of the earlier half, in the world along the path assumed so far, and T the time between the two. An object that stands
 has D ~ N(0, S): noise of the detections and of the odometry over the T seconds and s metres in between,
 
-    S = R (1/n_1 + 1/n_2) + distance_noise^2 s + time_noise^2 T + (scale s)^2 + range^2 (turn_noise^2 T + (bias T)^2)
+    S = R (1/n_1 + 1/n_2) + shift + (scale s)^2 + range^2 (turn + (bias T)^2)
 
-with the deviations of scale and bias as known so far; one that moves has D ~ N(0, S + (moving_speed T)^2). By Bayes,
-with even odds before,    P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (moving_speed T)^2)).
+where shift and turn are the variances that the increments in between add up to in translation and in heading; scale and
+bias their deviations as known so far. One that moves has D ~ N(0, S + (moving_speed T)^2). By Bayes, with even odds
+before,
+
+    P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (moving_speed T)^2))
+
+The odds weigh the time by themselves: where T is short, S and S + (moving_speed T)^2 are nearly the same, and P about
+one half.
 """
 
 from __future__ import annotations
@@ -17,11 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.ego.record import EgoMoment
+from saga_fg.ego.record import EgoMoment, motion_covariances
 from saga_fg.ego.settings import JointSettings
 from saga_fg.geometry import transform_points
-
-_SHORTEST = 0.3  # of the window: less time between the halves decides nothing
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,10 @@ class SlowErrors:
 
 @dataclass(frozen=True, eq=False)
 class _Sightings:
-    """All detections, by object and time: object, moment (N,), time, place (N, 2), variance, range, driven (N,)."""
+    """All detections, by object and time: object, moment, time (N,), place (N, 2), variance, range (N,).
+
+    drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first moment on
+    """
 
     object: IntArray
     moment: IntArray
@@ -42,7 +49,7 @@ class _Sightings:
     place: FloatArray
     variance: FloatArray
     range: FloatArray
-    driven: FloatArray
+    drift: FloatArray
 
 
 def standing_probabilities(
@@ -52,7 +59,7 @@ def standing_probabilities(
 
     0 where too little was seen to tell. Between two detections it is the smaller one of theirs.
     """
-    seen = _sightings(record, path)
+    seen = _sightings(record, path, settings)
     p = _probabilities(seen, slow, settings)
     result = [np.zeros(len(moment.objects.id)) for moment in record]
     if not len(p):
@@ -93,28 +100,31 @@ def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings) 
         count = np.maximum(b - a, 1).reshape(-1, *(1,) * (values.ndim - 1))
         return np.asarray((total[b] - total[a]) / count)
 
-    columns = np.column_stack([seen.place, seen.time - seen.time.min(), seen.driven])
-    D, T, s = np.split(half(columns, middle, high) - half(columns, low, middle), [2, 3], axis=1)
-    T, s = T[:, 0], s[:, 0]
-    noise, distance = settings.odometry, half(seen.range, low, high)
+    columns = np.column_stack([seen.place, seen.time - seen.time.min(), seen.drift])
+    between = half(columns, middle, high) - half(columns, low, middle)
+    D, (T, s, shift, turn) = between[:, :2], between[:, 2:].T
     S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
-    S = S + noise.distance_noise**2 * s + noise.time_noise**2 * T + (slow.scale * s) ** 2
-    S = S + distance**2 * (noise.turn_noise**2 * T + (slow.bias * T) ** 2)
+    S = S + shift + (slow.scale * s) ** 2 + half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
     M = S + (settings.moving_speed * T) ** 2
     d2 = (D**2).sum(axis=1)
     odds = np.log(M / S) - d2 / 2 * (1 / S - 1 / M)  # log, two dimensions
     p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
-    return np.where((n1 > 0) & (_SHORTEST * settings.standing_window <= T), p, 0.0)
+    return np.where(n1 > 0, p, 0.0)
 
 
-def _sightings(record: list[EgoMoment], path: FloatArray) -> _Sightings:
+def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSettings) -> _Sightings:
     moments = np.repeat(np.arange(len(record)), [len(moment.seen.id) for moment in record]).astype(np.int64)
     names = np.concatenate([moment.seen.id for moment in record])
     order = np.lexsort((moments, names))
     place = [transform_points(pose, moment.seen.z)[:, :2] for moment, pose in zip(record, path, strict=True)]
     variance = np.concatenate([np.trace(moment.seen.R, axis1=1, axis2=2) / 2 for moment in record])
     distance = np.concatenate([np.hypot(moment.seen.z[:, 0], moment.seen.z[:, 1]) for moment in record])
-    driven = np.cumsum([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in record])
+    driven = np.array([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in record])
+    P = motion_covariances(record, settings)
+    drift = np.zeros((len(record), 3))
+    drift[:, 0] = np.cumsum(driven)
+    drift[1:, 1] = np.cumsum((P[:, 3, 3] + P[:, 4, 4]) / 2)
+    drift[1:, 2] = np.cumsum(P[:, 2, 2])
     time = np.array([moment.time for moment in record])[moments]
     return _Sightings(
         names[order],
@@ -123,5 +133,5 @@ def _sightings(record: list[EgoMoment], path: FloatArray) -> _Sightings:
         np.concatenate(place)[order],
         variance[order],
         distance[order],
-        driven[moments][order],
+        drift[moments][order],
     )

@@ -1,6 +1,7 @@
 """Landmarks: their types, which observation is of which, and maps built from them."""
 
 from saga_fg.landmarks.association import associate, log_odds
+from saga_fg.landmarks.factors import sighting_factors
 from saga_fg.landmarks.joint_estimate import Innovation, JointEstimate
 from saga_fg.landmarks.mapper import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting
 from saga_fg.landmarks.merging import duplicates
@@ -26,4 +27,5 @@ __all__ = [
     "associate",
     "duplicates",
     "log_odds",
+    "sighting_factors",
 ]

@@ -32,6 +32,7 @@ from factors import (
 )
 from saga_fg.arrays import FloatArray
 from saga_fg.landmarks.association import associate
+from saga_fg.landmarks.factors import sighting_factors
 from saga_fg.landmarks.joint_estimate import JointEstimate
 from saga_fg.landmarks.merging import duplicates
 from saga_fg.landmarks.protocol import LandmarkType, Observation
@@ -202,18 +203,10 @@ class LandmarkMapper:
 
     def _graph(self) -> tuple[gtsam.NonlinearFactorGraph, list[Linearisable]]:
         graph = self._native.clone()
-        factors: list[Linearisable] = []
-        by_kind: dict[LandmarkType, list[Sighting]] = {}
-        for sighting in self._sightings:
-            by_kind.setdefault(sighting.observation.kind, []).append(sighting)
-        for kind, sightings in by_kind.items():
-            rows = np.array([[_pose_key(s.pose), _landmark_key(s.landmark)] for s in sightings], dtype=np.int64)
-            observed = np.stack([s.observation.value for s in sightings])
-            made = kind.factors(rows, observed, np.stack([s.observation.covariance for s in sightings]))
-            if isinstance(made, gtsam.NonlinearFactorGraph):
-                graph.push_back(made)
-            else:
-                factors += made
+        seen, factors = sighting_factors(
+            (_pose_key(s.pose), _landmark_key(s.landmark), s.observation) for s in self._sightings
+        )
+        graph.push_back(seen)
         return graph, factors
 
     def _apart(self) -> set[tuple[int, int]]:

@@ -1,0 +1,117 @@
+"""LiDAR SLAM with what moves: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
+
+The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.ego` (detections,
+interactions, objects that stand) are solved as one. Its moments are the keyframes, and scans in between where the
+vehicle is slow, since objects move while it stands. Poses are those of the sensor; detections are brought into its
+frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from data_tools.trajectories import Trajectory
+from factors import Robust
+from pipelines.config import TrackConfig
+from pipelines.scan_sequence import ScanSequence
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, graph_of, updated
+from saga_fg.arrays import FloatArray
+from saga_fg.ego import JointEstimate, LandmarkPart, Odometry, estimate_jointly, landmark_key
+from saga_fg.ego.record import in_ego
+from saga_fg.errors import InputError
+from saga_fg.frame import Frame
+from saga_fg.geometry import inverse_transform
+from saga_fg.tracking import Tracker
+
+_SAME_TIME = 0.01  # s
+
+
+@dataclass(frozen=True, eq=False)
+class SlamWithObjects:
+    """slam: with the trajectory, landmarks and covariances of the common solution; alone: without the objects.
+
+    estimate: poses of the sensor, errors of the odometry and objects in the world at the moments of the graph.
+    """
+
+    slam: LidarSlam
+    alone: LidarSlam
+    estimate: JointEstimate
+
+
+def with_objects(
+    result: LidarSlam,
+    scans: ScanSequence,
+    frames: Sequence[Frame],
+    config: TrackConfig,
+    settings: LidarSlamSettings | None = None,
+) -> SlamWithObjects:
+    """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
+
+    Raises `InputError` for a scan without a frame.
+    """
+    s = settings or LidarSlamSettings()
+    rows = _moments(result.drive.keyframes, scans.timestamps, s.objects.keyframe_period)
+    lidar_T_ego = inverse_transform(scans.ego_T_lidar)
+
+    def new_tracker() -> Tracker:
+        return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
+
+    seen = _frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
+    motions = result.drive.motions(rows)
+    odometry = Odometry(
+        scans.timestamps[rows],
+        np.array([motion for motion, _ in motions]).reshape(-1, 4, 4),
+        np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),
+    )
+    at = np.searchsorted(rows, result.keyframes)
+    known = {mark.number: mark for mark in result.landmarks}
+    graph, factors = graph_of(
+        (s for s in result.sightings if s.landmark in known),
+        result.loops,
+        at.tolist(),
+        Robust("geman-mcclure", s.robust_scale),
+    )
+    start = gtsam.Values()
+    for number, mark in known.items():
+        start.insert(landmark_key(number), mark.state)
+    part = LandmarkPart(graph, factors, start)
+    estimate = estimate_jointly(seen, odometry, new_tracker, s.objects, result.drive.poses[0], part)
+    poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
+    slam = replace(
+        result,
+        trajectory=Trajectory(scans.timestamps, poses),
+        covariances=estimate.pose_covariances[at],
+        landmarks=updated(result.landmarks, estimate.solution),
+        world_T_lidar=estimate.world_T_ego[at],
+    )
+    return SlamWithObjects(slam, result, estimate)
+
+
+def _moments(keyframes: Sequence[int], timestamps: FloatArray, period: float) -> list[int]:
+    """Rows of the scans that are moments of the graph: all keyframes, and those more than `period` s after the last."""
+    chosen: list[int] = []
+    waiting = set(keyframes)
+    for row, time in enumerate(timestamps.tolist()):
+        if row in waiting or not chosen or time > timestamps[chosen[-1]] + period:
+            chosen.append(row)
+    return chosen
+
+
+def _frames_at(
+    frames: Sequence[Frame], timestamps: FloatArray, lidar_T_ego: FloatArray, tracker: Tracker
+) -> list[Frame]:
+    """The frame at each time, its detections in the frame of the scanner."""
+    times = np.array([frame.timestamp for frame in frames])
+    found = []
+    for time in timestamps.tolist():
+        nearest = int(np.argmin(np.abs(times - time))) if len(times) else -1
+        if nearest < 0 or abs(times[nearest] - time) > _SAME_TIME:
+            raise InputError(f"frames: expected one of detections at {time:.3f} s, the time of a scan; there is none")
+        frame = frames[nearest]
+        detections = in_ego(frame, tracker.sensor(frame.sensor)).transformed(lidar_T_ego)
+        found.append(Frame(time, frame.sensor, detections, np.eye(4), "ego"))
+    return found

@@ -1,0 +1,101 @@
+"""LiDAR SLAM with objects: parked and moving cars in one graph with walls and poles."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.simulator.scan_drive import SimulatedScans
+from data_tools.trajectories import Trajectory, trajectory_errors
+from pipelines.cli import app
+from pipelines.config import load_config
+from pipelines.slam.kitti import write_lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.with_objects import with_objects
+from saga_fg import Boxes, Detections, Frame, InputError
+from saga_fg.geometry import inverse_transform, yaw_transform
+
+MOVER = np.array([8.0, -1.5]), np.array([7.0, 0.0])  # m, m/s
+
+
+def poor_drive(count: int = 24) -> tuple[SimulatedScans, np.ndarray, list[Frame]]:
+    """Scans whose recorded poses are poor, the true poses, and detections of the parked cars and of one that moves."""
+    scans = SimulatedScans(1, count)
+    truth, rng = scans.world_T_ego.copy(), np.random.default_rng(0)
+    parked = scans.world.boxes.select(scans.world.boxes.label == "car").position
+    frames = []
+    for time, pose in zip(scans.timestamps.tolist(), truth, strict=True):
+        moving = np.append(MOVER[0] + MOVER[1] * time, 0.75)
+        places = np.concatenate([parked, moving[None]])
+        places = places[np.linalg.norm(places - pose[:3, 3], axis=1) < 30]
+        places = places + rng.normal(0, 0.05, places.shape)
+        boxes = Boxes.of(["car"] * len(places), places).transformed(inverse_transform(pose))
+        frames.append(Frame(time, "lidar", Detections(boxes, np.full(len(boxes), 3.0)), np.eye(4), "ego"))
+    poor = [truth[0]]
+    for a, b in pairwise(truth):
+        poor.append(
+            poor[-1] @ inverse_transform(a) @ b @ yaw_transform(*rng.normal(0, 0.05, 2), yaw=rng.normal(0, 0.003))
+        )
+    scans.world_T_ego = np.array(poor)
+    return scans, truth, frames
+
+
+def test_parked_cars_are_landmarks_and_moving_ones_are_tracked(tmp_path: Path) -> None:
+    scans, truth, frames = poor_drive()
+    settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
+    found = with_objects(lidar_slam(scans, "oxts", settings), scans, frames, load_config("kitti"), settings)
+    reference = Trajectory(scans.timestamps, truth)
+    before = trajectory_errors(found.alone.trajectory, reference, "start").ate
+    assert trajectory_errors(found.slam.trajectory, reference, "start").ate < 0.6 * before
+    assert np.trace(found.slam.covariances[-1]) < 0.5 * np.trace(found.alone.covariances[-1])
+    last = found.estimate.objects[-1]
+    off = np.linalg.norm(last.position - (MOVER[0] + MOVER[1] * scans.timestamps[-1]), axis=1)
+    assert off.min() < 0.5
+    np.testing.assert_allclose(last.velocity[off.argmin()], MOVER[1], atol=1.5)
+    figures = write_lidar_slam(tmp_path / "run", found, scans)
+    assert figures["objects"] == len({name for objects in found.estimate.objects for name in objects.id.tolist()})
+    rows = (tmp_path / "run" / "tracks.csv").read_text().splitlines()[1:]
+    assert len(rows) == sum(len(objects.id) for objects in found.estimate.objects)
+    assert {row.split(",")[2] for row in rows} == {"car"}
+
+
+def test_landmarks_and_objects_are_in_one_graph() -> None:
+    scans, _, frames = poor_drive(12)
+    settings = LidarSlamSettings(oxts_rotation=0.003, oxts_translation=0.05)
+    alone = lidar_slam(scans, "oxts", settings)
+    found = with_objects(alone, scans, frames, load_config("kitti"), settings)
+    assert [mark.number for mark in found.slam.landmarks] == [mark.number for mark in alone.landmarks]
+    for with_, without in zip(found.slam.landmarks, alone.landmarks, strict=True):
+        assert np.trace(with_.covariance) < 1.05 * np.trace(without.covariance)
+        assert np.linalg.norm(with_.kind.variable.local(with_.state, without.state)) < 0.5
+
+
+def test_a_scan_without_a_frame_is_named() -> None:
+    scans, _, frames = poor_drive(6)
+    with pytest.raises(InputError, match=r"expected one of detections at 0\.500 s, the time of a scan"):
+        with_objects(lidar_slam(scans, "oxts"), scans, frames[:-1], load_config("kitti"))
+
+
+@pytest.mark.parametrize("options", [["--scans", "8"], ["--sequence", "0004", "--odometry", "oxts", "--scans", "12"]])
+def test_the_command_with_and_without_scans(recordings: Path, tmp_path: Path, options: list[str]) -> None:
+    arguments = ["--dataroot", str(recordings / "kitti"), "--objects", *options, "--output", str(tmp_path / "run")]
+    outcome = CliRunner().invoke(app, ["slam", "kitti", *arguments])
+    assert outcome.exit_code == 0, outcome.output
+    assert "without objects against GPS/IMU: ATE" in outcome.stdout
+    figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert figures["objects"] > 0
+    assert (figures["scan_to_map_residual"] is None) == ("0004" in options)
+    assert (tmp_path / "run" / "tracks.csv").read_text().count("\n") > 10
+
+
+def test_sequences_without_scans_need_poses_and_objects(recordings: Path, tmp_path: Path) -> None:
+    arguments = ["--dataroot", str(recordings / "kitti"), "--sequence", "0004", "--output", str(tmp_path / "run")]
+    outcome = CliRunner().invoke(app, ["slam", "kitti", *arguments])
+    assert outcome.exit_code != 0
+    assert "expected LiDAR scans" in outcome.output
+    assert not (tmp_path / "run").exists()
