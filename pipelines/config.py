@@ -25,7 +25,7 @@ from saga_fg.tracking import (
 from saga_fg.tracking.settings import settings_of
 
 Method = Literal["saga", "kf", "centerpoint"]
-Family = Literal["nuscenes", "kitti", "simulated", "file"]
+Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from saga_fg.errors import InputError
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
 from saga_fg.node import distinct_types
+from saga_fg.road.cone_geometry import ConeGeometry, anticipated
 from saga_fg.scene_graph import Edges, SceneGraph
 from saga_fg.settings import require_between, require_positive, setting, settings_group
 
@@ -83,6 +84,9 @@ class Following:
     lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
+    cones: ConeGeometry | None = settings_group(
+        lambda: None, "vehicles that cones push aside lead, and are led, where they will be then; null: where they are"
+    )
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
     def __post_init__(self) -> None:
@@ -91,8 +95,9 @@ class Following:
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = of_classes(nodes.label, self.classes)
-        target, source, _ = _close_pairs(nodes.position, able, self.max_gap)
-        offset = nodes.position[source] - nodes.position[target]
+        position = nodes.position if self.cones is None else anticipated(nodes, self.classes, self.cones)
+        target, source, _ = _close_pairs(position, able, self.max_gap)
+        offset = position[source] - position[target]
         heading = nodes.heading[target]
         c, s = np.cos(heading), np.sin(heading)
         ahead, lateral = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s

@@ -13,6 +13,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
 from saga_fg.geometry import checked_transform
+from saga_fg.road.road_map import RoadMap
 
 Coordinates = Literal["world", "ego", "sensor"]
 NAN = float("nan")
@@ -77,6 +78,14 @@ class Detections:
     def empty(cls) -> Self:
         return cls(Boxes.empty(), np.empty(0))
 
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """The rows of all parts, one after the other."""
+        score, rate = (
+            np.concatenate([np.empty(0), *(getattr(p, name) for p in parts)]) for name in ("score", "range_rate")
+        )
+        return cls(Boxes.concatenate([part.boxes for part in parts]), score, rate)
+
     def __len__(self) -> int:
         return len(self.boxes)
 
@@ -122,6 +131,7 @@ class Frame:
     world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world" and no range rate
                  was measured
     token        the dataset's own name of the record, "" if none
+    road_map     what is known of the road from now on, besides what earlier frames brought; None: nothing new
 
     Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
     that is not rigid.
@@ -133,6 +143,7 @@ class Frame:
     world_T_ego: FloatArray | None = None
     coordinates: Coordinates = "world"
     token: str = ""
+    road_map: RoadMap | None = None
 
     def __post_init__(self) -> None:
         try:

@@ -14,7 +14,8 @@ Car-following is Helly's linear law (Helly 1959); with the gap taken from the pr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -34,7 +35,9 @@ class NodeTable:
     id (n,); label (n,) classes; types n node types; position (n, 2) m; velocity (n, 2) m/s; heading (n,) rad;
     length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2;
     has_moved (n,) whether a node was ever clearly in motion, which tells a parked car from one that waits in a queue;
-    None if nobody knows
+    None if nobody knows; closed (n,) the weight in [0, 1] with which a stop line is closed, as the belief on its light
+    says, None where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
+    or of a lane (its centre); width: by row, of a lane, m
     """
 
     id: IntArray
@@ -46,6 +49,9 @@ class NodeTable:
     length: FloatArray
     velocity_variance: FloatArray
     has_moved: BoolArray | None = None
+    closed: FloatArray | None = None
+    outline: Mapping[int, FloatArray] = field(default_factory=dict)
+    width: Mapping[int, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.id)
@@ -86,7 +92,7 @@ class SharedVelocity:
         turn = nodes.heading[target] - nodes.heading[source] if self.along_heading else np.zeros(len(target))
         c, s = np.cos(turn), np.sin(turn)
         R = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-        triples = _zeros(nodes, target, source)
+        triples = no_triples(nodes, target, source)
         v_i = nodes.types[target[0]].index(VELOCITY)
         v_j = nodes.types[source[0]].index(VELOCITY)
         triples.A_self[:, v_i, v_i] = -1.0
@@ -114,12 +120,12 @@ class CarFollowing:
         return all(t.has(POSITION + VELOCITY) for t in (target, source))
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-        u_i, u_j = (_unit(nodes.heading[rows]) for rows in (target, source))
+        u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
         along = u_i[:, :, None] * u_i[:, None, :]
         from_leader = u_i[:, :, None] * u_j[:, None, :]
         p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
         p_j, v_j = (nodes.types[source[0]].index(names) for names in (POSITION, VELOCITY))
-        triples = _zeros(nodes, target, source)
+        triples = no_triples(nodes, target, source)
         triples.A_self[:, v_i[:, None], p_i] = -along / self.time_constant
         triples.A_self[:, v_i[:, None], v_i] = -along * (1 + self.headway / self.time_constant)
         triples.A_other[:, v_i[:, None], p_j] = along / self.time_constant
@@ -135,10 +141,12 @@ class CarFollowing:
         return np.asarray(distance - self.headway * (nodes.velocity[target] * u_i).sum(axis=1))
 
 
-def _unit(heading: FloatArray) -> FloatArray:
+def unit(heading: FloatArray) -> FloatArray:
+    """Unit vectors (n, 2) of headings (n,), rad."""
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
-def _zeros(nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+def no_triples(nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+    """Triples of E edges, all zero, of the sizes that their nodes' types have."""
     d_i, d_j, E = nodes.types[target[0]].dim, nodes.types[source[0]].dim, len(target)
     return Triples(np.zeros((E, d_i, d_i)), np.zeros((E, d_i, d_j)), np.zeros((E, d_i)))

@@ -115,6 +115,7 @@ class Sensor:
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
     )
+    colour_accuracy: float = setting(0.9, "chance that the colour reported of a traffic light is the true one")
     clutter_area: float | None = setting(
         None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
     )
@@ -126,7 +127,7 @@ class Sensor:
     time_offset: float = setting(0.0, "added to the sensor's timestamps to get the time of measurement, s")
 
     def __post_init__(self) -> None:
-        require_between(self, 0, 1, "detection_probability")
+        require_between(self, 0, 1, "detection_probability", "colour_accuracy")
         for label, chance in self.class_detection.items():
             if not 0 <= chance <= 1:
                 raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")

@@ -2,7 +2,8 @@
 
 Along a lane, distance is measured in its direction of travel: road s for forward lanes, length - s for oncoming ones.
 An ending lane approaches the road from `approach` m outside and runs beside it for a while before it ends: an
-on-ramp; with approach 0 it is a lane drop.
+on-ramp; with approach 0 it is a lane drop. Or it is closed by cones: over the last `taper` m they push its traffic into
+the lane beside.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class Lanes:
     end        where it ends, m
     opening    from where on one may change out of it, m
     approach   how far outside it starts, m
+    taper      length over which cones push its traffic into the lane beside, m; 0: drivers change when they like
     """
 
     road: Road
@@ -48,6 +50,7 @@ class Lanes:
     opening: float = 0.0
     approach: float = 0.0
     approach_length: float = 120.0
+    taper: float = 0.0
 
     @property
     def forward(self) -> IntArray:
@@ -57,9 +60,18 @@ class Lanes:
     def oncoming(self) -> IntArray:
         return np.flatnonzero(self.direction < 0)
 
+    @property
+    def beside(self) -> int:
+        """The lane that traffic of the ending lane joins."""
+        return self.ending - 1
+
     def lateral(self, lane: IntArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offset d of the lanes' middle at travelled s, m, and its derivative by s; lane and s of one shape."""
         d = self.offset[lane]
+        if self.taper > 0:
+            share = (s - self.end) / self.taper + 1
+            aside = np.where(lane == self.ending, self.offset[self.beside] - self.offset[self.ending], 0.0)
+            return d + aside * smooth_step(share), aside * smooth_step_slope(share) / self.taper
         if self.ending < 0 or self.approach == 0:
             return d, np.zeros_like(d)
         share = (self.opening - s) / self.approach_length
@@ -82,6 +94,8 @@ class Lanes:
     def may_change(self, lane: IntArray, target: IntArray, s: FloatArray) -> BoolArray:
         """Whether the road allows to change from a lane to its neighbour here; nobody enters a lane that ends."""
         allowed = (target >= 0) & (target != self.ending if self.ending >= 0 else True)
+        if self.taper > 0:
+            return np.asarray(allowed & (lane != self.ending))
         return np.asarray(allowed & ((lane != self.ending) | (s >= self.opening)))
 
     def pose(self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:

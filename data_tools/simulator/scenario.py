@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from data_tools.simulator.fleet import Fleet, draw_fleet
 from data_tools.simulator.idm import equilibrium_gap
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import curved_road
-from data_tools.simulator.settings import RoadSettings, SimulatorSettings, TrafficSettings
+from data_tools.simulator.settings import RoadSettings, RoadworkSettings, SimulatorSettings, TrafficSettings
+from data_tools.simulator.towing import hitched
 from saga_fg.arrays import FloatArray, IntArray
 
 JUNCTION = 10.0  # m between the stop lines of the two directions
@@ -20,7 +21,10 @@ FOCUS = 0.55  # share of the road's length at which things happen
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A scene before anybody moves; `focus` is where, m along the road, traffic is disturbed."""
+    """A scene before anybody moves; `focus` is where, m along the road, traffic is disturbed.
+
+    trailer  (N,) lengths of the vehicles' trailers, part of their length, m; 0 for none
+    """
 
     lanes: Lanes
     focus: float
@@ -31,6 +35,7 @@ class Scenario:
     speed: FloatArray
     stop_lines: tuple[StopLine, ...]
     slow_zones: tuple[SlowZone, ...]
+    trailer: FloatArray
 
     @property
     def edges(self) -> tuple[float, float]:
@@ -42,21 +47,23 @@ class Scenario:
 
 def draw_scenario(settings: SimulatorSettings, rng: np.random.Generator) -> Scenario:
     """A scenario with its own road, traffic and disturbances."""
-    lanes, hedge = _draw_lanes(settings.road, rng)
+    lanes, hedge = _draw_lanes(settings.road, settings.roadworks, rng)
     focus = FOCUS * settings.road.length
     until = settings.warm_up + settings.duration
     stop_lines, slow_zones = _draw_disturbances(lanes, focus, until, settings.traffic, rng)
     desired_speed = float(rng.uniform(*settings.drivers.desired_speed))
-    fleet, lane, s = _fill(lanes, desired_speed, settings, rng)
+    fleet, trailer, lane, s = _fill(lanes, desired_speed, settings, rng)
     speed = np.full(len(fleet), _start_speed(desired_speed))
-    return Scenario(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones)
+    return Scenario(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones, trailer)
 
 
 def _start_speed(desired_speed: float) -> float:
     return 0.6 * desired_speed
 
 
-def _draw_lanes(settings: RoadSettings, rng: np.random.Generator) -> tuple[Lanes, float | None]:
+def _draw_lanes(
+    settings: RoadSettings, roadworks: RoadworkSettings, rng: np.random.Generator
+) -> tuple[Lanes, float | None]:
     """Lanes, and the offset of the hedge between the directions, if there is one."""
     focus = FOCUS * settings.length
     bends = []
@@ -82,6 +89,10 @@ def _draw_lanes(settings: RoadSettings, rng: np.random.Generator) -> tuple[Lanes
         opening=focus - rng.uniform(80.0, 150.0) if merge else 0.0,
         approach=float(rng.choice([0.0, 25.0])) if merge else 0.0,
     )
+    if merge and roadworks.probability > 0 and rng.random() < roadworks.probability:
+        taper = float(rng.uniform(*roadworks.taper))
+        opening = focus - taper - float(rng.uniform(*roadworks.notice))
+        lanes = replace(lanes, taper=taper, opening=opening, approach=0.0)
     return lanes, 0.0 if hedge else None
 
 
@@ -108,11 +119,15 @@ def _draw_disturbances(
 
 def _fill(
     lanes: Lanes, desired_speed: float, settings: SimulatorSettings, rng: np.random.Generator
-) -> tuple[Fleet, IntArray, FloatArray]:
-    """Vehicles in platoons at equilibrium distances on all lanes: the fleet, its lanes (N,) and places s (N,), m."""
+) -> tuple[Fleet, FloatArray, IntArray, FloatArray]:
+    """Vehicles in platoons at equilibrium distances on all lanes.
+
+    Returns the fleet, the lengths of its trailers (N,), m, its lanes (N,) and places s (N,), m.
+    """
     length = lanes.road.length
     most = int(length / 6.0) * len(lanes.offset)
     fleet = draw_fleet(most, desired_speed, settings.drivers, settings.traffic, rng)
+    fleet, trailer = hitched(fleet, settings.traffic.trailer_share, rng)
     gaps = equilibrium_gap(_start_speed(desired_speed), fleet.drivers)
     rows, lane, s, row = [], [], [], 0
     for number in range(len(lanes.offset)):
@@ -129,4 +144,4 @@ def _fill(
             row, left = row + 1, left - 1
     chosen = np.array(rows)
     fleet = Fleet(fleet.kind[chosen], fleet.size[chosen], fleet.drivers.select(chosen))
-    return fleet, np.array(lane), np.array(s)
+    return fleet, trailer[chosen], np.array(lane), np.array(s)

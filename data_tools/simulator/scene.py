@@ -7,13 +7,14 @@ import zlib
 import numpy as np
 
 from data_tools.simulator.annotation import annotate
+from data_tools.simulator.lights import see_lights
 from data_tools.simulator.sensors import observe, viewpoint
 from data_tools.simulator.settings import SimulatorSettings
-from data_tools.simulator.world import build_world
+from data_tools.simulator.world import World, build_world
 from saga_fg.arrays import FloatArray
 from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
-from saga_fg.frame import Frame
+from saga_fg.frame import Detections, Frame
 
 EPOCH = 1_600_000_000.0  # s, when the scene of seed 0 takes place
 
@@ -25,7 +26,11 @@ def simulate_scene(settings: SimulatorSettings, seed: int, name: str = "") -> Sc
     """
     if seed < 0:
         raise InputError(f"seed: expected a number of at least 0, got {seed}")
-    world = build_world(settings, seed)
+    return scene_in(build_world(settings, seed), settings, seed, name)
+
+
+def scene_in(world: World, settings: SimulatorSettings, seed: int, name: str = "") -> Scene:
+    """The scene in a world that was built with the same settings and seed."""
     date = EPOCH + 60.0 * (seed % 100_000) - world.start
     frames = []
     for sensor_name, sensor in settings.sensors.items():
@@ -34,7 +39,10 @@ def simulate_scene(settings: SimulatorSettings, seed: int, name: str = "") -> Sc
             pose = world.ego_pose(time)
             boxes, near, share = world.seen_from(viewpoint(sensor, pose), time, sensor.max_range)
             detections = observe(sensor, pose, boxes.select(near), share, rng)
-            frames.append(Frame(round(date + time, 6), sensor_name, detections, pose))
+            lights = see_lights(sensor, pose, world.signals, time, settings.lights, rng)
+            if len(lights):
+                detections = Detections.concatenate([detections, lights])
+            frames.append(Frame(round(date + time, 6), sensor_name, detections, pose, road_map=world.road_map))
     frames.sort(key=lambda frame: (frame.timestamp, frame.sensor))
     keyframes = world.start + _times(settings.duration, settings.keyframe_rate, 0.0)
     poses = np.array([world.ego_pose(time) for time in keyframes])

@@ -71,6 +71,7 @@ class TrafficSettings:
     van_share: float = setting(0.25, "share of vans and the like, labelled car, that one cannot look over")
     truck_share: float = setting(0.18, "share of trucks")
     bus_share: float = setting(0.08, "share of buses")
+    trailer_share: float = setting(0.0, "share of the trucks that tow a trailer")
     platoon_size: tuple[int, int] = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: Range = setting((10.0, 60.0), "extra distance between platoons, m")
     signal_probability: float = setting(0.7, "share of scenes with a traffic light ahead; the rest have a slow zone")
@@ -82,6 +83,8 @@ class TrafficSettings:
 
     def __post_init__(self) -> None:
         _require_positive(self, "platoon_size", "red_duration", "green_duration", "slow_speed", "slow_duration")
+        if not 0 <= self.trailer_share <= 1:
+            raise InputError(f"trailer_share: expected a share in [0, 1], got {self.trailer_share}")
         if not self.van_share + self.truck_share + self.bus_share <= 1:
             raise InputError("van_share: expected the shares of vans, trucks and buses to be at most 1 together")
 
@@ -96,6 +99,46 @@ class PedestrianSettings:
     pause_interval: float = setting(20.0, "mean time between a group's stops, s")
     pause_duration: float = setting(4.0, "mean duration of a stop, s")
     jitter: float = setting(0.25, "standard deviation of a person's place around that in the group, m")
+
+
+@dataclass(frozen=True)
+class CyclistSettings:
+    """Riders on bicycles at the edges of the road."""
+
+    count: tuple[int, int] = setting((0, 0), "fewest and most riders in each direction")
+    speed: Range = setting((3.5, 6.5), "speed that a rider likes, m/s")
+    spread: float = setting(1.0, "standard deviation of a rider's speed about that, m/s")
+    change_time: float = setting(2.5, "correlation time of a rider's speed, s")
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "speed", "change_time")
+
+
+@dataclass(frozen=True)
+class RoadworkSettings:
+    """A right lane closed by cones: a taper that pushes its traffic into the lane beside, then a row along that."""
+
+    probability: float = setting(0.0, "share of the scenes with a lane that ends whose lane is closed by cones")
+    taper: Range = setting((30.0, 45.0), "length of the taper, m")
+    row: Range = setting((25.0, 50.0), "length of the row of cones behind it, m")
+    spacing: float = setting(4.0, "distance between cones, m")
+    notice: Range = setting((60.0, 110.0), "how far before the taper drivers begin to fit themselves in, m")
+    early: float = setting(10.0, "the earliest drivers leave the lane so long before the latest, m")
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "taper", "row", "spacing", "notice")
+        if not 0 <= self.probability <= 1:
+            raise InputError(f"probability: expected a share in [0, 1], got {self.probability}")
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """What is known, and seen, of the traffic lights."""
+
+    amber_duration: float = setting(3.0, "so long a light is amber before it is red, as part of its red phase, s")
+    mapped: bool = setting(False, "whether frames bring a map along, of lights, stop lines and lanes")
+    map_noise: float = setting(0.2, "standard deviation of the places in the map, m")
+    visible_range: float = setting(80.0, "the colour of a light can be seen from this far, m")
 
 
 @dataclass(frozen=True)
@@ -139,6 +182,9 @@ class SensorSettings:
         None, "standard deviation of the range rate over ground, m/s; null: no range rate"
     )
     boxes: bool = setting(True, "whether it measures sizes and headings")
+    colour_accuracy: float | None = setting(
+        None, "chance that it tells the colour of a traffic light rightly; null: it sees no colours"
+    )
     detection_probability: float = setting(0.97, "chance to detect a clearly visible object close by")
     hidden_share: float = setting(0.15, "visible share up to which an object is never detected")
     clear_share: float = setting(0.35, "visible share from which occlusion does not matter")
@@ -228,6 +274,9 @@ class SimulatorSettings:
     traffic: TrafficSettings = settings_group(TrafficSettings, "what is on the road")
     pedestrians: PedestrianSettings = settings_group(PedestrianSettings, "people on foot")
     surroundings: SurroundingSettings = settings_group(SurroundingSettings, "what stands beside the road")
+    cyclists: CyclistSettings = settings_group(CyclistSettings, "riders on bicycles")
+    roadworks: RoadworkSettings = settings_group(RoadworkSettings, "lanes closed by cones")
+    lights: LightSettings = settings_group(LightSettings, "traffic lights")
     sensors: dict[str, SensorSettings] = settings_group(
         lambda: {"lidar": lidar(), "camera": camera()}, "sensors on the ego vehicle, by name"
     )

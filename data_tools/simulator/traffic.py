@@ -63,6 +63,7 @@ class Traffic:
         slow_zones: Sequence[SlowZone] = (),
         step: float = 0.05,
         time: float = 0.0,
+        early: float = 0.0,
     ) -> None:
         self._lanes, self._fleet, self._settings, self._rng = lanes, fleet, settings, rng
         self._stop_lines, self._slow_zones, self._step = stop_lines, slow_zones, step
@@ -77,6 +78,7 @@ class Traffic:
         self._was_closed = [False] * len(stop_lines)
         self._pending = [np.zeros(n)] * round(settings.reaction_time / step)
         self._steps = 0
+        self._early = rng.uniform(0.0, early, n) if early > 0 else np.zeros(n)
 
     @property
     def on_road(self) -> BoolArray:
@@ -84,12 +86,19 @@ class Traffic:
 
     def order(self) -> LaneOrder:
         """Who is where, of those still on the road."""
-        lanes = np.where(self.on_road[:, None], np.stack([self.lane, self._from], axis=1), -1)
+        lanes = np.where(self.on_road[:, None], np.stack([self.lane, self._also_in()], axis=1), -1)
         return LaneOrder.of(self.s, lanes)
+
+    def _also_in(self) -> IntArray:
+        """The lane each is partly in besides its own, or -1: while it changes, and where cones push it aside."""
+        if self._lanes.taper == 0:
+            return self._from
+        pushed = (self.lane == self._lanes.ending) & (self.s + self._early >= self._lanes.end - self._lanes.taper)
+        return np.where(pushed, self._lanes.beside, self._from)
 
     def lateral(self) -> tuple[FloatArray, FloatArray]:
         """Offsets d (N,), m, and slopes dd/ds (N,)."""
-        d, slope = self._lanes.lateral(self.lane, self.s)
+        d, slope = self._lanes.lateral(self.lane, self.s + self._early)
         d0, slope0 = self._lanes.lateral(np.where(self._from >= 0, self._from, self.lane), self.s)
         q = np.where(self._from >= 0, self._share, 1.0)
         weight = smooth_step(q)
@@ -117,6 +126,8 @@ class Traffic:
         self.speed = speed
         self._share = self._share + travelled / self._change_length
         self._from = np.where(self._share < 1, self._from, -1)
+        if self._lanes.taper > 0:
+            self.lane[(self.lane == self._lanes.ending) & (self.s >= self._lanes.end)] = self._lanes.beside
         self.time += h
         self._steps += 1
 
@@ -127,7 +138,7 @@ class Traffic:
         for zone in self._slow_zones:
             limit = np.minimum(limit, zone.limit(self.lane, s, self.time))
         pull = np.zeros(len(s))
-        for lane in (self.lane, self._from):
+        for lane in (self.lane, self._also_in()):
             leader = order.ahead(lane, s)
             gap = (s[leader] - s) * metric - (self._fleet.length[leader] + self._fleet.length) / 2
             term = following_acceleration(v, np.maximum(gap, 0.0), v[leader], drivers)
@@ -149,7 +160,7 @@ class Traffic:
                 waits = np.isin(self.lane, line.lanes) & (gap > -0.5) & ~self._passes[k]
                 term = following_acceleration(v, np.maximum(gap, 0.0), np.zeros(len(s)), drivers)
                 pull = np.minimum(pull, np.where(waits, term, 0.0))
-        if self._lanes.ending >= 0:
+        if self._lanes.ending >= 0 and self._lanes.taper == 0:
             gap = np.maximum(self._lanes.end - s - self._fleet.length / 2, 0.0)
             term = following_acceleration(v, gap, np.zeros(len(s)), drivers)
             pull = np.minimum(pull, np.where(self.lane == self._lanes.ending, term, 0.0))
@@ -164,7 +175,7 @@ class Traffic:
             return pull
         merging = (self.lane == self._lanes.ending) & (self.s >= self._lanes.opening) & self.on_road
         rows = np.flatnonzero(merging)
-        target = self._lanes.neighbour(self.lane[rows], -1)
+        target = np.full(len(rows), self._lanes.beside)
         pairs = ((rows, order.ahead(target, self.s[rows])), (order.behind(target, self.s[rows]), rows))
         for behind, front in pairs:
             both = (behind >= 0) & (front >= 0)

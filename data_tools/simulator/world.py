@@ -6,17 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_tools.simulator.cyclists import ride
 from data_tools.simulator.fleet import CAR
+from data_tools.simulator.lights import Signal, map_of, signals_of
 from data_tools.simulator.occlusion import visible_share
 from data_tools.simulator.pedestrians import walk
+from data_tools.simulator.roadworks import draw_cones
 from data_tools.simulator.scenario import Scenario, draw_scenario
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.surroundings import draw_surroundings
+from data_tools.simulator.towing import parted
 from data_tools.simulator.traffic import Traffic, TrafficHistory, drive
 from data_tools.simulator.trajectories import Trajectories, standing, together
 from saga_fg.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.geometry import yaw_transform
+from saga_fg.road import RoadMap
 
 FURNISHED = (-300.0, 400.0)  # m around the place where traffic is disturbed
 WALKED = (-150.0, 100.0)
@@ -26,11 +31,19 @@ OCCLUDER_MARGIN = 20.0  # m, half the length of the largest occluder and more
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """objects: all that can be seen and annotated; occluders: what only hides; ego: the vehicle that looks."""
+    """objects: all that can be seen and annotated; occluders: what only hides; ego: the vehicle that looks.
+
+    signals: the traffic lights; road_map: what frames bring along of them and of the lanes, if anything; scenario: what
+    all this was made from; history: how the vehicles drove
+    """
 
     objects: Trajectories
     occluders: Boxes
     ego: Trajectories
+    signals: tuple[Signal, ...]
+    road_map: RoadMap | None
+    scenario: Scenario
+    history: TrafficHistory
 
     @property
     def start(self) -> float:
@@ -56,10 +69,10 @@ class World:
 
 def build_world(settings: SimulatorSettings, seed: int) -> World:
     """The world of one scene: the same for the same seed, whatever the sensors."""
-    streams = np.random.default_rng(seed).spawn(5)
+    streams = np.random.default_rng(seed).spawn(8)
     scenario = draw_scenario(settings, streams[0])
     history = simulate_traffic(scenario, settings, streams[1])
-    vehicles = vehicle_trajectories(scenario, history)
+    vehicles, trailers = parted(vehicle_trajectories(scenario, history), scenario.lanes, history, scenario.trailer)
     ego = choose_ego(scenario, history, streams[2])
     around = draw_surroundings(
         scenario.lanes.road,
@@ -74,7 +87,22 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     people = walk(scenario.lanes.road, around.pavements, walked, history.time, settings.pedestrians, streams[4])
     parked = standing(_ids("parked", len(around.parked)), around.parked, history.time)
     others = vehicles.select(np.delete(np.arange(len(vehicles)), ego))
-    return World(together([others, people, parked]), around.occluders, vehicles.select(np.array([ego])))
+    riders = ride(scenario.lanes.road, scenario.edges, walked, history.time, settings.cyclists, streams[5])
+    boxes = draw_cones(scenario.lanes, settings.roadworks, streams[6])
+    cones = standing(_ids("cone", len(boxes)), boxes, history.time)
+    signals = signals_of(scenario.lanes, scenario.stop_lines, settings.lights)
+    road_map = None
+    if settings.lights.mapped:
+        road_map = map_of(scenario.lanes, scenario.focus, scenario.stop_lines, signals, settings.lights, streams[7])
+    return World(
+        together([others, trailers, people, parked, riders, cones]),
+        around.occluders,
+        vehicles.select(np.array([ego])),
+        signals,
+        road_map,
+        scenario,
+        history,
+    )
 
 
 def simulate_traffic(scenario: Scenario, settings: SimulatorSettings, rng: np.random.Generator) -> TrafficHistory:
@@ -90,6 +118,7 @@ def simulate_traffic(scenario: Scenario, settings: SimulatorSettings, rng: np.ra
         scenario.stop_lines,
         scenario.slow_zones,
         settings.step,
+        early=settings.roadworks.early if scenario.lanes.taper > 0 else 0.0,
     )
     for _ in range(round(settings.warm_up / settings.step)):
         traffic.step()
@@ -97,7 +126,7 @@ def simulate_traffic(scenario: Scenario, settings: SimulatorSettings, rng: np.ra
 
 
 def vehicle_trajectories(scenario: Scenario, history: TrafficHistory) -> Trajectories:
-    """The vehicles' motion in world coordinates."""
+    """The vehicles' motion in world coordinates, each in one piece."""
     position, heading = scenario.lanes.pose(history.lane, history.s, history.offset, history.slope)
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     fleet = scenario.fleet

@@ -78,7 +78,9 @@ def _predicted(
     for row, node_type in zip(rows, types, strict=True):
         x = np.zeros(node_type.dim)
         known = row_of[int(graph.nodes[row])]
-        x[node_type.index(POSITION)], x[node_type.index(VELOCITY)] = nodes.position[known], nodes.velocity[known]
+        x[node_type.index(POSITION)] = nodes.position[known]
+        if node_type.has(VELOCITY):
+            x[node_type.index(VELOCITY)] = nodes.velocity[known]
         states.append(x)
     own = (transition.F_matrix @ np.concatenate(states) + transition.b)[: types[0].dim]
     return np.asarray(np.concatenate([own[types[0].index(POSITION)], own[types[0].index(VELOCITY)]]))

@@ -24,7 +24,7 @@ LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known 
 
 
 class Kinematics(NamedTuple):
-    """Of n tracks: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2)."""
+    """Of n tracks: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2); 0 for what stands."""
 
     position: FloatArray
     velocity: FloatArray
@@ -68,9 +68,11 @@ class JointTrackState:
         for node_type, rows in self._by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
             P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
-            at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
-            mean[:, at_p], mean[:, at_v] = now.position[rows], now.velocity[rows]
-            P[:, at_p[:, None], at_p], P[:, at_v[:, None], at_v] = now.P[rows], now.P_velocity[rows]
+            at_p = node_type.index(POSITION)
+            mean[:, at_p], P[:, at_p[:, None], at_p] = now.position[rows], now.P[rows]
+            if node_type.has(VELOCITY):
+                at_v = node_type.index(VELOCITY)
+                mean[:, at_v], P[:, at_v[:, None], at_v] = now.velocity[rows], now.P_velocity[rows]
             if delay > 0:
                 F, Q = _own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
@@ -96,8 +98,9 @@ class JointTrackState:
         measurement where it belongs; a filter, one of a track born since, moves it to the present along own motion.
         """
         for node_type, of_type in self._by_type(label, delay > 0):
+            measured = with_velocity[of_type] & node_type.has(VELOCITY)
             for velocity in (True, False):
-                rows = of_type[with_velocity[of_type] == velocity]
+                rows = of_type[measured == velocity]
                 if len(rows) == 0:
                     continue
                 k = 4 if velocity else 2
@@ -121,6 +124,8 @@ class JointTrackState:
         present estimate, moved back by `delay` along own motion. Left out: tracks within `LEAST_RANGE` of the sensor.
         """
         for node_type, rows in self._by_type(label, moving=True):
+            if not node_type.has(VELOCITY):
+                continue
             at_p, at_v = node_type.index(POSITION).tolist(), node_type.index(VELOCITY).tolist()
             x = self._estimator.mean(ids[rows])
             if delay > 0:
@@ -139,6 +144,11 @@ class JointTrackState:
         if self._kinematics is None or len(self._kinematics.P) != len(ids):
             self._kinematics = self._read(ids, label)
         return self._kinematics
+
+    def places(self, ids: IntArray, label: StrArray) -> tuple[FloatArray, FloatArray]:
+        """Positions (k, 2) of some nodes now, and their covariances (k, 2, 2)."""
+        now = self._read(ids, label)
+        return now.position, now.P
 
     def positions_before(self, ids: IntArray, label: StrArray, delay: float) -> tuple[FloatArray, FloatArray]:
         """Positions (n, 2) `delay` s ago, by own motion, and their covariances (n, 2, 2)."""
@@ -217,10 +227,11 @@ class JointTrackState:
         result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
         for node_type, rows in self._by_type(label):
             mean, covariance = self._estimator.mean(ids[rows]), self._estimator.covariance(ids[rows])
-            at_p, at_v = node_type.index(POSITION), node_type.index(VELOCITY)
-            result.position[rows], result.velocity[rows] = mean[:, at_p], mean[:, at_v]
-            result.P[rows] = covariance[:, at_p[:, None], at_p]
-            result.P_velocity[rows] = covariance[:, at_v[:, None], at_v]
+            at_p = node_type.index(POSITION)
+            result.position[rows], result.P[rows] = mean[:, at_p], covariance[:, at_p[:, None], at_p]
+            if node_type.has(VELOCITY):
+                at_v = node_type.index(VELOCITY)
+                result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
         return result
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.boxes import Boxes
 from saga_fg.frame import Frame
+from saga_fg.road.signal import SIGHTINGS
 from saga_fg.sensor import Sensor
 from saga_fg.tracking.settings import ClassSettings, class_values
 from saga_fg.tracking.suppression import strongest
@@ -43,7 +44,8 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     detections = sensor.in_world(frame)
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
-    keep = np.flatnonzero(probability >= class_values(classes, "min_score", label))
+    objects = ~np.isin(label, SIGHTINGS)  # the colours of lights are not objects of their own
+    keep = np.flatnonzero(objects & (probability >= class_values(classes, "min_score", label)))
     limits = (
         class_values(classes, name, label[keep]) for name in ("duplicate_distance", "shadow_distance", "shadow_ratio")
     )

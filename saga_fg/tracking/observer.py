@@ -28,7 +28,7 @@ class TrackerView:
     timestamp   s, of the state
     sensor      that the frame is of
     columns     existence, score, times and so on
-    nodes       the tracks as edge rules see them; positions are local, see `origin`
+    nodes       as edge rules see them: the tracks, then the nodes of the roadside; positions are local, see `origin`
     P           (n, 2, 2) covariance of the positions, m^2
     origin      (2,) of the local positions in the world, m
     graph       of the latest interval, None before the first
@@ -49,8 +49,8 @@ class TrackerView:
     born: IntArray
 
     def places(self) -> FloatArray:
-        """(n, 2) positions in the world, m."""
-        return np.asarray(self.nodes.position + self.origin)
+        """(n, 2) positions of the tracks in the world, m."""
+        return np.asarray(self.nodes.position[: len(self.columns.id)] + self.origin)
 
 
 class Observer(Protocol):

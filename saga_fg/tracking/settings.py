@@ -12,7 +12,12 @@ import numpy as np
 from saga_fg.arrays import FloatArray, StrArray, distinct
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
-from saga_fg.node import ConstantAcceleration, ConstantVelocity
+from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
+from saga_fg.rigid_coupling import Attached
+from saga_fg.road import RoadMap, SignalSettings
+from saga_fg.road.cones import ConeEdge
+from saga_fg.road.lane_keeping import InLane
+from saga_fg.road.stopping import RedLight
 from saga_fg.sensor import DEFAULT
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
@@ -24,8 +29,8 @@ AssociationName = Literal["hungarian", "greedy", "graph"]
 class ClassSettings:
     """How objects of one class move, are born, matched and given up."""
 
-    motion: ConstantVelocity | ConstantAcceleration = settings_group(
-        lambda: ConstantVelocity(acceleration_noise=2.0), "own motion"
+    motion: ConstantVelocity | ConstantAcceleration | RandomWalk = settings_group(
+        lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
     )
     birth_speed: float = setting(5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s")
     birth_drift: float = setting(1.0, "standard deviation of an unmeasured velocity at birth, across the heading, m/s")
@@ -128,11 +133,18 @@ class TrackerSettings:
         default_factory=lambda: {DEFAULT: ClassSettings()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    edges: tuple[Following | Neighbours, ...] = settings_group(
+    edges: tuple[Following | Neighbours | RedLight | InLane | ConeEdge | Attached, ...] = settings_group(
         lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
     )
     explained_noise: float = setting(
         0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
+    )
+    max_step: float = setting(
+        math.inf, "a longer interval is predicted in several steps, each with edges of its own, s; .inf: in one"
+    )
+    signals: SignalSettings = settings_group(SignalSettings, "traffic lights, where a map knows of any")
+    road_map: RoadMap | None = settings_group(
+        lambda: None, "lights, stop lines and lanes, world coordinates; null: none but those that frames bring along"
     )
     estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
     lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
@@ -154,7 +166,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting", "score_memory")
-        require_positive(self, "max_out_of_view", "report_speed_known", infinite=True)
+        require_positive(self, "max_out_of_view", "report_speed_known", "max_step", infinite=True)
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))

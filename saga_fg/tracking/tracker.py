@@ -34,6 +34,7 @@ from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estima
 from saga_fg.tracking.matching import associate
 from saga_fg.tracking.observation import Observed, observe
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
+from saga_fg.tracking.roadside import Roadside, motion_of
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
@@ -46,7 +47,7 @@ class Snapshot:
     """A tracker at one moment, see `Tracker.snapshot`."""
 
     state: Any
-    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow]
+    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow, Roadside]
     numbers: tuple[float, FloatArray, int, int]
     graph: SceneGraph | None
     assignment: Assignment
@@ -80,7 +81,7 @@ class Tracker:
         self.graph: SceneGraph | None = None  # of the latest interval
         self.assignment = Assignment.empty()  # of the latest frame
         self._state = JointTrackState(
-            new_estimator(self.settings.estimator, self.settings.lag), lambda label: self.class_settings(label).motion
+            new_estimator(self.settings.estimator, self.settings.lag), lambda label: motion_of(self.settings, label)
         )
         self._time = -math.inf  # of the state; no frame yet
         self._origin = np.zeros(2)
@@ -89,6 +90,7 @@ class Tracker:
         self._evidence = SensorEvidence()
         self._flow = TrafficFlow(self.settings.flow)
         self._box = BoxFilter.empty()
+        self.roadside = Roadside(self.settings.signals)
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far."""
@@ -96,7 +98,7 @@ class Tracker:
         timestamp = frame.timestamp + sensor.time_offset
         if self._time == -math.inf:
             self._time = timestamp
-        if len(self._columns.id) == 0:
+        if len(self._columns.id) == 0 and len(self.roadside) == 0:
             self._origin = _origin(frame)
         delay = max(0.0, self._time - timestamp)
         self.assignment = Assignment.empty()
@@ -105,8 +107,12 @@ class Tracker:
             log.warning("frame of %s at %.3f s comes %.3f s late and is left out", frame.sensor, timestamp, delay)
             return self._report(self._time)
         before = self._time
+        for road_map in (self.settings.road_map, frame.road_map):
+            if road_map is not None:
+                self.roadside.learn(road_map, self._origin, self._state)
         self._predict(max(timestamp, self._time))
         self._tell("predict", frame)
+        self.roadside.heed(frame, sensor, self._origin, self._state, delay)
         observed = observe(frame, sensor, self.settings.classes)
         self._tell("observe", frame, observed)
         matching = self._associate(observed, sensor, delay)
@@ -140,24 +146,25 @@ class Tracker:
         if timestamp <= self._time:
             return self._report(timestamp)
         state, box, now, graph = self._state.snapshot(), self._box, self._time, self.graph
-        self._box = box.select(np.arange(len(box.z)))
+        self._box, roadside = box.select(np.arange(len(box.z))), self.roadside
+        self.roadside = copy.copy(roadside)
         try:
             self._predict(timestamp)
             return self._report(timestamp)
         finally:
             self._state.restore(state)
-            self._box, self._time, self.graph = box, now, graph
+            self._box, self._time, self.graph, self.roadside = box, now, graph, roadside
 
     def snapshot(self) -> Snapshot:
         """All that the tracker knows; what it does later leaves it as it is."""
-        own = copy.deepcopy((self._columns, self._box, self._evidence, self._flow))
+        own = copy.deepcopy((self._columns, self._box, self._evidence, self._flow, self.roadside))
         numbers = (self._time, self._origin, self._next_id, self.late_frames)
         return Snapshot(self._state.snapshot(), own, numbers, self.graph, self.assignment)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from where a tracker of the same settings was; as often as wanted from one snapshot."""
         self._state.restore(snapshot.state)
-        self._columns, self._box, self._evidence, self._flow = copy.deepcopy(snapshot.own)
+        self._columns, self._box, self._evidence, self._flow, self.roadside = copy.deepcopy(snapshot.own)
         self._time, self._origin, self._next_id, self.late_frames = snapshot.numbers
         self.graph, self.assignment = snapshot.graph, snapshot.assignment
 
@@ -179,11 +186,13 @@ class Tracker:
 
     def _predict(self, timestamp: float) -> None:
         dt = timestamp - self._time
-        if dt > 0 and len(self._columns.id):
-            graph = build_graph(self._nodes(), self.rules, explained_noise=self.settings.explained_noise)
-            self._state.predict(graph, dt)
+        if dt > 0 and len(self._columns.id) + len(self.roadside):
+            steps = max(1, math.ceil(dt / self.settings.max_step - 1e-9))
+            for _ in range(steps):
+                self.graph = build_graph(self._nodes(), self.rules, explained_noise=self.settings.explained_noise)
+                self._state.predict(self.graph, dt / steps)
+                self.roadside.predict(dt / steps)
             self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
-            self.graph = graph
         self._time = timestamp
 
     def _associate(self, observed: Observed, sensor: Sensor, delay: float) -> Matching:
@@ -378,11 +387,11 @@ class Tracker:
         return self._state.kinematics(self._columns.id, self._columns.label)
 
     def _nodes(self) -> NodeTable:
-        """The present estimates as edge rules see them."""
+        """The present estimates as edge rules see them: the tracks, then the nodes of the roadside."""
         columns, box = self._columns, self._box
         position, velocity, _, P_velocity = self._kinematics()
         heading = np.where(np.isfinite(box.yaw), box.yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
-        return NodeTable(
+        tracks = NodeTable(
             columns.id,
             columns.label,
             self._state.types_of(columns.label),
@@ -393,6 +402,7 @@ class Tracker:
             (P_velocity[:, 0, 0] + P_velocity[:, 1, 1]) / 2,
             columns.has_moved,
         )
+        return self.roadside.beside(tracks, self._origin, self._state)
 
     def _of_class(self, name: str, label: StrArray) -> FloatArray:
         """(n,) a class setting for each label."""

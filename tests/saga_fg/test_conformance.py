@@ -25,6 +25,7 @@ from estimator_programs import (
 )
 from estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
+from road_scenes import road_program
 
 from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
 from saga_fg.discretisation import discretise
@@ -150,6 +151,13 @@ def test_nodes_that_stand_still_for_ever(make, seed):
     """Stop lines and poles have no process noise: Q is singular."""
     rng = np.random.default_rng(40 + seed)
     in_step(random_program(rng, moments=7, kinds=(CAR, POLE)), make())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_scene_of_lights_lanes_cones_and_trailers(make, seed):
+    """Standing and moving nodes whose edges go between kinds, with rates that follow the belief on a light."""
+    rng = np.random.default_rng(seed)
+    in_step(road_program(rng), make())
 
 
 @pytest.mark.parametrize("seed", range(3))

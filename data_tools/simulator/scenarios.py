@@ -1,0 +1,62 @@
+"""Kinds of scenes in which more than cars matters, as settings of the simulator.
+
+red-light    a queue before a traffic light; frames bring a map along, the camera sees the colours
+road-works   cones close the right lane, whose traffic is pushed into the lane beside
+towing       many trucks, most of them with a trailer
+cycling      riders on bicycles beside slow traffic
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Literal, get_args
+
+from data_tools.simulator.settings import (
+    CyclistSettings,
+    LightSettings,
+    RoadSettings,
+    RoadworkSettings,
+    SimulatorSettings,
+    TrafficSettings,
+    camera,
+    lidar,
+)
+
+ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "cycling"]
+SCENARIOS: tuple[ScenarioName, ...] = get_args(ScenarioName)
+
+
+def scenario_settings(name: ScenarioName) -> SimulatorSettings:
+    """The settings of a kind of scene; `traffic` is what the simulator does by default."""
+    return _SETTINGS[name]()
+
+
+def _red_light() -> SimulatorSettings:
+    return SimulatorSettings(
+        road=RoadSettings(merge_probability=0.0),
+        traffic=TrafficSettings(signal_probability=1.0),
+        lights=LightSettings(mapped=True),
+        sensors={"lidar": lidar(), "camera": replace(camera(), colour_accuracy=0.9)},
+    )
+
+
+def _road_works() -> SimulatorSettings:
+    return SimulatorSettings(road=RoadSettings(merge_probability=1.0), roadworks=RoadworkSettings(probability=1.0))
+
+
+def _towing() -> SimulatorSettings:
+    return SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8))
+
+
+def _cycling() -> SimulatorSettings:
+    return SimulatorSettings(cyclists=CyclistSettings(count=(5, 9)))
+
+
+_SETTINGS: Mapping[ScenarioName, Callable[[], SimulatorSettings]] = {
+    "traffic": SimulatorSettings,
+    "red-light": _red_light,
+    "road-works": _road_works,
+    "towing": _towing,
+    "cycling": _cycling,
+}

@@ -1,0 +1,156 @@
+r"""A closed stop line brings the first vehicle to a halt, and through it the queue.
+
+    dv_i/dt += rate tau u ( -v^2 / (2 g) ),    v = u.v_i,    g = u.(p_j - p_i) + bend - length_i / 2 - margin
+
+is the even deceleration that ends at the line: v its speed along the lane, g the way left from the front of the vehicle
+to `margin` before the line, `bend` what the way along the lane is longer than the straight one. Linearised at the
+estimate (v0, g0):
+
+    -v^2 / (2 g) ~ -v0^2 / (2 g0) - (v0 / g0) (v - v0) + v0^2 / (2 g0^2) (g - g0)
+
+The rule: of the vehicles that come to a line, the first of each lane that can still stop, at
+
+    rate = rate  closed_j  ramp( v^2 / (2 g) from `noticed` to `firm` )
+
+since nobody brakes for a line far away; who would have to brake harder than `hardest` to stop before it goes on. Those
+behind follow by other interactions. Lanes of the map tell who comes to the line; without them, straight on along the
+heading.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.edge_rules import VEHICLES, Pairs
+from saga_fg.geometry import wrap_angle
+from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
+from saga_fg.node import NodeType
+from saga_fg.road.polyline import feet, on_it
+from saga_fg.road.road_map import LANE, STOP_LINE
+from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+LEAST_GAP = 0.5  # m; nearer, v^2 / (2 g) is all noise
+LEAST_SPEED = 0.1  # m/s
+SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
+
+
+class Approach(NamedTuple):
+    """Of E pairs of a vehicle and a stop line: whether it comes to it, the way to it (from the centre, along the lane),
+    m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m to the left of its middle.
+    """
+
+    comes: BoolArray
+    way: FloatArray
+    direction: FloatArray
+    crossing: FloatArray
+
+
+def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
+    """How vehicles `target` (E,) stand to stop lines `source` (E,)."""
+    offset = nodes.position[source] - nodes.position[target]
+    u = unit(nodes.heading[target])
+    way = np.einsum("ei,ei->e", offset, u)
+    left, right = (np.array([nodes.outline[j][end] for j in source.tolist()]).reshape(-1, 2) for end in (0, 1))
+    aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
+    half = np.hypot(*(left - right).T) / 2
+    aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
+    comes = (np.abs(aside) < half) & aligned & (way > 0)
+    crossing = -aside
+    (vehicles, of_vehicle), (lines, of_line) = (np.unique(rows, return_inverse=True) for rows in (target, source))
+    for lane in np.flatnonzero(nodes.label == LANE).tolist() if len(target) else ():
+        centre, width = nodes.outline[lane], nodes.width[lane]
+        mine = feet(centre, nodes.position[vehicles]).select(of_vehicle)
+        its = feet(centre, nodes.position[lines]).select(of_line)
+        in_lane = (np.abs(mine.e) <= width / 2) & (np.einsum("ei,ei->e", mine.direction, u) > 0)
+        in_lane &= on_it(centre, mine.s)
+        crossed = (np.abs(its.e) <= half) & (np.cos(np.arctan2(*its.direction.T[::-1]) - nodes.heading[source]) > 0)
+        way = np.where(in_lane & crossed, its.s - mine.s, way)
+        comes = np.where(in_lane, crossed & (its.s > mine.s), comes)
+        crossing = np.where(in_lane & crossed, mine.e - its.e, crossing)
+        u = np.where(in_lane[:, None], mine.direction, u)
+    return Approach(comes, way, u, crossing)
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """Even deceleration to a halt before a line; the source is the line."""
+
+    time_constant: float = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
+    margin: float = setting(1.5, "way left between the front of a vehicle and the line's middle at the halt, m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "time_constant")
+        require_between(self, 0, math.inf, "margin")
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(POSITION + VELOCITY) and source.has(POSITION)
+
+    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
+        """g (E,), m, for ways from the centres to the line."""
+        return np.maximum(way - nodes.length[target] / 2 - self.margin, LEAST_GAP)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        ways = approach(nodes, target, source)
+        u, g = ways.direction, self.gap(nodes, target, ways.way)
+        v = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], u), 0.0)
+        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+        p_j = nodes.types[source[0]].index(POSITION)
+        along = self.time_constant * u[:, :, None] * u[:, None, :]
+        slower, nearer = v / g, v**2 / (2 * g**2)
+        straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
+        triples = no_triples(nodes, target, source)
+        triples.A_self[:, v_i[:, None], v_i] = -along * slower[:, None, None]
+        triples.A_self[:, v_i[:, None], p_i] = -along * nearer[:, None, None]
+        triples.A_other[:, v_i[:, None], p_j] = along * nearer[:, None, None]
+        triples.b[:, v_i] = self.time_constant * u * (v**2 / (2 * g) - nearer * straight)[:, None]
+        return triples
+
+
+@dataclass(frozen=True)
+class RedLight:
+    """The first vehicle that comes to a closed stop line, and can stop, does."""
+
+    interaction: Stopping = settings_group(Stopping, "interaction function of the edges")
+    rate: float = setting(1.0, "strength of an edge of a vehicle that brakes for a line surely closed, 1/s")
+    max_distance: float = setting(100.0, "nobody brakes for a line further away, m")
+    noticed: float = setting(0.3, "needed deceleration from which drivers begin to react, m/s^2")
+    firm: float = setting(1.0, "needed deceleration from which they brake as much as is needed, m/s^2")
+    hardest: float = setting(4.5, "who would have to brake harder does not stop, m/s^2")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_distance", "noticed")
+        require_positive(self, "firm", "hardest")
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        lines = np.flatnonzero(nodes.label == STOP_LINE)
+        vehicles = np.flatnonzero(np.isin(nodes.label, self.classes))
+        if len(lines) == 0 or len(vehicles) == 0 or nodes.closed is None:
+            return Pairs(vehicles[:0], lines[:0], np.empty(0))
+        target, source = np.repeat(vehicles, len(lines)), np.tile(lines, len(vehicles))
+        near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= self.max_distance
+        target, source = target[near], source[near]
+        ways = approach(nodes, target, source)
+        g = self.interaction.gap(nodes, target, ways.way)
+        v = np.einsum("ei,ei->e", nodes.velocity[target], ways.direction)
+        needed = np.maximum(v, 0.0) ** 2 / (2 * g)
+        front = ways.way - nodes.length[target] / 2  # of the vehicle, before the line
+        stops = ways.comes & (front > 0) & (v**2 <= 2 * self.hardest * front)
+        first = _first(source, np.where(stops, ways.way, np.inf), ways.crossing)
+        ramp = np.clip((needed - self.noticed) / max(self.firm - self.noticed, 1e-9), 0.0, 1.0)
+        # at a crawl nothing needs to be braked any more
+        rate = self.rate * nodes.closed[source] * ramp * (v > LEAST_SPEED)
+        return Pairs(target[first], source[first], rate[first])
+
+
+def _first(line: IntArray, way: FloatArray, crossing: FloatArray) -> IntArray:
+    """The pairs with a finite way that no other of the same line, which crosses it within a metre or two, precedes."""
+    same = line[:, None] == line
+    same &= np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE
+    preceded = (same & (way < way[:, None])).any(axis=1)
+    return np.flatnonzero(np.isfinite(way) & ~preceded)

@@ -1,0 +1,162 @@
+"""The road in the tracker: lights, stop lines and lanes as nodes of the joint state, with the colours of the lights.
+
+Nodes of the roadside stand still; their places start where the map has them, as uncertain as the map, and are corrected
+by whatever is seen: of a light itself, and through the interactions of the vehicles that heed a line or keep a lane.
+Ids count down from -1, so that they are never those of tracks. Detections labelled `saga_fg.road.SIGHTINGS` report the
+colour of a light, of the nearest known one within reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.association import assign, gate, mahalanobis
+from saga_fg.frame import Frame
+from saga_fg.interactions import NodeTable
+from saga_fg.node import Motion, RandomWalk
+from saga_fg.road.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, RoadMap
+from saga_fg.road.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
+from saga_fg.sensor import Sensor
+from saga_fg.tracking.joint_state import JointTrackState, Kinematics
+from saga_fg.tracking.settings import TrackerSettings, settings_of
+
+
+def motion_of(settings: TrackerSettings, label: str) -> Motion:
+    """Own motion of a class: nodes of the roadside stand still unless the settings name their class."""
+    if label in ROADSIDE and label not in settings.classes:
+        return RandomWalk()
+    return settings_of(settings.classes, label).motion
+
+
+GATE = 0.999  # share of true sightings of a light that may be its own
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the map has a node, world: middle (2,), polyline (k, 2) about it, direction of travel, m and rad."""
+
+    middle: FloatArray
+    outline: FloatArray
+    heading: float
+    width: float
+
+
+class Roadside:
+    """What is known of the road. `settings`: how lights change."""
+
+    def __init__(self, settings: SignalSettings) -> None:
+        self._settings = settings
+        self.id: IntArray = np.empty(0, dtype=np.int64)
+        self.label: StrArray = np.empty(0, dtype="<U16")
+        self._name: tuple[str, ...] = ()
+        self._place: tuple[_Place, ...] = ()
+        self._light: tuple[str, ...] = ()  # that governs each node, "" for none
+        self._belief: Mapping[str, FloatArray] = {}
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def belief(self, light: str) -> Mapping[str, float]:
+        """Probabilities of the colours of a light, by colour; raises `KeyError` for one that no map has."""
+        return dict(zip(COLOURS, self._belief[light].tolist(), strict=True))
+
+    def learn(self, road_map: RoadMap, origin: FloatArray, state: JointTrackState) -> None:
+        """Add what is new in a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
+        new = [(name, *rest) for name, *rest in _elements(road_map) if name not in self._name]
+        if not new:
+            return
+        names, labels, places, lights = zip(*new, strict=True)
+        ids = -np.arange(len(self) + 1, len(self) + len(new) + 1, dtype=np.int64)
+        self.id, self.label = np.concatenate([self.id, ids]), np.concatenate([self.label, np.array(labels)])
+        self._name += names
+        self._place += places
+        self._light += lights
+        fresh = {name: self._settings.stationary for name in lights if name and name not in self._belief}
+        self._belief = {**self._belief, **fresh}
+        n, P = len(ids), road_map.deviation**2 * np.eye(2)
+        middle = np.array([place.middle for place in places]) - origin
+        still = np.zeros((n, 2)), np.zeros((n, 2, 2))
+        state.add(ids, np.array(labels), Kinematics(middle, still[0], np.tile(P, (n, 1, 1)), still[1]))
+
+    def predict(self, dt: float) -> None:
+        """The lights may change within `dt` s."""
+        if self._belief and dt > 0:
+            later = self._settings.predicted(np.array(list(self._belief.values())), dt)
+            self._belief = dict(zip(self._belief, later, strict=True))
+
+    def heed(self, frame: Frame, sensor: Sensor, origin: FloatArray, state: JointTrackState, delay: float) -> None:
+        """Take in the lights that a frame shows, as it was `delay` s ago: their colours, and where they are."""
+        lights = np.flatnonzero(self.label == LIGHT)
+        if len(lights) == 0 or not np.isin(frame.detections.boxes.label, SIGHTINGS).any():
+            return
+        seen = sensor.in_world(frame)
+        seen = seen.select(np.isin(seen.boxes.label, SIGHTINGS))
+        R = sensor.detection_covariance(seen, sensor.origin(frame))
+        position, P = state.places(self.id[lights], self.label[lights])
+        z = seen.boxes.position[:, :2] - origin
+        d2, log_det = mahalanobis(position, P, z, R)
+        apart = np.hypot(*np.moveaxis(z[None] - position[:, None], -1, 0))
+        possible = (d2 < gate(GATE)) & (apart < self._settings.max_distance)
+        cost = d2 + log_det
+        row, column = assign(cost, possible, cost.max(initial=0.0) + 1.0)
+        belief = dict(self._belief)
+        for light, sighting in zip(lights[row].tolist(), column.tolist(), strict=True):
+            colour = SIGHTINGS.index(str(seen.boxes.label[sighting]))
+            name = self._name[light]
+            belief[name] = colour_updated(belief[name], colour, sensor.colour_accuracy)
+        self._belief = belief
+        k = len(row)
+        if k:
+            full = np.zeros((k, 4, 4))
+            full[:, :2, :2] = R[column]
+            measured = np.concatenate([z[column], np.zeros((k, 2))], axis=1)
+            ids, label = self.id[lights[row]], self.label[lights[row]]
+            state.update(ids, label, measured, full, np.zeros(k, dtype=bool), delay)
+
+    def beside(self, tracks: NodeTable, origin: FloatArray, state: JointTrackState) -> NodeTable:
+        """The table of the tracks with the roadside's nodes after them."""
+        n, m = len(tracks), len(self)
+        if m == 0:
+            return tracks
+        position, _ = state.places(self.id, self.label)
+        moved = tracks.has_moved
+        closed = self._settings.closed(np.array([self._belief[light] for light in self._light if light]))
+        governed = np.array([bool(light) for light in self._light])
+        weight = np.zeros(n + m)
+        weight[n:][governed] = closed
+        outline = {n + k: place.outline + position[k] for k, place in enumerate(self._place) if len(place.outline)}
+        width = {n + k: place.width for k, place in enumerate(self._place) if place.width > 0}
+        return NodeTable(
+            np.concatenate([tracks.id, self.id]),
+            np.concatenate([tracks.label, self.label]),
+            tracks.types + tuple(state.type_of(str(label)) for label in self.label),
+            np.concatenate([tracks.position, position]),
+            np.concatenate([tracks.velocity, np.zeros((m, 2))]),
+            np.concatenate([tracks.heading, [place.heading for place in self._place]]),
+            np.concatenate([tracks.length, np.zeros(m)]),
+            np.concatenate([tracks.velocity_variance, np.zeros(m)]),
+            None if moved is None else np.concatenate([moved, np.zeros(m, dtype=bool)]),
+            weight,
+            outline,
+            width,
+        )
+
+
+def _elements(road_map: RoadMap) -> list[tuple[str, str, _Place, str]]:
+    """Name, class, place and governing light of every element of a map."""
+    none = np.empty((0, 2))
+    elements = [
+        (light.name, LIGHT, _Place(np.array(light.position), none, 0.0, 0.0), light.name) for light in road_map.lights
+    ]
+    for line in road_map.stop_lines:
+        middle = line.ends.mean(axis=0)
+        elements.append((line.name, STOP_LINE, _Place(middle, line.ends - middle, line.heading, 0.0), line.light))
+    for lane in road_map.lanes:
+        centre = np.array(lane.centre)
+        middle = centre[len(centre) // 2]
+        elements.append((lane.name, LANE, _Place(middle, centre - middle, 0.0, lane.width), ""))
+    return elements
