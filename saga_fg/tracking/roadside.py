@@ -133,7 +133,7 @@ class Roadside:
         return NodeTable(
             np.concatenate([tracks.id, self.id]),
             np.concatenate([tracks.label, self.label]),
-            tracks.types + tuple(state.type_of(str(label)) for label in self.label),
+            tracks.types + state.types_of(self.label),
             np.concatenate([tracks.position, position]),
             np.concatenate([tracks.velocity, np.zeros((m, 2))]),
             np.concatenate([tracks.heading, [place.heading for place in self._place]]),
