@@ -11,6 +11,7 @@ from pathlib import Path
 from concept_pictures import write_concept_pictures
 
 from data_tools.simulator import simulate_scene
+from pipelines.bench.scaling import ScalingSettings, bench_scaling, write_picture
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint
@@ -31,8 +32,9 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the concepts, of the demonstration, and of a drive down a simulated street."""
+    """The pictures of the concepts, the benchmark of scaling, the demonstration, and a drive down a simulated street."""
     write_concept_pictures(HERE)
+    write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")

@@ -5,6 +5,7 @@ from data_tools.plots.calibration import calibration_plot
 from data_tools.plots.error_histograms import error_histograms
 from data_tools.plots.from_above import paths_from_above
 from data_tools.plots.recall_sweep import recall_sweep
+from data_tools.plots.scaling import scaling_plot
 from data_tools.plots.scan_map import scan_map_from_above
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "paths_from_above",
     "png",
     "recall_sweep",
+    "scaling_plot",
     "scan_map_from_above",
     "trails",
 ]

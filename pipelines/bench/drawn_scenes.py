@@ -84,15 +84,15 @@ def drawn_config(settings: DrawnSettings, edges: tuple[Neighbours, ...] | None =
         birth_score=0.0,
         duplicate_distance=0.0,
         max_distance=30.0,
-        max_coasting=2 * settings.hidden_for,
+        max_coasting=4 * settings.hidden_for,
     )
     tracker = TrackerSettings(
         classes={DEFAULT: of_class},
         edges=(settings.rule,) if edges is None else edges,
-        association=AssociationSettings(clutter_area=CLUTTER_AREA, existence_weight=0.0, score_weight=1.0),
-        existence=ExistenceSettings(report=0.5, confirm=0.95),
-        report_coasting=0.0,
-        max_out_of_view=2 * settings.hidden_for,
+        association=AssociationSettings(clutter_area=CLUTTER_AREA, existence_weight=0.1, score_weight=1.0),
+        existence=ExistenceSettings(report=0.9, confirm=0.95),
+        report_coasting=2 * INTERVAL,
+        max_out_of_view=4 * settings.hidden_for,
     )
     noise = {DEFAULT: NoiseModel(position=settings.noise)}
     return TrackConfig(tracker, sensors={DEFAULT: Sensor(noise=noise, detection_probability=settings.detected)})

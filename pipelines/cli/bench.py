@@ -19,6 +19,7 @@ from pipelines.cli.bench_lidar import lidar
 from pipelines.cli.bench_metrics import metrics
 from pipelines.cli.bench_paper import paper
 from pipelines.cli.bench_reading import reading
+from pipelines.cli.bench_scaling import scaling
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
 from pipelines.cli.bench_smoothing import smoothing
@@ -35,6 +36,7 @@ Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to 
 bench_app.command()(association)
 bench_app.command()(estimators)
 bench_app.command()(fusion)
+bench_app.command()(scaling)
 bench_app.command()(service)
 bench_app.command()(metrics)
 bench_app.command()(joint)
