@@ -32,7 +32,7 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the concepts, the benchmark of scaling, the demonstration, and a drive down a simulated street."""
+    """The pictures of the concepts, of the benchmark of scaling, of the demonstration, and of a simulated drive."""
     write_concept_pictures(HERE)
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     with tempfile.TemporaryDirectory() as folder:
