@@ -18,6 +18,11 @@ Config = Annotated[
     Path | None, typer.Option("--config", help="YAML file over the defaults; see `saga-fg config`.", metavar="FILE")
 ]
 
+Online = Annotated[
+    bool, typer.Option("--online", help="Estimate online too, with a fixed-lag smoother, beside the full batch.")
+]
+Lag = Annotated[float, typer.Option("--lag", min=0.0, help="Length of the window of --online, s.")]
+
 
 def sensor_files(values: Sequence[str]) -> dict[str, Path]:
     """`["lidar=a.json", "camera=b.json"]` as a mapping; a lone file without a name is the sensor "lidar"."""

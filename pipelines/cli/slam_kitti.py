@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose
+from pipelines.cli.options import Config, Lag, Online, Verbose
 from pipelines.cli.reporting import progress_bar, working
 from pipelines.cli.summary import counted
 
@@ -36,6 +36,8 @@ def kitti(
             help="Folder of a detector: Car/, Pedestrian/, Cyclist/; DATAROOT/detections/pointrcnn if not given.",
         ),
     ] = None,
+    online: Online = False,
+    lag: Lag = 3.0,
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
     config: Config = None,
     verbose: Verbose = False,
@@ -62,6 +64,8 @@ def kitti(
 
     if detections is not None and not objects:
         raise InputError("--detections: expected with --objects only")
+    if online and not objects:
+        raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
     frames, tracker = [], load_config("kitti", config)
     if objects:
         detector = detections or dataroot / "detections" / "pointrcnn"
@@ -78,7 +82,8 @@ def kitti(
         result = lidar_slam(recorded, odometry, settings, progress)
     if objects:
         with working("objects"):
-            figures = write_lidar_slam(output, with_objects(result, recorded, frames, tracker, settings), recorded)
+            together = with_objects(result, recorded, frames, tracker, settings, lag if online else None)
+            figures = write_lidar_slam(output, together, recorded)
     else:
         figures = write_lidar_slam(output, result, recorded)
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Config, Verbose
+from pipelines.cli.options import Config, Lag, Online, Verbose
 from pipelines.cli.reporting import working
 
 
@@ -15,10 +15,14 @@ def simulated(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the scene and of the odometry's errors.")] = 0,
     duration: Annotated[float, typer.Option("--duration", min=2.0, help="Length of the drive, s.")] = 20.0,
+    online: Online = False,
+    lag: Lag = 3.0,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
     """Drive down a simulated street with poor odometry; the path and all objects are estimated in one graph.
+
+    With --online once more, frame by frame, in a window of the last seconds.
 
     Writes the paths (TUM, KITTI), the covariances of the poses, the tracks of the objects (tracks.csv), errors.json and
     a picture from above (above.png).
@@ -26,19 +30,24 @@ def simulated(
     \b
     Example:
       saga-fg slam simulated --seed 3 --output street
+      saga-fg slam simulated --seed 3 --online --lag 2 --output street
     """
     from dataclasses import replace
 
     from data_tools.simulator import simulate_scene
+    from data_tools.trajectories import trajectory_errors
     from pipelines.config import load_config
     from pipelines.slam.joint import run_joint
-    from pipelines.slam.simulated import street, write_joint
+    from pipelines.slam.simulated import online_paths, street, write_joint
     from saga_fg.ego import JointSettings
 
     scene = simulate_scene(replace(street(), duration=duration), seed)
     with working("estimating"):
-        run = run_joint(scene, load_config("simulated", config), JointSettings(), "lidar", seed)
+        window = lag if online else None
+        run = run_joint(scene, load_config("simulated", config), JointSettings(), "lidar", seed, lag=window)
         write_joint(output, run)
     odometry, joint = run.errors()
     typer.echo(f"{output}: {joint.poses} poses over {joint.path_length:.0f} m")
     typer.echo(f"ATE: odometry {odometry.ate:.3f} m, joint {joint.ate:.3f} m")
+    for name, path in online_paths(run).items():
+        typer.echo(f"{name} (lag {lag:g} s): ATE {trajectory_errors(path, run.truth).ate:.3f} m")

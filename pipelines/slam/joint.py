@@ -15,7 +15,15 @@ from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odome
 from pipelines.config import TrackConfig
 from saga_fg.arrays import FloatArray
 from saga_fg.dataset import Scene
-from saga_fg.ego import JointEstimate, JointSettings, Observations, Odometry, estimate_jointly
+from saga_fg.ego import (
+    JointEstimate,
+    JointSettings,
+    Observations,
+    Odometry,
+    OnlineEstimate,
+    estimate_jointly,
+    estimate_online,
+)
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.tracking import Tracker
@@ -23,11 +31,12 @@ from saga_fg.tracking import Tracker
 
 @dataclass(frozen=True, eq=False)
 class JointRun:
-    """One scene: the true path, the odometry's, and the estimate."""
+    """One scene: the true path, the odometry's, the estimate, and the online one if it was asked for."""
 
     truth: Trajectory
     odometry: Trajectory
     estimate: JointEstimate
+    online: OnlineEstimate | None = None
 
     @property
     def joint(self) -> Trajectory:
@@ -46,10 +55,11 @@ def run_joint(
     sensor: str,
     seed: int,
     landmarks: Callable[[FloatArray], Observations] | None = None,
+    lag: float | None = None,
 ) -> JointRun:
     """Estimate jointly from the frames of one sensor and odometry degraded as `settings.odometry` says.
 
-    landmarks: what is observed of them from true poses (n, 4, 4).
+    landmarks: what is observed of them from true poses (n, 4, 4); lag: s, to estimate online as well.
     Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
     """
     frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], settings.keyframe_period)
@@ -68,7 +78,10 @@ def run_joint(
 
     observed = None if landmarks is None else landmarks(truth.world_T_ego)
     estimate = estimate_jointly(frames, odometry, new_tracker, settings, start, observed)
-    return JointRun(truth, Trajectory(truth.timestamps, odometry.path(start)), estimate)
+    online = None
+    if lag is not None:
+        online = estimate_online(frames, odometry, new_tracker(), lag, settings, start, observed)
+    return JointRun(truth, Trajectory(truth.timestamps, odometry.path(start)), estimate, online)
 
 
 def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:

@@ -1,6 +1,7 @@
 """SLAM on a simulated street, where the truth is known: results as files.
 
 odometry.tum, joint.tum, truth.tum   the paths (TUM); joint.txt the estimated one in KITTI's format
+online.tum, settled.tum              if estimated online as well: each pose as known at once, and a lag later
 covariances.csv                      of each estimated pose in its own frame: rotation vector (rad), translation (m)
 tracks.csv                           objects in the world at every moment: place, velocity and their deviations
 errors.json                          ATE and relative error of the odometry's path and of the estimated one
@@ -20,7 +21,7 @@ from data_tools.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import SurroundingSettings
-from data_tools.trajectories import write_kitti_poses, write_tum_poses
+from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.joint import JointRun
 from pipelines.slam.object_tracks import tracks, tracks_csv
 
@@ -38,16 +39,28 @@ def write_joint(output: Path, run: JointRun) -> None:
         write_tum_poses(folder / "odometry.tum", run.odometry)
         write_tum_poses(folder / "joint.tum", run.joint)
         write_kitti_poses(folder / "joint.txt", run.joint, folder / "times.txt")
+        for name, path in online_paths(run).items():
+            write_tum_poses(folder / f"{name}.tum", path)
         write_text(folder / "covariances.csv", _covariances(run))
         write_text(folder / "tracks.csv", tracks_csv(run.estimate))
         errors = {"odometry": asdict(odometry), "joint": asdict(joint)}
+        errors |= {name: asdict(trajectory_errors(path, run.truth)) for name, path in online_paths(run).items()}
         write_text(folder / "errors.json", json.dumps(errors, indent=1) + "\n")
         write_bytes(folder / "above.png", png(picture(run)))
+
+
+def online_paths(run: JointRun) -> dict[str, Trajectory]:
+    """The online estimate's path, each pose as known at once and as settled; empty without one."""
+    if run.online is None:
+        return {}
+    times = run.online.timestamps
+    return {"online": Trajectory(times, run.online.newest), "settled": Trajectory(times, run.online.settled)}
 
 
 def picture(run: JointRun) -> Any:
     """The paths from above, and where objects were last seen."""
     paths = {"truth": run.truth.positions, "odometry": run.odometry.positions, "joint": run.joint.positions}
+    paths |= {name: path.positions for name, path in online_paths(run).items() if name == "online"}
     last = np.array([track[-1] for track in tracks(run.estimate).values()]).reshape(-1, 2)
     return paths_from_above(paths, {"objects": last})
 

@@ -20,11 +20,12 @@ from pipelines.config import TrackConfig
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, graph_of, updated
 from saga_fg.arrays import FloatArray
-from saga_fg.ego import JointEstimate, LandmarkPart, Odometry, estimate_jointly, landmark_key
+from saga_fg.ego import JointEstimate, LandmarkPart, Odometry, estimate_jointly, estimate_online, landmark_key
 from saga_fg.ego.record import in_ego
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.geometry import inverse_transform
+from saga_fg.landmarks import Observation
 from saga_fg.tracking import Tracker
 
 _SAME_TIME = 0.01  # s
@@ -48,9 +49,11 @@ def with_objects(
     frames: Sequence[Frame],
     config: TrackConfig,
     settings: LidarSlamSettings | None = None,
+    lag: float | None = None,
 ) -> SlamWithObjects:
     """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
 
+    lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `slam.online` is then by that.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
@@ -88,6 +91,15 @@ def with_objects(
         landmarks=updated(result.landmarks, estimate.solution),
         world_T_lidar=estimate.world_T_ego[at],
     )
+    if lag is not None:
+        observed: list[list[Observation]] = [[] for _ in rows]
+        for sighting in result.sightings:
+            observed[at[sighting.pose]].append(sighting.observation)
+        online = estimate_online(
+            seen, odometry, new_tracker(), lag, s.objects, result.drive.poses[0], observed, s.mapper
+        )
+        placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
+        slam = replace(slam, online=Trajectory(scans.timestamps, placed))
     return SlamWithObjects(slam, result, estimate)
 
 

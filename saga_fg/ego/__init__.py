@@ -5,6 +5,8 @@ from saga_fg.ego.estimate import JointEstimate, ObjectStates
 from saga_fg.ego.graph import pose_key
 from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_key
 from saga_fg.ego.odometry import Odometry, OdometryNoise
+from saga_fg.ego.online import OnlineEstimator, OnlineStep
+from saga_fg.ego.online_estimate import OnlineEstimate, estimate_online
 from saga_fg.ego.settings import JointSettings
 
 __all__ = [
@@ -15,7 +17,11 @@ __all__ = [
     "Observations",
     "Odometry",
     "OdometryNoise",
+    "OnlineEstimate",
+    "OnlineEstimator",
+    "OnlineStep",
     "estimate_jointly",
+    "estimate_online",
     "landmark_key",
     "pose_key",
 ]

@@ -27,7 +27,7 @@ from saga_fg.geometry import transform_points
 from saga_fg.interactions import POSITION
 from saga_fg.tracking import Tracker
 
-_TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
+TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
 
 
 def estimate_jointly(
@@ -62,7 +62,8 @@ def estimate_jointly(
             seen = landmarks
         else:
             seen = landmark_part(landmarks, path, settings.landmark_reach)
-        estimate = _solved(list(enumerate(moments)), path, standing, seen, settings)
+        first = [None] if estimate is None else []
+        estimate = _solved(list(enumerate(moments)), path, [*first, standing], seen, settings)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate
@@ -78,17 +79,23 @@ def check_times(frames: Sequence[Frame], odometry: Odometry) -> None:
 
 
 def _solved(
-    record: Keyed, path: FloatArray, standing: Sequence[FloatArray], landmarks: LandmarkPart, settings: JointSettings
+    record: Keyed,
+    path: FloatArray,
+    standing: Sequence[Sequence[FloatArray] | None],
+    landmarks: LandmarkPart,
+    settings: JointSettings,
 ) -> JointEstimate:
-    """All objects moving first, which needs no good start; from there with those that stand."""
+    """One solution after the other, each from the one before: all objects moving, which needs no good start (None), or
+    with those that stand.
+    """
     graph = start_graph(0, path[0], settings)
     graph.push_back(linear_graph(record))
     graph.push_back(landmarks.graph)
-    solver = SolverSettings(max_iterations=settings.max_iterations, tolerance=_TOLERANCE)
+    solver = SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
     values = start_values(record, path)
     values.insert(landmarks.start)
-    for standing_or_none in (None, standing):
-        factors = [*nonlinear_factors(record, settings, standing_or_none), *landmarks.factors]
+    for probabilities in standing:
+        factors = [*nonlinear_factors(record, settings, probabilities), *landmarks.factors]
         solution = solve(graph, factors, values, solver)
         values = solution.values
     return read_estimate(record, solution)
