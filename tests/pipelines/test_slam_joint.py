@@ -28,12 +28,16 @@ SHORT = replace(street(), duration=2.0)
 
 def test_a_simulated_street(tmp_path: Path) -> None:
     output = tmp_path / "street"
-    done = CliRunner().invoke(app, ["slam", "simulated", "--seed", "2", "--duration", "2", "--output", str(output)])
+    options = ["--seed", "2", "--duration", "2", "--online", "--lag", "0.5"]
+    done = CliRunner().invoke(app, ["slam", "simulated", *options, "--output", str(output)])
     assert done.exit_code == 0, done.output
     assert "ATE: odometry" in done.output
+    assert "settled (lag 0.5 s): ATE" in done.output
     errors = json.loads((output / "errors.json").read_text())
     assert errors["joint"]["poses"] == errors["odometry"]["poses"]
     joint = read_tum_poses(output / "joint.tum")
+    for name in ("online", "settled"):
+        assert len(read_tum_poses(output / f"{name}.tum")) == len(joint) == errors[name]["poses"]
     kitti = read_kitti_poses(output / "joint.txt", output / "times.txt")
     np.testing.assert_allclose(kitti.world_T_ego, joint.world_T_ego, atol=1e-6)
     assert {line.split(",")[2] for line in (output / "tracks.csv").read_text().splitlines()[1:]} >= {"car"}
