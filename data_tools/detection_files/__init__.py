@@ -41,7 +41,7 @@ Tracks are written with the same columns and, besides, id, cov_xx, cov_xy, cov_y
 position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coasting (s since the last detection).
 """
 
-from data_tools.detection_files.dataset import DetectionFile, read_detections
+from data_tools.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
 from data_tools.detection_files.track_rows import TrackRows, read_tracks
 from data_tools.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
 
@@ -50,6 +50,7 @@ __all__ = [
     "DetectionFile",
     "TrackRows",
     "read_detections",
+    "read_scenes_in_parts",
     "read_tracks",
     "track_rows",
     "write_rows",

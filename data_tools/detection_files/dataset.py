@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -9,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from data_tools.detection_files.columns import POSE, RawTable
-from data_tools.detection_files.formats import read_raw_table
+from data_tools.detection_files.formats import read_raw_parts, read_raw_table
 from data_tools.located import located, unknown
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
@@ -41,9 +42,9 @@ class DetectionFile:
     A scene's moments are all times at which some sensor spoke; without pose columns its poses are the identity.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        """Read and check everything. Raises `InputError` naming file, row and column."""
-        self._rows = _checked(read_raw_table(Path(path)))
+    def __init__(self, table: RawTable) -> None:
+        """Check everything. Raises `InputError` naming file, row and column."""
+        self._rows = _checked(table)
         names, first = np.unique(self._rows.scene, return_index=True)
         self._scenes = tuple(names[np.argsort(first)].tolist())
 
@@ -104,7 +105,40 @@ class DetectionFile:
 
 def read_detections(path: str | Path) -> DetectionFile:
     """Read a table of detections, .csv, .ndjson, .jsonl or .npz. Raises `InputError` naming file, row and column."""
-    return DetectionFile(path)
+    return DetectionFile(read_raw_table(Path(path)))
+
+
+def read_scenes_in_parts(
+    path: str | Path, rows: int = 50_000, scenes: Collection[str] | None = None
+) -> Iterator[Scene]:
+    """The scenes of a table as they come, each as successive `Scene`s of about `rows` rows: without holding them all.
+
+    scenes: the names of those wanted, None for all
+
+    Raises `InputError` as `read_detections` does, when it comes to the row; where a scene goes on after another; and at
+    the end, for names that did not come.
+    """
+    done: set[str] = set()
+    name, latest = "", -np.inf
+    for table in read_raw_parts(Path(path), rows=rows):
+        part = DetectionFile(table)
+        for scene in (part.scene(name) for name in part.scenes):
+            if scene.name in done:
+                raise InputError(f"{path}: scene {scene.name}: expected its rows together, it goes on after {name}")
+            if scene.name != name:
+                done.add(name)
+                name, latest = scene.name, -np.inf
+            if scene.timestamps[0] <= latest:
+                raise InputError(
+                    f"{path}: {table.where(0)}: timestamp: expected rows in order of time, "
+                    f"time runs backwards at {scene.timestamps[0]} s"
+                )
+            latest = float(scene.timestamps[-1])
+            if scenes is None or name in scenes:
+                yield scene
+    for wanted in scenes or ():
+        if wanted not in done and wanted != name:
+            raise InputError(f"{path}: {unknown('scene', wanted, tuple(sorted({*done, name} - {''})))}")
 
 
 def _checked(raw: RawTable) -> _Rows:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -13,6 +14,9 @@ from rich.table import Table
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile
+
+if TYPE_CHECKING:
+    from pipelines.bench.streaming import StreamingBenchSettings
 
 
 def streaming(
@@ -23,6 +27,9 @@ def streaming(
         float, typer.Option("--compared", min=1.0, help="Seconds of it that are compared with the batch smoother.")
     ] = 20.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the traffic.")] = 0,
+    file: Annotated[
+        bool, typer.Option("--file", help="From a file of detections to labels on disk, not the smoother alone.")
+    ] = False,
     json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
@@ -35,6 +42,7 @@ def streaming(
     Examples:
       saga-fg bench streaming
       saga-fg bench streaming --seconds 3600      # an hour
+      saga-fg bench streaming --file --seconds 120 --compared 60
     """
     from data_tools.atomic_files import check_writable, write_text
     from pipelines.bench.streaming import StreamingBenchSettings, bench_streaming
@@ -42,6 +50,9 @@ def streaming(
     settings = StreamingBenchSettings(objects, seconds, rate, compared=compared, seed=seed)
     if json_file is not None:
         check_writable(json_file)
+    if file:
+        _file(settings, json_file)
+        return
     with progress_bar() as progress:
         result = bench_streaming(settings, progress=progress)
     table = Table("recorded, s", "memory, MB", "moments held", "CPU, s", title=f"{objects} objects at {rate:g} Hz")
@@ -53,6 +64,25 @@ def streaming(
     typer.echo(f"RMSE {result.rmse:.3f} m, ANEES {result.anees:.3f}")
     typer.echo(
         f"largest difference from the batch smoother in {compared:g} s: {result.largest_difference:.1e} m or m/s"
+    )
+    if json_file is not None:
+        write_text(json_file, json.dumps({"settings": asdict(settings), **asdict(result)}, indent=1) + "\n")
+
+
+def _file(settings: StreamingBenchSettings, json_file: Path | None) -> None:
+    from data_tools.atomic_files import write_text
+    from pipelines.bench.streamed_files import bench_files
+
+    with progress_bar() as progress:
+        result = bench_files(settings, progress)
+    table = Table("read, s", "memory, MB", "CPU, s", title=f"{settings.objects} objects at {settings.rate:g} Hz")
+    for row in result.rows:
+        table.add_row(f"{row.recorded:.0f}", f"{row.memory:.0f}", f"{row.cpu:.1f}")
+    Console().print(table)
+    typer.echo(f"{result.boxes} boxes; peak memory {result.peak:.0f} MB; {result.ratio:.3f} s of CPU time a second")
+    typer.echo(
+        f"largest difference from the whole at once in {settings.compared:g} s: {result.largest_difference:.1e} m; "
+        f"{result.differing} of {result.compared} boxes in one of the two alone"
     )
     if json_file is not None:
         write_text(json_file, json.dumps({"settings": asdict(settings), **asdict(result)}, indent=1) + "\n")

@@ -16,7 +16,7 @@ from pipelines.cli.tracking_options import AssociationOption, MethodOption, asso
 
 if TYPE_CHECKING:
     from pipelines.config import Family
-    from pipelines.smoothing import SmoothConfig, SmoothedScene
+    from pipelines.smoothing import SmoothConfig, SmoothedScene, StreamedScene
     from saga_fg.tracking import AssociationName
 
 smooth_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
@@ -189,17 +189,18 @@ def file(
 ) -> None:
     """Label your own recordings: a table with one detection a row in, one box a row out.
 
-    The columns are those of `saga-fg track file` (see docs/formats.md).
+    The columns are those of `saga-fg track file` (see docs/formats.md). A recording is smoothed as it is read: memory
+    does not grow with its length.
 
     \b
     Example:
       saga-fg smooth file detections.csv --output labels
       saga-fg smooth file 's3://fleet/2026-11/*.csv' --workers 0 --output labels
     """
-    from data_tools.detection_files import read_detections
+    from data_tools.detection_files import read_scenes_in_parts
     from data_tools.remote_files import local_copy
     from pipelines.scale_out import DetectionFileInput, SmoothTask
-    from pipelines.smoothing import smooth_dataset, write_labels
+    from pipelines.smoothing import smooth_stream, write_streamed_labels
 
     settings = _configured("file", config, method, association)
     if at_scale(workers, ray):
@@ -207,15 +208,16 @@ def file(
         task = SmoothTask(settings, method, "table", f".{table}")
         run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray)
         return
-    with local_copy(only(detections)) as path:
-        dataset = read_detections(path)
-    chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
-    with progress_bar(len(chosen)) as progress:
-        done = write_labels(output, smooth_dataset(dataset, settings, method, chosen, progress), f".{table}")
+    chosen = None if scenes is None else names("--scenes", scenes)
+    with local_copy(only(detections)) as path, progress_bar() as progress:
+        parts = read_scenes_in_parts(path, scenes=chosen)
+        done = write_streamed_labels(
+            output, lambda folder: smooth_stream(parts, settings, folder, method, progress=progress), f".{table}"
+        )
     _show(output, done)
 
 
-def _show(output: Path, runs: tuple[SmoothedScene, ...]) -> None:
+def _show(output: Path, runs: tuple[SmoothedScene, ...] | tuple[StreamedScene, ...]) -> None:
     """The line that says what was done."""
     from saga_fg.smoothing import LabelCounts
 

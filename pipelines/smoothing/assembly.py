@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pipelines.smoothing.rounds import SmoothedObjects
@@ -9,6 +11,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.smoothing import (
     Evidence,
+    Headings,
     LabelCounts,
     Labels,
     Lives,
@@ -28,10 +31,51 @@ from saga_fg.track import Tracks
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
 
 
+@dataclass(frozen=True, eq=False)
+class LabelledStates:
+    """All that labels say of R states: position (R, 3) in the world, size (R, 3), headings, position_covariance
+    (R, 2, 2), coasting (R,) s, label, score, source and quality (R,)."""
+
+    states: StateTable
+    label: StrArray
+    position: FloatArray
+    size: FloatArray
+    headings: Headings
+    position_covariance: FloatArray
+    coasting: FloatArray
+    score: FloatArray
+    source: StrArray
+    quality: StrArray
+
+    def at(self, moment: int, time: float) -> Labels:
+        """The labels of a moment of the evidence, which is at `time` s."""
+        there = self.states.at(moment)
+        mean, P = self.states.mean[there], self.states.covariance[there]
+        found = Boxes(self.label[there], self.position[there], self.size[there], self.headings.yaw[there], mean[:, 2:])
+        tracks = Tracks(
+            time,
+            self.states.id[there],
+            found,
+            self.score[there],
+            self.position_covariance[there],
+            P[:, 2:, 2:],
+            self.coasting[there],
+        )
+        return Labels(tracks, self.headings.variance[there], self.source[there], self.quality[there])
+
+
 def label_moments(
     evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
 ) -> tuple[Labels, ...]:
     """The labels at the times `wanted` (M,), s."""
+    labelled = label_states(evidence, objects, wanted, settings)
+    return tuple(labelled.at(int(np.searchsorted(evidence.times, time)), time) for time in wanted.tolist())
+
+
+def label_states(
+    evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
+) -> LabelledStates:
+    """Labels of all states of a recording; the times `wanted` (M,), s, are those that count as observed or not."""
     lives, states = objects.lives, objects.states
     owner = lives.rows_of(states.id)
     rows = np.flatnonzero(objects.object_of >= 0)
@@ -46,42 +90,41 @@ def label_moments(
     turning = offline_values(settings.classes, "yaw_drift", label) ** 2 * duration
     turning = np.where(_stands(objects), 1e-6, turning)
     moving = offline_values(settings.classes, "motion_heading", lives.label)
-    yaw, yaw_variance = smooth_headings(states, lives, evidence, rows, at, turning, moving)
+    headings = smooth_headings(states, lives, evidence, rows, at, turning, moving)
     lasting = offline_values(settings.classes, "lasting_error", label)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
+    position = np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1)
+    score = objects.score[owner]
     source = _sources(evidence, objects, wanted)
-    quality = quality_of(objects.score[owner], P, settings.quality)
-    moments = []
-    for time in wanted.tolist():
-        there = states.at(int(np.searchsorted(evidence.times, time)))
-        position = np.concatenate([states.mean[there, :2] + evidence.origin, z[there, None]], axis=1)
-        found = Boxes(label[there], position, size[owner[there]], yaw[there], states.mean[there, 2:])
-        velocity_covariance = states.covariance[there, 2:, 2:]
-        score = objects.score[owner[there]]
-        tracks = Tracks(time, states.id[there], found, score, P[there], velocity_covariance, gap[there])
-        moments.append(Labels(tracks, yaw_variance[there], source[there], quality[there]))
-    return tuple(moments)
+    quality = quality_of(score, P, settings.quality)
+    return LabelledStates(states, label, position, size[owner], headings, P, gap, score, source, quality)
 
 
 def count_labels(
     evidence: Evidence, objects: SmoothedObjects, labels: tuple[Labels, ...], wanted: FloatArray
 ) -> LabelCounts:
     """The summary of a recording."""
-    source = np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])
-    at = np.searchsorted(evidence.times, wanted)
-    dropped = sum(
-        int((np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)).sum())
-        for gone in objects.dropped
-    )
     return LabelCounts(
-        observed=int((source == "observed").sum()),
-        filled=int((source == "filled").sum()),
-        extended=int((source == "extended").sum()),
-        dropped=dropped,
+        **source_counts(np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])),
+        dropped=dropped_boxes(evidence, objects, wanted),
         objects=len(objects.lives),
         dropped_objects=sum(map(len, objects.dropped)),
         joined=objects.joined,
+    )
+
+
+def source_counts(source: StrArray) -> dict[str, int]:
+    """How many of some boxes were observed, filled and extended."""
+    return {kind: int((source == kind).sum()) for kind in ("observed", "filled", "extended")}
+
+
+def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> int:
+    """How many boxes at the times `wanted` (M,), s, went with the objects that were dropped."""
+    at = np.searchsorted(evidence.times, wanted)
+    return sum(
+        int((np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)).sum())
+        for gone in objects.dropped
     )
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.arrays import IntArray
-from saga_fg.dataset import Scene
+from saga_fg.frame import Frame
 from saga_fg.sensor import Sensor
 from saga_fg.smoothing.attribution import attribute
 from saga_fg.smoothing.evidence import Evidence, measured_in_order
@@ -18,17 +18,21 @@ UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps 
 
 
 def track_evidence(
-    scene: Scene,
+    name: str,
+    frames: Sequence[Frame],
     tracker: OnlineTracker,
     evidence: Evidence,
     sensors: Mapping[str, Sensor],
     classes: Mapping[str, ClassSettings],
     progress: Progress | None = None,
 ) -> IntArray:
-    """(N,) the track of each detection, -1 for none: of the reported tracks that a frame updated, the likely one."""
+    """(N,) the track of each detection, -1 for none: of the reported tracks that a frame updated, the likely one.
+
+    evidence: that of these frames, or of the next ones of a recording; `name` of the recording, for `progress`
+    """
     track_of = np.full(len(evidence), -1, dtype=np.int64)
-    frames = measured_in_order(scene.frames, sensors)
-    for count, ((_, frame), rows) in enumerate(zip(frames, evidence.rows_of_look(), strict=True)):
+    ordered = measured_in_order(frames, sensors)
+    for count, ((_, frame), rows) in enumerate(zip(ordered, evidence.rows_of_look(), strict=True)):
         tracks = tracker.step(frame)
         updated = tracks.select(tracks.coasting == 0)
         noise = evidence.R[rows, :2, :2]
@@ -44,5 +48,5 @@ def track_evidence(
         )
         track_of[rows.start + detections] = updated.id[objects]
         if progress is not None:
-            progress(scene.name, count + 1, len(frames))
+            progress(name, count + 1, len(ordered))
     return track_of

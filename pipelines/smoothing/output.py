@@ -10,9 +10,11 @@ results/         KITTI: the same with scores, as evaluators take it
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from data_tools.atomic_files import atomic_directory
 from data_tools.kitti import KittiTracking, write_kitti_results
@@ -20,6 +22,7 @@ from data_tools.label_files import write_kitti_labels, write_label_table, write_
 from data_tools.nuscenes import ResultMeta, write_tracking_results
 from pipelines.figures import write_figures
 from pipelines.smoothing.scene import SmoothedScene
+from pipelines.smoothing.streamed import StreamedScene
 from saga_fg.smoothing import LabelCounts
 
 
@@ -30,6 +33,17 @@ def write_labels(
     with atomic_directory(directory) as folder:
         done = tuple(runs)
         _write_common(folder, done, suffix)
+    return done
+
+
+def write_streamed_labels(
+    directory: str | Path, smooth: Callable[[Path], Iterable[StreamedScene]], suffix: str = ".csv"
+) -> tuple[StreamedScene, ...]:
+    """The same of recordings that are smoothed as they are read; `smooth` is called with a folder for their spools."""
+    with atomic_directory(directory) as folder, TemporaryDirectory(dir=folder) as spools:
+        done = tuple(smooth(Path(spools)))
+        write_label_table(folder / f"labels{suffix}", chain.from_iterable(run.spool.labels() for run in done))
+        _write_summary(folder, {run.name: (run.counts, run.seconds) for run in done})
     return done
 
 
@@ -64,6 +78,11 @@ def write_kitti_run(
 
 def _write_common(folder: Path, runs: Sequence[SmoothedScene], suffix: str) -> None:
     write_label_table(folder / f"labels{suffix}", [(run.scene, run.labels) for run in runs])
-    total = LabelCounts.sum(run.counts for run in runs)
-    scenes = {run.scene.name: {**asdict(run.counts), "seconds": round(run.seconds, 3)} for run in runs}
+    _write_summary(folder, {run.scene.name: (run.counts, run.seconds) for run in runs})
+
+
+def _write_summary(folder: Path, runs: Mapping[str, tuple[LabelCounts, float]]) -> None:
+    """Counts and seconds, by scene and together."""
+    total = LabelCounts.sum(counts for counts, _ in runs.values())
+    scenes = {name: {**asdict(counts), "seconds": round(seconds, 3)} for name, (counts, seconds) in runs.items()}
     write_figures(folder / "summary.json", {"total": asdict(total), "scenes": scenes})

@@ -49,7 +49,8 @@ def smooth_scene(
         start = time.perf_counter()
         evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, tracking.tracker.classes)
         tracker = tracking.new_tracker(method)
-        track_of = track_evidence(scene, tracker, evidence, config.sensors, tracking.tracker.classes, progress)
+        classes = tracking.tracker.classes
+        track_of = track_evidence(scene.name, scene.frames, tracker, evidence, config.sensors, classes, progress)
         objects = smooth_objects(evidence, track_of, config.smoothing, tracking.tracker)
         labels = label_moments(evidence, objects, scene.timestamps, config.smoothing)
         counts = count_labels(evidence, objects, labels, scene.timestamps)

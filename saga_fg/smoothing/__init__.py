@@ -5,7 +5,7 @@ from saga_fg.smoothing.batch_states import Standing, no_edges, robust_weights, s
 from saga_fg.smoothing.claiming import claim_detections
 from saga_fg.smoothing.edges import SmoothedEdges
 from saga_fg.smoothing.evidence import Evidence, Look, gather_evidence, measured_in_order
-from saga_fg.smoothing.headings import smooth_headings
+from saga_fg.smoothing.headings import Headings, is_backwards, smooth_headings
 from saga_fg.smoothing.joining import join_tracklets
 from saga_fg.smoothing.labels import LabelCounts, Labels, Quality, Source, quality_of
 from saga_fg.smoothing.random_walk import previous_rows, scalar_readings, smooth_walks
@@ -18,12 +18,13 @@ from saga_fg.smoothing.settings import (
     StandingSettings,
     offline_values,
 )
-from saga_fg.smoothing.sizes import constant_sizes
+from saga_fg.smoothing.sizes import constant_sizes, size_weights, weighted_medians
 from saga_fg.smoothing.standing import standing_states
 from saga_fg.smoothing.states import Lives, StateTable, lives_of_evidence
 
 __all__ = [
     "Evidence",
+    "Headings",
     "JoiningSettings",
     "LabelCounts",
     "Labels",
@@ -43,6 +44,7 @@ __all__ = [
     "constant_sizes",
     "evidence_scores",
     "gather_evidence",
+    "is_backwards",
     "join_tracklets",
     "lives_of_evidence",
     "look_rate",
@@ -54,8 +56,10 @@ __all__ = [
     "quality_of",
     "robust_weights",
     "scalar_readings",
+    "size_weights",
     "smooth_headings",
     "smooth_states",
     "smooth_walks",
     "standing_states",
+    "weighted_medians",
 ]

@@ -11,9 +11,11 @@ vehicle that backs out of a bay and drives away is right in the longer part.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.geometry import wrap_angle
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.random_walk import ScalarReadings, previous_rows, scalar_readings, smooth_walks
@@ -24,6 +26,17 @@ CLEAR = 3.0  # standard deviations by which a motion is no estimation error
 COURSE_NOISE = 0.1  # standard deviation between heading and direction of motion, rad
 
 
+@dataclass(frozen=True, eq=False)
+class Headings:
+    """Of R states: yaw (R,), rad, NaN where nothing tells; variance (R,), rad^2; and what says that yaw is no half turn
+    off: path (R,), m moved along it on the way to each state, and votes (R,) of the detections at each."""
+
+    yaw: FloatArray
+    variance: FloatArray
+    path: FloatArray
+    votes: FloatArray
+
+
 def smooth_headings(
     states: StateTable,
     lives: Lives,
@@ -32,8 +45,8 @@ def smooth_headings(
     row: IntArray,
     growth: FloatArray,
     moving: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Heading (R,), rad, and its variance for every state; NaN for an object whose heading nothing tells.
+) -> Headings:
+    """Heading of every state.
 
     detection (m,) and row (m,): detections and the states they belong to; growth (R,): see `smooth_walks`; moving (n,):
     speed from which the motion of an object tells its heading, m/s
@@ -52,9 +65,15 @@ def smooth_headings(
     axis, variance = smooth_walks(states, growth, readings, period=np.pi)
     before = previous_rows(states)
     dt = np.where(before >= 0, evidence.times[states.moment] - evidence.times[states.moment[before]], 0.0)
-    forward = (speed * dt * np.cos(course - np.nan_to_num(axis)))[telling]
-    path = np.bincount(owner[telling], forward, minlength=len(lives))
+    path = np.zeros(len(states))
+    path[telling] = (speed * dt * np.cos(course - np.nan_to_num(axis)))[telling]
     seen = evidence.probability[detection] * np.cos(np.where(known, yaw - axis[row], np.pi / 2))
-    votes = np.bincount(owner[row], np.nan_to_num(seen), minlength=len(lives))
-    backwards = np.where(np.abs(path) >= TELLING_PATH, path, votes) < 0
-    return wrap_angle(axis + np.pi * backwards[owner]), variance
+    votes = np.bincount(row, np.nan_to_num(seen), minlength=len(states))
+    backwards = is_backwards(*(np.bincount(owner, w, len(lives)).astype(np.float64) for w in (path, votes)))
+    sign = np.where(backwards, -1.0, 1.0)[owner]
+    return Headings(wrap_angle(axis + np.pi * (sign < 0)), variance, sign * path, sign * votes)
+
+
+def is_backwards(path: FloatArray, votes: FloatArray) -> BoolArray:
+    """(n,) which objects face the other way, of the sums (n,) over their states."""
+    return np.where(np.abs(path) >= TELLING_PATH, path, votes) < 0

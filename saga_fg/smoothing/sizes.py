@@ -22,10 +22,15 @@ def constant_sizes(
     owner (m,): row of the object of each detection; size (m, 3), NaN for unmeasured; probability (m,); distance (m,)
     from the sensor, m, NaN for unknown
     """
-    weight = probability / (1 + (np.nan_to_num(distance) / FAR) ** 2)
+    weight = size_weights(probability, distance)
     known = np.isfinite(size).all(axis=1)
     columns = [weighted_medians(owner[known], count, column[known], weight[known]) for column in size.T]
     return np.stack(columns, axis=-1)
+
+
+def size_weights(probability: FloatArray, distance: FloatArray) -> FloatArray:
+    """(m,) the weight of detections' sizes; distance (m,) from the sensor, m, NaN for unknown."""
+    return np.asarray(probability / (1 + (np.nan_to_num(distance) / FAR) ** 2))
 
 
 def weighted_medians(owner: IntArray, count: int, value: FloatArray, weight: FloatArray) -> FloatArray:

@@ -127,7 +127,8 @@ def test_the_front_is_where_an_object_drives_else_what_most_detections_say() -> 
     states = smooth_states(evidence, numbers, lives, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
     rows = np.arange(len(evidence))
     at = states.rows_of(evidence.moment, numbers)
-    yaw, variance = smooth_headings(states, lives, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0))
+    found = smooth_headings(states, lives, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0))
+    yaw, variance = found.yaw, found.variance
     assert np.allclose(np.cos(yaw[states.id == 0]), -1.0, atol=0.01)  # the detector says 0, the motion pi
     assert np.allclose(yaw[states.id == 1], 0.0, atol=1e-6)
     assert (variance > 0).all()

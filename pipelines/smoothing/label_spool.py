@@ -1,0 +1,109 @@
+"""Labels that wait on disk until all is known of their objects: an archive of arrays for each stretch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.smoothing.assembly import LabelledStates
+from pipelines.smoothing.lifetimes import Lifetimes
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.boxes import Boxes
+from saga_fg.dataset import Scene
+from saga_fg.geometry import wrap_angle
+from saga_fg.smoothing import Labels, SmoothingSettings, quality_of
+from saga_fg.track import Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class _Lasting:
+    """Columns of what lasts of all objects, by ascending id."""
+
+    id: IntArray
+    size: FloatArray
+    score: FloatArray
+    backwards: FloatArray  # radians to turn by
+
+
+class LabelSpool:
+    """The labels of a recording, added stretch by stretch, and read back when it is over."""
+
+    def __init__(self, folder: Path, name: str, settings: SmoothingSettings) -> None:
+        folder.mkdir()
+        self._folder, self._name, self._settings = folder, name, settings
+        self._stretches = 0
+        self._lasting: _Lasting | None = None
+
+    def add(
+        self,
+        wanted: FloatArray,
+        at: IntArray,
+        labelled: LabelledStates,
+        names: Mapping[int, int],
+        turned: Mapping[int, float],
+    ) -> None:
+        """The labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
+
+        names: the lasting id of each object; turned: -1 where its directions are half a turn off those before
+        """
+        spans = [labelled.states.at(moment) for moment in at.tolist()]
+        rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
+        ids = labelled.states.id[rows].tolist()
+        mean, P = labelled.states.mean[rows], labelled.states.covariance[rows]
+        np.savez(
+            self._folder / f"{self._stretches:06d}.npz",
+            time=wanted,
+            bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
+            id=np.array([names[id_] for id_ in ids], dtype=np.int64),
+            sign=np.array([turned[id_] for id_ in ids], dtype=np.float64),
+            label=labelled.label[rows],
+            position=labelled.position[rows],
+            yaw=labelled.headings.yaw[rows],
+            yaw_variance=labelled.headings.variance[rows],
+            velocity=mean[:, 2:],
+            position_covariance=labelled.position_covariance[rows],
+            velocity_covariance=P[:, 2:, 2:],
+            coasting=labelled.coasting[rows],
+            source=labelled.source[rows],
+        )
+        self._stretches += 1
+
+    def finish(self, lifetimes: Lifetimes, prior_looks: float) -> None:
+        """What lasts of the objects, which are all over; prior_looks: see `Lifetimes.lasting`."""
+        ids = np.array(lifetimes.ids, dtype=np.int64)
+        found = [lifetimes.lasting(id_, prior_looks) for id_ in ids.tolist()]
+        self._lasting = _Lasting(
+            ids,
+            np.array([each.size for each in found]).reshape(-1, 3),
+            np.array([each.score for each in found]),
+            np.array([np.pi * each.backwards for each in found]),
+        )
+
+    def labels(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
+        """The labels, stretch by stretch: a part of the scene without frames or poses, and one table a moment."""
+        assert self._lasting is not None, "the recording is not over"
+        for number in range(self._stretches):
+            with np.load(self._folder / f"{number:06d}.npz") as columns:
+                yield self._complete(dict(columns), self._lasting)
+
+    def _complete(self, column: Mapping[str, np.ndarray], lasting: _Lasting) -> tuple[Scene, tuple[Labels, ...]]:
+        at = np.searchsorted(lasting.id, column["id"])
+        score, P = lasting.score[at], column["position_covariance"]
+        yaw = wrap_angle(column["yaw"] + np.pi * (column["sign"] < 0) + lasting.backwards[at])
+        boxes = Boxes(column["label"], column["position"], lasting.size[at], yaw, column["velocity"])
+        quality = quality_of(score, P, self._settings.quality)
+        times = column["time"]
+        moments = []
+        for time, (a, b) in zip(times.tolist(), pairwise(column["bounds"].tolist()), strict=True):
+            rows = slice(a, b)
+            tracks = Tracks(
+                time, column["id"][rows], boxes.select(rows), score[rows], P[rows],
+                column["velocity_covariance"][rows], column["coasting"][rows],
+            )  # fmt: skip
+            moments.append(Labels(tracks, column["yaw_variance"][rows], column["source"][rows], quality[rows]))
+        scene = Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ())
+        return scene, tuple(moments)

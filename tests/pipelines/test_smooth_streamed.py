@@ -1,0 +1,134 @@
+"""Recordings smoothed as they are read: the same labels as of the whole at once, and what lasts of objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.detection_files import read_detections, read_scenes_in_parts
+from data_tools.label_files import read_label_table
+from pipelines.bench.streamed_files import bench_files
+from pipelines.bench.streaming import StreamingBenchSettings
+from pipelines.cli import app
+from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream
+from pipelines.smoothing.lifetimes import Lifetimes
+from saga_fg import InputError
+
+HEADER = "timestamp,label,x,y,length,width,height,yaw,score"
+
+
+def drive(seconds: float = 18.0, rate: float = 4.0) -> list[str]:
+    """A queue of three cars, the middle one hidden for 2.5 s; a parked one; one that comes late; boxes seen askew."""
+    rng = np.random.default_rng(3)
+    rows = []
+    for k in range(round(seconds * rate)):
+        t = k / rate
+        cars = [(8 * t - 12 * n + 2 * np.sin(t / 3), 0.0, 4.5 + 0.2 * n) for n in range(3)]
+        cars += [(30.0, 8.0, 4.0)] + [(100 - 6 * t, -6.0, 5.0)] * (t > 9)
+        for n, (x, y, length) in enumerate(cars):
+            if n == 1 and 10 < t < 12.5:
+                continue
+            dx, dy, dl = rng.normal(0, [0.2, 0.2, 0.1])
+            yaw = np.pi * ((n == 4) ^ (rng.random() < 0.3))
+            rows.append(f"{t:.3f},car,{x + dx:.4f},{y + dy:.4f},{length + dl:.3f},1.8,1.5,{yaw:.3f},0.8")
+    return rows
+
+
+def write(path: Path, rows: list[str], header: str = HEADER) -> Path:
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_stretches_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
+    path, config = write(tmp_path / "drive.csv", drive()), load_smooth_config("file")
+    whole = smooth_scene(read_detections(path).scene("drive"), config)
+    (run,) = smooth_stream(
+        read_scenes_in_parts(path, 60), config, tmp_path, stretches=StretchSettings(length=5.0, margin=6.0)
+    )
+    assert len(list(tmp_path.glob("000000/*.npz"))) == 3  # it was cut
+    assert run.frames == whole.frames
+    assert replace(run.counts, joined=0) == replace(whole.counts, joined=0)
+    moments = [moment for _, part in run.spool.labels() for moment in part]
+    assert len(moments) == len(whole.labels)
+    for mine, theirs in zip(moments, whole.labels, strict=True):
+        a, b = mine.tracks, theirs.tracks
+        assert a.timestamp == b.timestamp
+        assert a.id.tolist() == b.id.tolist()
+        moves = np.abs(b.boxes.position[:, 1] - 8.0) > 1.0
+        np.testing.assert_allclose(a.boxes.position[moves], b.boxes.position[moves], atol=1e-3)
+        np.testing.assert_allclose(a.boxes.position, b.boxes.position, atol=0.05)  # parked: averaged over less
+        np.testing.assert_allclose(a.boxes.size, b.boxes.size, atol=1e-3)
+        np.testing.assert_allclose(np.cos(a.boxes.yaw - b.boxes.yaw), 1.0, atol=1e-3)
+        np.testing.assert_allclose(a.position_covariance[moves], b.position_covariance[moves], rtol=1e-2)
+        np.testing.assert_allclose(a.score, b.score, atol=1e-9)
+        assert mine.source.tolist() == theirs.source.tolist()
+        assert mine.quality.tolist() == theirs.quality.tolist()
+
+
+def test_the_command_streams_several_recordings(tmp_path: Path) -> None:
+    rows = [f"{name},{row}" for name in ("a", "b") for row in drive(6.0)]
+    path = write(tmp_path / "two.csv", rows, f"scene,{HEADER}")
+    result = CliRunner().invoke(app, ["smooth", "file", str(path), "--output", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"labels.csv", "summary.json"}
+    labels = read_label_table(tmp_path / "out" / "labels.csv")
+    first, second = (labels.tracks.boxes.position[labels.tracks.scene == name] for name in ("a", "b"))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_parts_hold_together_what_belongs_together(tmp_path: Path) -> None:
+    path = write(tmp_path / "drive.csv", drive(6.0))
+    whole, parts = read_detections(path).scene("drive"), list(read_scenes_in_parts(path, 10))
+    assert len(parts) > 5
+    assert np.concatenate([part.timestamps for part in parts]).tolist() == whole.timestamps.tolist()
+    assert [len(frame) for part in parts for frame in part.frames] == [len(frame) for frame in whole.frames]
+    scattered = ["a,0,car,0,0,,,,,1", "b,0,car,0,0,,,,,1", "a,1,car,0,0,,,,,1"]
+    with pytest.raises(InputError, match="scene a: expected its rows together, it goes on after b"):
+        list(read_scenes_in_parts(write(tmp_path / "s.csv", scattered, f"scene,{HEADER}"), 1))
+    late = ["1,car,0,0,,,,,1", "0,car,0,0,,,,,1"]
+    with pytest.raises(InputError, match="line 3: timestamp: expected rows in order of time"):
+        list(read_scenes_in_parts(write(tmp_path / "l.csv", late), 1))
+    with pytest.raises(InputError, match="unknown scene 'c'"):
+        list(read_scenes_in_parts(path, scenes=["c"]))
+
+
+def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
+    lifetimes = Lifetimes()
+    for size, probability, looks in ((4.0, 0.5, 3), (4.2, 0.9, 2), (9.0, 0.1, 5)):
+        lifetimes.seen(7, np.array([probability]), np.array([[size, 2.0, np.nan]]), np.array([probability]))
+        lifetimes.seen(7, np.array([probability]), np.array([[size, 2.0, 1.5]]), np.array([probability]))
+        lifetimes.looked(7, looks)
+    lifetimes.given_out(7, lifetimes.turned(7, 0.1), yaw=0.1, path=-1.0, votes=3.0)
+    assert lifetimes.turned(7, 0.2) == 1
+    turned = lifetimes.turned(7, 0.1 - np.pi)  # the next stretch sees it the other way round
+    assert turned == -1
+    lifetimes.given_out(7, turned, yaw=0.1 - np.pi, path=4.0, votes=1.0)
+    lifetimes.retire(np.array([7]))
+    lifetimes.retire(np.array([], dtype=np.int64))
+    size, score, backwards = lifetimes.lasting(7, prior_looks=2.0)
+    assert 4.0 < size[0] < 4.2  # the far guess of 9 m does not count for more than its weight
+    assert size[1:] == pytest.approx([2.0, 1.5])
+    assert score == pytest.approx(3.0 / 12)
+    assert backwards  # 5 m against the direction of its start
+
+
+def test_many_values_are_kept_by_their_weights() -> None:
+    rng = np.random.default_rng(0)
+    sizes = rng.normal([4.5, 1.8, 1.5], 0.1, (20_000, 3))
+    lifetimes = Lifetimes()
+    for part in np.split(sizes, 20):
+        lifetimes.seen(0, np.ones(1000), part, np.ones(1000))
+    lifetimes.retire(np.array([], dtype=np.int64))
+    np.testing.assert_allclose(lifetimes.lasting(0, 1.0).size, np.median(sizes, axis=0), atol=1e-3)
+
+
+def test_the_bench_counts_and_compares() -> None:
+    result = bench_files(StreamingBenchSettings(objects=5, seconds=12.0, rate=4.0, compared=12.0))
+    assert result.boxes > 100
+    assert result.largest_difference < 1e-3
+    assert result.differing <= result.compared / 50
+    assert result.rows[-1].recorded == 12.0
