@@ -47,6 +47,7 @@ COMPONENTS = (
     Variant("matching without existence", changes={"tracker.association.existence_weight": 0.0}),
     Variant("matching without scores", changes={"tracker.association.score_weight": 0.0}),
     Variant("greedy matching", changes={"tracker.association.method": "greedy"}),
+    Variant("graph matching", changes={"tracker.association.method": "graph"}),
     Variant("tracks that never leave unseen", changes={"tracker.existence.lifetime": math.inf}),
     Variant("scores without steadiness", changes={"tracker.existence.steadiness_weight": 0.0}),
     Variant("coasting tracks scored in full", changes={"tracker.existence.coasting_score": 1.0}),

@@ -24,6 +24,7 @@ from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
 from pipelines.cli.bench_smoothing import smoothing
 from pipelines.cli.bench_streaming import streaming
+from pipelines.cli.bench_synthetic import synthetic
 from pipelines.cli.bench_tracking import tracking
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import ReportingGroup, progress_bar
@@ -46,6 +47,7 @@ bench_app.command()(smoothing)
 bench_app.command()(streaming)
 bench_app.command()(reading)
 bench_app.command()(paper)
+bench_app.command()(synthetic)
 bench_app.command()(tracking)
 
 
