@@ -57,9 +57,12 @@ def mahalanobis(
 
     position (n, 2), covariance (n, 2, 2), measured (m, 2), noise (m, 2, 2)
     """
-    dx = measured[None, :, 0] - position[:, None, 0]
-    dy = measured[None, :, 1] - position[:, None, 1]
-    S = covariance[:, None] + noise[None]
+    return mahalanobis_of_pairs(measured[None] - position[:, None], covariance[:, None] + noise[None])
+
+
+def mahalanobis_of_pairs(innovation: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared distances and log det S, both (...), of innovations (..., 2) with covariances S (..., 2, 2)."""
+    dx, dy = innovation[..., 0], innovation[..., 1]
     a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
     det = a * c - b * b
     return (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det, np.log(det)

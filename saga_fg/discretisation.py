@@ -55,7 +55,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
     kinds, kind = distinct_types(graph.types)
-    coupled = np.asarray(graph.diffusion_scale != 1.0)
+    coupled = np.zeros(len(graph), dtype=bool)
     for edges in graph.edges:
         coupled[edges.target[edges.rate > 0]] = True
     offsets = np.concatenate([[0], np.cumsum(graph.dims)])
@@ -73,7 +73,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         generators, diffusions = (np.stack([getattr(kinds[k], n) for k in numbers]) for n in ("generator", "diffusion"))
         (own,), noise = _phi_and_noise(generators, diffusions, dt, 0, _nilpotency([kinds[k] for k in numbers]))
         F.append(Blocks(rows, rows, own[of_row]))
-        Q.append(Blocks(rows, rows, noise[of_row]))
+        Q.append(Blocks(rows, rows, noise[of_row] * graph.diffusion_scale[rows, None, None]))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
     for d in np.unique(graph.dims[coupled]).tolist():
         rows = np.flatnonzero(coupled & (graph.dims == d))

@@ -116,12 +116,16 @@ class Following:
 
 
 def build_graph(
-    nodes: NodeTable, rules: Sequence[EdgeRule], min_rate: float = 1e-3, explained_noise: float = 0.0
+    nodes: NodeTable,
+    rules: Sequence[EdgeRule],
+    min_rate: float = 1e-3,
+    explained_noise: float = 0.0,
+    noise_scale: FloatArray | None = None,
 ) -> SceneGraph:
     """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out.
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
-    a driver who does what his leader does is no longer a surprise.
+    a driver who does what his leader does is no longer a surprise. `noise_scale` (n,) are further factors on it.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
     """
@@ -144,6 +148,8 @@ def build_graph(
                     groups.append(Edges(name, t, s, rate[mine], *rule.interaction.triples(nodes, t, s)))
                     np.add.at(total_rate, t, rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
+    if noise_scale is not None:
+        scale = scale * noise_scale
     return SceneGraph(nodes.id, nodes.types, tuple(groups), scale)
 
 

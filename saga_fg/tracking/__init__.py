@@ -11,6 +11,7 @@ from saga_fg.tracking.settings import (
     ExistenceSettings,
     FlowSettings,
     GreedySettings,
+    StandingSettings,
     TrackerSettings,
 )
 from saga_fg.tracking.tracker import Tracker
@@ -27,6 +28,7 @@ __all__ = [
     "Journal",
     "Observer",
     "Stage",
+    "StandingSettings",
     "Tracker",
     "TrackerSettings",
     "TrackerView",

@@ -11,6 +11,7 @@ from saga_fg.boxes import Boxes
 from saga_fg.tracking.joint_state import Kinematics
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import ClassSettings, class_values
+from saga_fg.tracking.standing import after_evidence, log_density
 from saga_fg.tracking.traffic_flow import TrafficFlow
 
 
@@ -19,31 +20,38 @@ def newborn(
     rows: IntArray,
     origin: FloatArray,
     classes: Mapping[str, ClassSettings],
-    flow: TrafficFlow | None = None,
-) -> Kinematics:
-    """The kinematics of tracks born from the detections `rows` (k,), positions from `origin` (2,).
+    flow: TrafficFlow,
+    standing: float = 0.0,
+) -> tuple[Kinematics, FloatArray]:
+    """The kinematics of tracks born from the detections `rows` (k,), if they move; and the belief (k,) that they stand.
 
-    flow  what traffic around tells of velocities that are not measured
+    origin    (2,) that positions are from
+    flow      what traffic around tells of velocities that are not measured
+    standing  the belief that an object stands of which nothing is known
     """
     boxes, measured, R = observed.boxes.select(rows), observed.with_velocity[rows], observed.R[rows]
-    velocity, P_velocity = _unmeasured_velocity(boxes, classes, flow)
-    return Kinematics(
+    velocity, P_velocity, stands = _unmeasured_velocity(boxes, classes, flow, standing)
+    if standing > 0:
+        z, R_v = np.nan_to_num(boxes.velocity), R[:, 2:, 2:]
+        seen = after_evidence(stands, log_density(z, R_v) - log_density(z - velocity, P_velocity + R_v))
+        stands = np.where(measured, seen, stands)
+    kinematics = Kinematics(
         boxes.position[:, :2] - origin,
         np.where(measured[:, None], boxes.velocity, velocity),
         R[:, :2, :2],
         np.where(measured[:, None, None], R[:, 2:, 2:], P_velocity),
     )
+    return kinematics, stands
 
 
 def _unmeasured_velocity(
-    boxes: Boxes, classes: Mapping[str, ClassSettings], flow: TrafficFlow | None
-) -> tuple[FloatArray, FloatArray]:
-    """Velocity (k, 2) and its covariance (k, 2, 2) by class, heading and traffic."""
+    boxes: Boxes, classes: Mapping[str, ClassSettings], flow: TrafficFlow, standing: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Velocity (k, 2), its covariance (k, 2, 2) and the belief (k,) to stand, by class, heading and traffic."""
     speed, drift = (class_values(classes, name, boxes.label) for name in ("birth_speed", "birth_drift"))
-    mean, variance = np.zeros(len(boxes)), speed**2
-    if flow is not None:
-        mean, variance = flow.speed(boxes.label, boxes.position[:, :2], boxes.yaw, variance)
+    stands, mean, variance = flow.expected(boxes.label, boxes.position[:, :2], boxes.yaw, speed**2, standing)
     known = np.isfinite(boxes.yaw)
     ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))
     along = np.where(known, variance - drift**2, 0.0)[:, None, None] * (ahead[:, :, None] * ahead[:, None])
-    return mean[:, None] * ahead, along + (np.where(known, drift, speed) ** 2)[:, None, None] * np.eye(2)
+    P = along + (np.where(known, drift, speed) ** 2)[:, None, None] * np.eye(2)
+    return mean[:, None] * ahead, P, stands

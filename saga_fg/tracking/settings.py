@@ -126,6 +126,23 @@ class FlowSettings:
 
 
 @dataclass(frozen=True)
+class StandingSettings:
+    """The belief that an object stands still, see `saga_fg.tracking.standing`."""
+
+    prior: float = setting(0.0, "share of new objects that stand; 0: standing is no case of its own")
+    depart: float = setting(0.02, "rate at which what stands starts to move, 1/s")
+    halt: float = setting(0.05, "rate at which what moves comes to stand, 1/s")
+    drift: float = setting(0.02, "how far the place of what stands drifts, standard deviation after one second, m")
+    noise: float = setting(0.05, "share of the process noise that is left to what stands")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, 1, "prior", "noise")
+        require_between(self, 0, math.inf, "depart", "halt", "drift")
+        if self.prior == 1 or self.noise == 0:
+            raise InputError("prior and noise: expected a prior below 1 and some noise, since everything may move")
+
+
+@dataclass(frozen=True)
 class TrackerSettings:
     """Everything the tracker can be told; `edges` empty is the classical filter of independent objects."""
 
@@ -151,6 +168,7 @@ class TrackerSettings:
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     flow: FlowSettings = settings_group(FlowSettings, "the speed of new tracks from traffic around them")
+    standing: StandingSettings = settings_group(StandingSettings, "whether an object stands or moves")
     report_speed_known: float = setting(
         math.inf,
         "a track is first reported when the standard deviation of its velocity is below this, m/s; .inf: at once",

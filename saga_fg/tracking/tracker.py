@@ -37,6 +37,7 @@ from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.roadside import Roadside, motion_of
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
+from saga_fg.tracking.standing import Standing
 from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
 
 log = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class Snapshot:
     """A tracker at one moment, see `Tracker.snapshot`."""
 
     state: Any
-    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow, Roadside]
+    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow, Roadside, Standing]
     numbers: tuple[float, FloatArray, int, int]
     graph: SceneGraph | None
     assignment: Assignment
@@ -91,6 +92,7 @@ class Tracker:
         self._flow = TrafficFlow(self.settings.flow)
         self._box = BoxFilter.empty()
         self.roadside = Roadside(self.settings.signals)
+        self._standing = Standing.empty()
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far."""
@@ -145,26 +147,30 @@ class Tracker:
             return Tracks.empty(timestamp)
         if timestamp <= self._time:
             return self._report(timestamp)
-        state, box, now, graph = self._state.snapshot(), self._box, self._time, self.graph
-        self._box, roadside = box.select(np.arange(len(box.z))), self.roadside
-        self.roadside = copy.copy(roadside)
+        state, now, graph, roadside = self._state.snapshot(), self._time, self.graph, self.roadside
+        box, standing, rows = self._box, self._standing, np.arange(len(self._box.z))
+        self._box, self._standing, self.roadside = box.select(rows), standing.select(rows), copy.copy(roadside)
         try:
             self._predict(timestamp)
             return self._report(timestamp)
         finally:
             self._state.restore(state)
-            self._box, self._time, self.graph, self.roadside = box, now, graph, roadside
+            self._box, self._standing, self.roadside = box, standing, roadside
+            self._time, self.graph = now, graph
 
     def snapshot(self) -> Snapshot:
         """All that the tracker knows; what it does later leaves it as it is."""
-        own = copy.deepcopy((self._columns, self._box, self._evidence, self._flow, self.roadside))
+        own = copy.deepcopy(
+            (self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing)
+        )
         numbers = (self._time, self._origin, self._next_id, self.late_frames)
         return Snapshot(self._state.snapshot(), own, numbers, self.graph, self.assignment)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go on from where a tracker of the same settings was; as often as wanted from one snapshot."""
         self._state.restore(snapshot.state)
-        self._columns, self._box, self._evidence, self._flow, self.roadside = copy.deepcopy(snapshot.own)
+        own = copy.deepcopy(snapshot.own)
+        self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing = own
         self._time, self._origin, self._next_id, self.late_frames = snapshot.numbers
         self.graph, self.assignment = snapshot.graph, snapshot.assignment
 
@@ -189,11 +195,21 @@ class Tracker:
         if dt > 0 and len(self._columns.id) + len(self.roadside):
             steps = max(1, math.ceil(dt / self.settings.max_step - 1e-9))
             for _ in range(steps):
-                self.graph = build_graph(self._nodes(), self.rules, explained_noise=self.settings.explained_noise)
+                noise = self._standing_noise(dt / steps)
+                nodes, explained = self._nodes(), self.settings.explained_noise
+                self.graph = build_graph(nodes, self.rules, explained_noise=explained, noise_scale=noise)
                 self._state.predict(self.graph, dt / steps)
                 self.roadside.predict(dt / steps)
             self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
         self._time = timestamp
+
+    def _standing_noise(self, dt: float) -> FloatArray | None:
+        """`dt` s pass for the belief that tracks stand; factors on the nodes' noise over this time."""
+        settings = self.settings.standing
+        if settings.prior == 0:
+            return None
+        self._standing.predict(dt, self._kinematics(), settings)
+        return np.concatenate([self._standing.noise_scale(settings), np.ones(len(self.roadside))])
 
     def _associate(self, observed: Observed, sensor: Sensor, delay: float) -> Matching:
         """Register what was observed to the prediction, as of `delay` s ago."""
@@ -218,6 +234,11 @@ class Tracker:
         columns, boxes = self._columns, observed.boxes
         t, d = matching.track, matching.detection
         z = np.concatenate([boxes.position[d, :2] - self._origin, boxes.velocity[d]], axis=1)
+        if self.settings.standing.prior > 0:
+            position, P = self._state.positions_before(columns.id, columns.label, delay)
+            then = self._kinematics()._replace(position=position, P=P)
+            moving = Kinematics._make(column[t] for column in then)
+            self._standing.update(t, z, observed.R[d], moving, observed.with_velocity[d])
         self._state.update(columns.id[t], columns.label[t], z, observed.R[d], observed.with_velocity[d], delay)
         self._update_range_rate(observed, d, columns.id[t], columns.label[t], delay)
         p = observed.probability[d]
@@ -225,7 +246,7 @@ class Tracker:
             t, boxes.size[d], p, boxes.position[d, 2], observed.z_noise[d], boxes.yaw[d], observed.yaw_noise[d]
         )
         if len(columns.id):
-            now = self._kinematics()
+            now = self._told()
             speed = np.hypot(*now.velocity.T)
             moves = (speed > MOVING) & (speed > 3 * self._speed_deviation())
             self._box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
@@ -290,13 +311,14 @@ class Tracker:
                 yaw,
                 speed,
                 variance,
+                self._standing.belief[rows],
                 np.full(len(rows), self._time),
             )
         )
 
     def _speed_deviation(self) -> FloatArray:
         """(n,) standard deviation of the velocity in a mean direction, m/s."""
-        P = self._kinematics().P_velocity
+        P = self._told().P_velocity
         return np.asarray(np.sqrt((P[:, 0, 0] + P[:, 1, 1]) / 2))
 
     def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float) -> IntArray:
@@ -312,7 +334,9 @@ class Tracker:
         boxes, p = observed.boxes.select(born), observed.probability[born]
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
-        kinematics = newborn(observed, born, self._origin, self.settings.classes, self._flow)
+        kinematics, stands = newborn(
+            observed, born, self._origin, self.settings.classes, self._flow, self.settings.standing.prior
+        )
         self._state.add(ids, boxes.label, kinematics, delay)
         self._update_range_rate(observed, born, ids, boxes.label, delay)
         confirmed, accepted = p >= self.settings.existence.confirm, self.sensor(sensor).births == "alone"
@@ -321,6 +345,7 @@ class Tracker:
             TrackColumns.born(ids, boxes.label, p, seen, self._time, confirmed, accepted)
         )
         self._evidence.born(sensor, p, seen)
+        self._standing = self._standing.extended(Standing.born(kinematics, stands))
         self._box = self._box.extended(
             BoxFilter.born(
                 boxes.size, p, boxes.position[:, 2], observed.z_noise[born], boxes.yaw, observed.yaw_noise[born]
@@ -338,6 +363,7 @@ class Tracker:
         if dead.any():
             self._state.remove(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
+            self._standing = self._standing.select(~dead)
             self._evidence.select(~dead)
 
     def _report(self, timestamp: float) -> Tracks:
@@ -350,7 +376,7 @@ class Tracker:
             & columns.ready
         )
         rows = np.flatnonzero(shown)
-        position, velocity, P, P_velocity = (column[rows] for column in self._kinematics())
+        position, velocity, P, P_velocity = (column[rows] for column in self._told())
         boxes = self._boxes(rows, position, velocity)
         score = reported_score(columns, coasting > 0, settings.existence)[rows]
         score = np.where(columns.accepted[rows], score, settings.unconfirmed_share * score)
@@ -386,10 +412,15 @@ class Tracker:
     def _kinematics(self) -> Kinematics:
         return self._state.kinematics(self._columns.id, self._columns.label)
 
+    def _told(self) -> Kinematics:
+        """What is told of the tracks: the joint state, the velocity with the belief that they stand."""
+        now = self._kinematics()
+        return self._standing.told(now) if self.settings.standing.prior > 0 else now
+
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them: the tracks, then the nodes of the roadside."""
         columns, box = self._columns, self._box
-        position, velocity, _, P_velocity = self._kinematics()
+        position, velocity, _, P_velocity = self._told()
         heading = np.where(np.isfinite(box.yaw), box.yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
         tracks = NodeTable(
             columns.id,

@@ -7,6 +7,10 @@ r"""How fast traffic goes here: the speed of a new track from tracks of its clas
 Every neighbour j counts once, by the nearest place it passed within `memory`, with its speed s_j along its heading
 there (parked ones with a speed near 0). The new track takes the mean and the variance of the mixture, which is as wide
 as the neighbours disagree, and that of knowing nothing where nobody was.
+
+Where standing is a case of its own (`saga_fg.tracking.standing`), neighbour j stands with the belief b_j and an object
+of which nothing is known with b_0. The new one stands with the mean of these, weighted by k, and the mixture is that of
+those that move, with the weights 1 - b_0 and k_j (1 - b_j).
 """
 
 from __future__ import annotations
@@ -21,7 +25,8 @@ from saga_fg.tracking.settings import FlowSettings
 
 
 class Passages(NamedTuple):
-    """n places where tracks were: track id, class, position (n, 2), heading, speed along it, its variance, time."""
+    """n places where tracks were: track id, class, position (n, 2), heading, speed along it if it moves, its variance,
+    the belief that it stands, time."""
 
     id: IntArray
     label: StrArray
@@ -29,29 +34,22 @@ class Passages(NamedTuple):
     heading: FloatArray
     speed: FloatArray
     variance: FloatArray
+    standing: FloatArray
     time: FloatArray
 
     def select(self, rows: BoolArray) -> Passages:
-        return Passages(
-            self.id[rows],
-            self.label[rows],
-            self.position[rows],
-            self.heading[rows],
-            self.speed[rows],
-            self.variance[rows],
-            self.time[rows],
-        )
+        return Passages._make(column[rows] for column in self)
 
     def extended(self, other: Passages) -> Passages:
-        return Passages(
-            np.concatenate([self.id, other.id]),
-            np.concatenate([self.label, other.label]),
-            np.concatenate([self.position, other.position]),
-            np.concatenate([self.heading, other.heading]),
-            np.concatenate([self.speed, other.speed]),
-            np.concatenate([self.variance, other.variance]),
-            np.concatenate([self.time, other.time]),
-        )
+        return Passages._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
+
+
+class Expected(NamedTuple):
+    """Of k new tracks, each (k,): the belief that they stand; if they move, their speed ahead, and its variance."""
+
+    standing: FloatArray
+    speed: FloatArray
+    variance: FloatArray
 
 
 class TrafficFlow:
@@ -74,17 +72,16 @@ class TrafficFlow:
             new = self._passages.select(self._passages.time >= passages.time[0] - settings.memory).extended(new)
         self._passages = new
 
-    def speed(
-        self, label: StrArray, position: FloatArray, heading: FloatArray, variance: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Speed (k,) along the heading of new tracks at `position` (k, 2), and its variance.
+    def expected(
+        self, label: StrArray, position: FloatArray, heading: FloatArray, variance: FloatArray, standing: float = 0.0
+    ) -> Expected:
+        """What is to be expected of new tracks at `position` (k, 2).
 
-        variance  (k,) of the speed of one of which nothing is known
+        variance, standing  (k,) of the speed of one of which nothing is known, and the belief that it stands
         """
-        mean, total = np.zeros(len(label)), variance.copy()
         passages, settings = self._passages, self._settings
         if passages is None or len(passages.id) == 0 or len(label) == 0:
-            return mean, total
+            return Expected(np.full(len(label), standing), np.zeros(len(label)), variance.copy())
         offset = passages.position - position[:, None]
         c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
         ahead, lateral = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
@@ -97,10 +94,12 @@ class TrafficFlow:
         k = settings.weight * np.exp(-exponent / 2)
         k = np.where((passages.label == label[:, None]) & np.isfinite(heading)[:, None], k, 0.0)
         k = _nearest_of_each(k, passages.id)
-        norm = 1 + k.sum(axis=1)
+        stands = (standing + k @ passages.standing) / (1 + k.sum(axis=1))
+        k = k * (1 - passages.standing)
+        norm = 1 - standing + k.sum(axis=1)
         mean = k @ passages.speed / norm
         square = passages.speed**2 + passages.variance + settings.spread**2
-        return mean, (variance + k @ square) / norm - mean**2
+        return Expected(stands, mean, ((1 - standing) * variance + k @ square) / norm - mean**2)
 
 
 def _nearest_of_each(k: FloatArray, ids: IntArray) -> FloatArray:

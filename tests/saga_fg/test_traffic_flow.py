@@ -15,7 +15,7 @@ from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
 ON = FlowSettings(weight=5.0)
 
 
-def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="car"):
+def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="car", standing=0.0):
     n = len(position)
     return Passages(
         np.arange(n) if ids is None else np.array(ids),
@@ -24,15 +24,20 @@ def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="
         np.array(heading, dtype=float),
         np.array(speed, dtype=float),
         np.full(n, variance),
+        np.broadcast_to(np.asarray(standing, dtype=float), n),
         np.full(n, time),
     )
 
 
 def speed_at(flow, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
-    mean, variances = flow.speed(
-        np.array([label]), np.array([position]), np.array([heading]), np.array([variance], dtype=float)
+    return expected_at(flow, 0.0, position, heading, label, variance)[1:]
+
+
+def expected_at(flow, standing, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
+    expected = flow.expected(
+        np.array([label]), np.array([position]), np.array([heading]), np.array([variance], dtype=float), standing
     )
-    return mean[0], variances[0]
+    return tuple(column[0] for column in expected)
 
 
 def remembering(*tables, settings=ON):
@@ -68,6 +73,15 @@ def test_neighbours_that_disagree_make_the_speed_uncertain():
     split = speed_at(remembering(passages([(5, 0), (-5, 0)], [0, 0], [0, 24])))
     assert split[0] == pytest.approx(agreed[0])
     assert split[1] > agreed[1] + 50
+
+
+def test_standing_neighbours_say_that_a_new_one_stands_and_nothing_of_its_speed_if_not():
+    both = remembering(passages([(0, 0), (0, 0)], [0, 0], [12, 0.3], standing=[0.0, 1.0]))
+    standing, mean, variance = expected_at(both, 0.4)
+    assert standing == pytest.approx((0.4 + 5) / 11)
+    assert mean == pytest.approx(5 * 12 / 5.6)
+    assert variance == pytest.approx((0.6 * 25 + 5 * (144 + 0.1 + ON.spread**2)) / 5.6 - mean**2)
+    assert expected_at(remembering(), 0.4) == pytest.approx((0.4, 0.0, 25.0))
 
 
 def test_a_track_counts_once_however_often_it_was_seen():

@@ -1,0 +1,116 @@
+r"""Standing or moving: a discrete state of every track beside its Gaussian one, and what follows from it.
+
+    s <- b + (s - b) exp(-(depart + halt) dt),   b = halt / (depart + halt)     time passes
+    s / (1 - s) <- s / (1 - s)  N(z; a, D + R) / N(z; H m, H P H^T + R)         a detection z is taken in
+
+s is the belief that the object stands. If it moves, it is where the joint filter says, N(m, P). If it stands, it is at
+a place of its own, N(a, D), that drifts slowly and of which all its detections are measurements; one that has just
+halted is where the joint filter has it, and the two are merged by their moments. A measured velocity is a second piece
+of evidence, N(z_v; 0, R_v) against N(z_v; v, P_v + R_v), taken for independent of the first.
+
+The belief is used in two places. The joint filter's process noise over the next interval is that expected under it,
+(1 - s + s * standing_noise) Qc, frozen with the interval as the edges are. What is told of the velocity is the mixture,
+
+    v_told = (1 - s) v     P_told = (1 - s) P_v + s (1 - s) v v^T
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6: the
+interacting multiple model, here without mixing what stands into what moves, so that the joint filter stays a Kalman
+filter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.association import mahalanobis_of_pairs
+from saga_fg.tracking.joint_state import Kinematics
+from saga_fg.tracking.settings import StandingSettings
+
+_MOST_LOG_ODDS = 12.0  # no belief is beyond being changed by what is seen
+
+
+@dataclass(eq=False)
+class Standing:
+    """Columns over n tracks: place (n, 2), local, its covariance P (n, 2, 2), belief (n,)."""
+
+    place: FloatArray
+    P: FloatArray
+    belief: FloatArray
+
+    @classmethod
+    def empty(cls) -> Standing:
+        return cls(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+
+    @classmethod
+    def born(cls, now: Kinematics, belief: FloatArray) -> Standing:
+        """Of new tracks: they stand where they are."""
+        return cls(now.position.copy(), now.P.copy(), belief)
+
+    def select(self, rows: IntArray | BoolArray) -> Standing:
+        return Standing(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def extended(self, other: Standing) -> Standing:
+        return Standing(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+    def predict(self, dt: float, moving: Kinematics, settings: StandingSettings) -> None:
+        """`dt` s pass; `moving` is the joint filter's state before."""
+        rate = settings.depart + settings.halt
+        balance, lost = settings.halt / max(rate, 1e-12), -math.expm1(-rate * dt)
+        stays, halts = self.belief * (1 - (1 - balance) * lost), (1 - self.belief) * balance * lost
+        self.belief = stays + halts
+        new = (halts / np.maximum(self.belief, 1e-12))[:, None]
+        apart = moving.position - self.place
+        self.place = self.place + new * apart
+        self.P = (
+            (1 - new)[..., None] * self.P
+            + new[..., None] * moving.P
+            + (new * (1 - new))[..., None] * apart[:, :, None] * apart[:, None]
+            + settings.drift**2 * dt * np.eye(2)
+        )
+
+    def update(
+        self, rows: IntArray, z: FloatArray, R: FloatArray, moving: Kinematics, with_velocity: BoolArray
+    ) -> None:
+        """Take in one detection each for the tracks `rows` (k,).
+
+        z (k, 4) position and velocity, R (k, 4, 4); `moving`: the joint filter's prediction of these tracks
+        """
+        if len(rows) == 0:
+            return
+        z_p, R_p, z_v, R_v = z[:, :2], R[:, :2, :2], np.where(with_velocity[:, None], z[:, 2:], 0.0), R[:, 2:, 2:]
+        evidence = log_density(z_p - self.place[rows], self.P[rows] + R_p)
+        evidence -= log_density(z_p - moving.position, moving.P + R_p)
+        by_velocity = log_density(z_v, R_v) - log_density(z_v - moving.velocity, moving.P_velocity + R_v)
+        evidence += np.where(with_velocity, by_velocity, 0.0)
+        S = self.P[rows] + R_p
+        gain = np.swapaxes(np.linalg.solve(S, self.P[rows]), 1, 2)
+        self.place[rows] += (gain @ (z_p - self.place[rows])[:, :, None])[:, :, 0]
+        self.P[rows] = self.P[rows] - gain @ self.P[rows]
+        self.belief[rows] = after_evidence(self.belief[rows], evidence)
+
+    def noise_scale(self, settings: StandingSettings) -> FloatArray:
+        """(n,) the share of the process noise that is expected."""
+        return np.asarray(1 - self.belief * (1 - settings.noise))
+
+    def told(self, moving: Kinematics) -> Kinematics:
+        """The joint filter's state with the velocity that is told."""
+        s, v = self.belief[:, None], moving.velocity
+        P = (1 - s)[..., None] * moving.P_velocity + (s * (1 - s))[..., None] * v[:, :, None] * v[:, None]
+        return moving._replace(velocity=(1 - s) * v, P_velocity=P)
+
+
+def after_evidence(belief: FloatArray, evidence: FloatArray) -> FloatArray:
+    """The belief (k,) after evidence (k,), the log of a ratio of likelihoods."""
+    before = np.clip(belief, 1e-9, 1 - 1e-9)
+    odds = np.clip(np.log(before / (1 - before)) + evidence, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
+    return np.asarray(1 / (1 + np.exp(-odds)))
+
+
+def log_density(innovation: FloatArray, S: FloatArray) -> FloatArray:
+    """(k,) log N(innovation; 0, S) in the plane, but for a constant."""
+    distance, log_det = mahalanobis_of_pairs(innovation, S)
+    return np.asarray(-0.5 * (distance + log_det))
