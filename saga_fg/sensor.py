@@ -42,12 +42,18 @@ class NoiseModel:
     velocity: float = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
     range_rate: float = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
     low_score: float = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
+    told_scale: float = setting(1.0, "factor on the standard deviation that is told of a track's position")
+    told_low_score: float = setting(0.0, "it grows by the factor 1 + told_low_score * (1 - probability); > -1")
+    shared_error: float = setting(0.0, "standard deviation of what all detections of an object err alike, m")
+    shared_low_score: float = setting(0.0, "it grows by the factor 1 + shared_low_score * (1 - probability)")
     yaw: float = setting(0.2, "standard deviation of the heading, rad")
     height: float = setting(0.2, "standard deviation of the centre's height, m")
 
     def __post_init__(self) -> None:
-        require_positive(self, "position", "velocity", "range_rate", "yaw", "height")
+        require_positive(self, "position", "velocity", "range_rate", "yaw", "height", "told_scale")
         require_between(self, 0, math.inf, "range_noise", "bearing_noise", "low_score")
+        require_between(self, 0, math.inf, "shared_error", "shared_low_score")
+        require_between(self, -0.99, math.inf, "told_low_score")
 
 
 @dataclass(frozen=True)
@@ -198,6 +204,14 @@ class Sensor:
     def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """(N,), (m/s)^2."""
         return np.asarray(self.deviations(label, "range_rate") ** 2 * self._score_factor(label, probability))
+
+    def told(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What is told of positions (N,): the factor on their deviations, and the shared error, m."""
+        factor, shared = (
+            self.deviations(label, name) * (1 + self.deviations(label, growth) * (1 - probability))
+            for name, growth in (("told_scale", "told_low_score"), ("shared_error", "shared_low_score"))
+        )
+        return factor, shared
 
     def _score_factor(self, label: StrArray, probability: FloatArray) -> FloatArray:
         return np.asarray((1 + self.deviations(label, "low_score") * (1 - probability)) ** 2)

@@ -18,6 +18,7 @@ class TrackColumns:
     label         (n,) class
     existence     (n,) probability that the track is a real object
     score         (n,) probability of its latest detection
+    told, shared  (n,) what the sensor of its latest detection tells of positions: a factor, and an error in m
     last_seen     (n,) time of its latest detection
     last_in_view  (n,) when it was last inside a sensor's field of view
     confirmed     (n,) misses no longer end it
@@ -31,6 +32,8 @@ class TrackColumns:
     label: StrArray
     existence: FloatArray
     score: FloatArray
+    told: FloatArray
+    shared: FloatArray
     last_seen: FloatArray
     last_in_view: FloatArray
     confirmed: BoolArray
@@ -43,7 +46,8 @@ class TrackColumns:
     @classmethod
     def empty(cls) -> Self:
         none = np.empty(0)
-        return cls.born(np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), none, 0.0, 0.0, none.astype(bool), True)
+        label = np.empty(0, dtype="<U1")
+        return cls.born(np.empty(0, dtype=np.int64), label, none, (none, none), 0.0, 0.0, none.astype(bool), True)
 
     @classmethod
     def born(
@@ -51,6 +55,7 @@ class TrackColumns:
         ids: IntArray,
         label: StrArray,
         probability: FloatArray,
+        told: tuple[FloatArray, FloatArray],
         seen: float,
         now: float,
         confirmed: BoolArray,
@@ -63,6 +68,7 @@ class TrackColumns:
             label,
             probability.copy(),
             probability.copy(),
+            *told,
             np.full(k, seen),
             np.full(k, now),
             confirmed,

@@ -22,7 +22,8 @@ UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 class Observed:
     """m detections: boxes (world), probability (m,), R (m, 4, 4) of position and velocity, standard deviations (m,) of
     height (m) and heading (rad), whether the velocity was measured (m,), rows (m,) in the frame's detections, range
-    rate (m,), m/s, NaN where not to be used, its variance (m,), and the place (2,), world, it was seen from."""
+    rate (m,), m/s, NaN where not to be used, its variance (m,), what is told of positions (m,) twice (see
+    `saga_fg.tracking.told_covariance`), and the place (2,), world, it was seen from."""
 
     boxes: Boxes
     probability: FloatArray
@@ -33,6 +34,7 @@ class Observed:
     row: IntArray
     range_rate: FloatArray
     range_rate_variance: FloatArray
+    told: tuple[FloatArray, FloatArray]
     viewpoint: FloatArray | None
 
     def __len__(self) -> int:
@@ -67,5 +69,6 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
         keep,
         np.where(sensor.use_velocity, detections.range_rate, np.nan),
         sensor.range_rate_variance(boxes.label, probability),
+        sensor.told(boxes.label, probability),
         viewpoint,
     )

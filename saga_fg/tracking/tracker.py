@@ -38,6 +38,7 @@ from saga_fg.tracking.roadside import Roadside, motion_of
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 from saga_fg.tracking.standing import Standing
+from saga_fg.tracking.told_covariance import told_covariance
 from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
 
 log = logging.getLogger(__name__)
@@ -289,6 +290,8 @@ class Tracker:
         columns.score = np.where(np.isfinite(fused), fused, columns.score)
         columns.hits, columns.looks = self._evidence.steadiest()
         columns.accepted |= self._evidence.confirmed(self.settings.confirmations)
+        for column, told in zip((columns.told, columns.shared), observed.told, strict=True):
+            column[matching.track] = told[matching.detection]
         columns.last_seen[matching.track] = np.maximum(columns.last_seen[matching.track], self._time - delay)
         columns.last_in_view[matching.track] = self._time
         columns.confirmed |= columns.existence >= settings.confirm
@@ -340,9 +343,9 @@ class Tracker:
         self._state.add(ids, boxes.label, kinematics, delay)
         self._update_range_rate(observed, born, ids, boxes.label, delay)
         confirmed, accepted = p >= self.settings.existence.confirm, self.sensor(sensor).births == "alone"
-        seen = self._time - delay
+        seen, told = self._time - delay, (observed.told[0][born], observed.told[1][born])
         self._columns = self._columns.extended(
-            TrackColumns.born(ids, boxes.label, p, seen, self._time, confirmed, accepted)
+            TrackColumns.born(ids, boxes.label, p, told, seen, self._time, confirmed, accepted)
         )
         self._evidence.born(sensor, p, seen)
         self._standing = self._standing.extended(Standing.born(kinematics, stands))
@@ -378,6 +381,7 @@ class Tracker:
         rows = np.flatnonzero(shown)
         position, velocity, P, P_velocity = (column[rows] for column in self._told())
         boxes = self._boxes(rows, position, velocity)
+        P = told_covariance(P, boxes.yaw, columns.told[rows], columns.shared[rows])
         score = reported_score(columns, coasting > 0, settings.existence)[rows]
         score = np.where(columns.accepted[rows], score, settings.unconfirmed_share * score)
         return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])

@@ -12,9 +12,8 @@ SETTINGS = ExistenceSettings(lifetime=np.inf)
 
 def columns(score, hits, looks, existence=0.9):
     score = np.atleast_1d(np.asarray(score, dtype=float))
-    table = TrackColumns.born(
-        np.arange(len(score)), np.full(len(score), "car"), score, 0.0, 0.0, np.zeros(len(score), dtype=bool), True
-    )
+    label, told, confirmed = np.full(len(score), "car"), (score, score), np.zeros(len(score), dtype=bool)
+    table = TrackColumns.born(np.arange(len(score)), label, score, told, 0.0, 0.0, confirmed, True)
     table.hits, table.looks = np.broadcast_to(hits, len(score)) * 1.0, np.broadcast_to(looks, len(score)) * 1.0
     table.existence = np.full(len(score), existence)
     return table

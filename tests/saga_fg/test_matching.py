@@ -33,6 +33,7 @@ def observed(found, probability, noise=0.3):
         yaw_noise=flat,
         range_rate=np.full(n, np.nan),
         range_rate_variance=flat,
+        told=(flat, flat),
         viewpoint=None,
     )
 
