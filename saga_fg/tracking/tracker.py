@@ -161,9 +161,7 @@ class Tracker:
 
     def snapshot(self) -> Snapshot:
         """All that the tracker knows; what it does later leaves it as it is."""
-        own = copy.deepcopy(
-            (self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing)
-        )
+        own = copy.deepcopy((self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing))
         numbers = (self._time, self._origin, self._next_id, self.late_frames)
         return Snapshot(self._state.snapshot(), own, numbers, self.graph, self.assignment)
 
