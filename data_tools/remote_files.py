@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob, has_magic
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import Any
 from urllib.parse import urlsplit
@@ -45,6 +45,39 @@ def local_copy(location: str) -> Iterator[Path]:
         except Exception as error:  # each protocol has its own
             raise InputError(f"{location}: cannot be read: {type(error).__name__}: {error}") from error
         yield path
+
+
+@contextmanager
+def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
+    """A local folder with the files below `location` that match: itself, or a copy for the length of the block.
+
+    patterns: paths relative to `location`, with `*` for names; what is not there is left out. An `InputError` that is
+    raised in the block, about a file of the copy, names `location` instead.
+
+    Raises `InputError` where files cannot be read, `MissingExtraError` for a URL without the packages it takes.
+    """
+    if not is_url(location):
+        yield Path(location)
+        return
+    file_system, remote = _file_system(location)
+    remote = remote.rstrip("/")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        try:
+            for found in (name for pattern in patterns for name in sorted(file_system.glob(f"{remote}/{pattern}"))):
+                path = folder / PurePosixPath(found).relative_to(remote)
+                if folder not in path.resolve().parents:
+                    raise InputError(f"{location}: expected files below it, got {found}")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                file_system.get_file(found, str(path))
+        except InputError:
+            raise
+        except Exception as error:  # each protocol has its own
+            raise InputError(f"{location}: cannot be read: {type(error).__name__}: {error}") from error
+        try:
+            yield folder
+        except InputError as error:
+            raise InputError(str(error).replace(str(folder), location.rstrip("/"))) from error
 
 
 def expanded(locations: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ from data_tools.kitti.dataset import KittiTracking
 from data_tools.kitti.image_boxes import image_boxes, observation_angles
 from data_tools.kitti.labels import KittiObjects, has_box, read_kitti_labels
 from data_tools.kitti.oxts import read_poses
+from data_tools.kitti.remote import local_kitti
 from data_tools.kitti.tracking_results import kitti_result_text, write_kitti_results
 from data_tools.kitti.velodyne import KittiScans
 
@@ -19,6 +20,7 @@ __all__ = [
     "has_box",
     "image_boxes",
     "kitti_result_text",
+    "local_kitti",
     "observation_angles",
     "read_calibration",
     "read_kitti_labels",

@@ -2,6 +2,7 @@
 
 from data_tools.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES
 from data_tools.nuscenes.dataset import NuScenes
+from data_tools.nuscenes.remote import local_nuscenes
 from data_tools.nuscenes.result_files import ResultMeta
 from data_tools.nuscenes.scans import NuScenesScans, nuscenes_scans
 from data_tools.nuscenes.scored_scenes import ScoredScene, read_scored_scenes
@@ -24,6 +25,7 @@ __all__ = [
     "ScoredScene",
     "TrackedBoxes",
     "TrackingResults",
+    "local_nuscenes",
     "merge_tracking_results",
     "nuscenes_scans",
     "read_scored_scenes",

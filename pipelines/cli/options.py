@@ -26,16 +26,23 @@ Lag = Annotated[float, typer.Option("--lag", min=0.0, help="Length of the window
 
 def sensor_files(values: Sequence[str]) -> dict[str, Path]:
     """`["lidar=a.json", "camera=b.json"]` as a mapping; a lone file without a name is the sensor "lidar"."""
-    files: dict[str, Path] = {}
+    return {sensor: Path(path) for sensor, path in sensor_locations(values).items()}
+
+
+def sensor_locations(values: Sequence[str]) -> dict[str, str]:
+    """The same where files may be given by URL."""
+    files: dict[str, str] = {}
     for value in values:
         sensor, equals, path = value.partition("=")
+        if "://" in sensor:  # a URL without a name before it
+            sensor, equals, path = value, "", ""
         if not equals and len(values) == 1:
             sensor, path = "lidar", value
         if not sensor or not path:
             raise InputError(f"--detections {value}: expected NAME=FILE, e.g. lidar={value or 'detections.json'}")
         if sensor in files:
             raise InputError(f"--detections {value}: the sensor {sensor} is given twice")
-        files[sensor] = Path(path)
+        files[sensor] = path
     return files
 
 

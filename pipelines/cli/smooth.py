@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_files
+from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_locations
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import counted
@@ -35,7 +35,7 @@ def smooth() -> None:
 
 @smooth_app.command()
 def nuscenes(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")],
+    dataroot: Annotated[str, typer.Option("--dataroot", help="Folder that holds the folder of tables, or its URL.")],
     detections: Annotated[
         list[str],
         typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
@@ -64,36 +64,39 @@ def nuscenes(
           --detections lidar=megvii.json --workers 0 --output labels   # all cores
     """
     from data_tools.label_files import merge_label_parts
-    from data_tools.nuscenes import NuScenes, merge_tracking_results
+    from data_tools.nuscenes import NuScenes, local_nuscenes, merge_tracking_results
     from pipelines.scale_out import HeldScene, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_nuscenes_run
 
     settings = _configured("nuscenes", config, method, association)
-    chosen = chosen_scenes(dataroot, version, split, scenes)
-    dataset = NuScenes(dataroot, version, sensor_files(detections), chosen)
-    if at_scale(workers, ray):
-        task = SmoothTask(settings, method, "nuscenes", f".{table}", dataset.meta)
-        inputs = (HeldScene(dataset.scene(name)) for name in chosen)
+    with local_nuscenes(dataroot, version, sensor_locations(detections)) as (root, files):
+        chosen = chosen_scenes(root, version, split, scenes)
+        dataset = NuScenes(root, version, files, chosen)
+        if at_scale(workers, ray):
+            task = SmoothTask(settings, method, "nuscenes", f".{table}", dataset.meta)
+            inputs = (HeldScene(dataset.scene(name)) for name in chosen)
 
-        def merge() -> None:
-            merge_tracking_results(tracking, (output / task.tracking(name) for name in chosen), dataset.meta)
-            merge_label_parts(output, dataroot, version, (output / task.objects(name) for name in chosen))
+            def merge() -> None:
+                merge_tracking_results(tracking, (output / task.tracking(name) for name in chosen), dataset.meta)
+                merge_label_parts(output, root, version, (output / task.objects(name) for name in chosen))
 
-        tracking = output / "tracking.json"
-        tracking.unlink(missing_ok=True)
-        run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
-        return
-    with progress_bar(len(chosen)) as progress:
-        runs = smooth_dataset(dataset, settings, method, chosen, progress)
-        done = write_nuscenes_run(output, runs, dataroot, version, dataset.meta, f".{table}")
-    _show(output, done)
+            tracking = output / "tracking.json"
+            tracking.unlink(missing_ok=True)
+            run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
+            return
+        with progress_bar(len(chosen)) as progress:
+            runs = smooth_dataset(dataset, settings, method, chosen, progress)
+            done = write_nuscenes_run(output, runs, root, version, dataset.meta, f".{table}")
+        _show(output, done)
 
 
 @smooth_app.command()
 def kitti(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/.")],
+    dataroot: Annotated[
+        str, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/; or its URL.")
+    ],
     detections: Annotated[
-        Path, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/ and in each NNNN.txt.")
+        str, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.")
     ],
     output: Output,
     sequences: Annotated[
@@ -114,21 +117,22 @@ def kitti(
       saga-fg smooth kitti --dataroot data/kitti --detections data/kitti/detections/pointrcnn \\
           --sequences 0000,0011 --output labels
     """
-    from data_tools.kitti import KittiTracking
+    from data_tools.kitti import local_kitti
     from pipelines.scale_out import KittiInput, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_kitti_run
 
     settings = _configured("kitti", config, method, association)
-    dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
-    if at_scale(workers, ray):
-        inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
-        task = SmoothTask(settings, method, "kitti", f".{table}")
-        run_at_scale(inputs, len(dataset.scenes), task, output, workers, ray)
-        return
-    with progress_bar(len(dataset.scenes)) as progress:
-        runs = smooth_dataset(dataset, settings, method, progress=progress)
-        done = write_kitti_run(output, runs, dataset, f".{table}")
-    _show(output, done)
+    chosen = names("--sequences", sequences) if sequences is not None else None
+    with local_kitti(dataroot, detections, chosen) as dataset:
+        if at_scale(workers, ray):
+            inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
+            task = SmoothTask(settings, method, "kitti", f".{table}")
+            run_at_scale(inputs, len(dataset.scenes), task, output, workers, ray)
+            return
+        with progress_bar(len(dataset.scenes)) as progress:
+            runs = smooth_dataset(dataset, settings, method, progress=progress)
+            done = write_kitti_run(output, runs, dataset, f".{table}")
+        _show(output, done)
 
 
 @smooth_app.command()

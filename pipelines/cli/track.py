@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_files
+from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_locations
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import Summary
@@ -31,7 +31,7 @@ def track() -> None:
 
 @track_app.command()
 def nuscenes(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")],
+    dataroot: Annotated[str, typer.Option("--dataroot", help="Folder that holds the folder of tables, or its URL.")],
     detections: Annotated[
         list[str],
         typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
@@ -68,41 +68,45 @@ def nuscenes(
       saga-fg track nuscenes --dataroot data/nuscenes --version v1.0-trainval --split val \\
           --detections lidar=a.json --workers 0 --output run   # all cores; writes run/tracks.json
     """
-    from data_tools.nuscenes import NuScenes, merge_tracking_results, write_tracking_results
+    from data_tools.nuscenes import NuScenes, local_nuscenes, merge_tracking_results, write_tracking_results
+    from data_tools.remote_files import is_url
     from pipelines.explaining import trackers
     from pipelines.scale_out import HeldScene, TrackTask
     from pipelines.tracking import track_dataset
 
-    chosen = chosen_scenes(dataroot, version, split, scenes)
     settings = configured("nuscenes", config, method, estimator, lag, association)
-    files = sensor_files(detections)
-    apart(output, *files.values())
-    dataset = NuScenes(dataroot, version, files, chosen)
-    kept = journal(explain, output, at_scale(workers, ray))
-    if at_scale(workers, ray):
-        task = TrackTask(settings, method, "nuscenes", dataset.meta)
-        inputs = (HeldScene(dataset.scene(name)) for name in chosen)
+    locations = sensor_locations(detections)
+    apart(output, *(Path(location) for location in locations.values() if not is_url(location)))
+    with local_nuscenes(dataroot, version, locations) as (root, files):
+        chosen = chosen_scenes(root, version, split, scenes)
+        dataset = NuScenes(root, version, files, chosen)
+        kept = journal(explain, output, at_scale(workers, ray))
+        if at_scale(workers, ray):
+            task = TrackTask(settings, method, "nuscenes", dataset.meta)
+            inputs = (HeldScene(dataset.scene(name)) for name in chosen)
 
-        def merge() -> None:
-            merge_tracking_results(merged, (output / task.result(name) for name in chosen), dataset.meta)
+            def merge() -> None:
+                merge_tracking_results(merged, (output / task.result(name) for name in chosen), dataset.meta)
 
-        merged = output / "tracks.json"
-        merged.unlink(missing_ok=True)
-        run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
-        return
-    summary = Summary(output)
-    with progress_bar(len(chosen)) as progress, trackers(settings, method, chosen, kept) as new_tracker:
-        runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
-        write_tracking_results(output, ((run.scene, run.tracks) for run in runs), dataset.meta)
-    summary.write_record(method, settings)
-    summary.show()
+            merged = output / "tracks.json"
+            merged.unlink(missing_ok=True)
+            run_at_scale(inputs, len(chosen), task, output, workers, ray, merge)
+            return
+        summary = Summary(output)
+        with progress_bar(len(chosen)) as progress, trackers(settings, method, chosen, kept) as new_tracker:
+            runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
+            write_tracking_results(output, ((run.scene, run.tracks) for run in runs), dataset.meta)
+        summary.write_record(method, settings)
+        summary.show()
 
 
 @track_app.command()
 def kitti(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/.")],
+    dataroot: Annotated[
+        str, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/; or its URL.")
+    ],
     detections: Annotated[
-        Path, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/ and in each NNNN.txt.")
+        str, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write NNNN.txt to.")],
     sequences: Annotated[
@@ -125,25 +129,29 @@ def kitti(
       saga-fg track kitti --dataroot data/kitti --detections data/kitti/detections/pointrcnn \\
           --sequences 0000,0011 --output results
     """
-    from data_tools.kitti import KittiTracking, write_kitti_results
+    from data_tools.kitti import local_kitti, write_kitti_results
     from pipelines.explaining import trackers
     from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
 
     settings = configured("kitti", config, method, estimator, lag, association)
-    dataset = KittiTracking(dataroot, detections, names("--sequences", sequences) if sequences is not None else None)
-    kept = journal(explain, output, at_scale(workers, ray))
-    if at_scale(workers, ray):
-        sequence_inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
-        task = TrackTask(settings, method, "kitti")
-        run_at_scale(sequence_inputs, len(dataset.scenes), task, output, workers, ray)
-        return
-    summary = Summary(output)
-    with progress_bar(len(dataset.scenes)) as progress, trackers(settings, method, dataset.scenes, kept) as new_tracker:
-        runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
-        write_kitti_results(output, dataset, ((run.scene, run.tracks) for run in runs))
-    summary.write_record(method, settings)
-    summary.show()
+    chosen = names("--sequences", sequences) if sequences is not None else None
+    with local_kitti(dataroot, detections, chosen) as dataset:
+        kept = journal(explain, output, at_scale(workers, ray))
+        if at_scale(workers, ray):
+            sequence_inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
+            task = TrackTask(settings, method, "kitti")
+            run_at_scale(sequence_inputs, len(dataset.scenes), task, output, workers, ray)
+            return
+        summary = Summary(output)
+        with (
+            progress_bar(len(dataset.scenes)) as progress,
+            trackers(settings, method, dataset.scenes, kept) as new_tracker,
+        ):
+            runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
+            write_kitti_results(output, dataset, ((run.scene, run.tracks) for run in runs))
+        summary.write_record(method, settings)
+        summary.show()
 
 
 @track_app.command()

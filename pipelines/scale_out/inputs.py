@@ -66,20 +66,22 @@ class SimulatedInput:
 
 @dataclass(frozen=True)
 class KittiInput:
-    """A sequence of KITTI tracking, read at the worker; folders as `KittiTracking` takes them."""
+    """A sequence of KITTI tracking, read at the worker; folders as `KittiTracking` takes them, or their URLs."""
 
-    dataroot: Path
-    detections: Path
+    dataroot: str
+    detections: str
     name: str
 
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
         """With the digests of its text files."""
-        from data_tools.kitti import KittiTracking
+        from data_tools.kitti import local_kitti
 
-        dataset = KittiTracking(self.dataroot, self.detections, [self.name])
-        files = dataset.files(self.name)
-        yield OpenedInput({f"{path.parent.name}/{path.name}": _file_digest(path) for path in files}, lambda: dataset)
+        with local_kitti(self.dataroot, self.detections, [self.name]) as dataset:
+            files = dataset.files(self.name)
+            yield OpenedInput(
+                {f"{path.parent.name}/{path.name}": _file_digest(path) for path in files}, lambda: dataset
+            )
 
 
 @dataclass(frozen=True)
