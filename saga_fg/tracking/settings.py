@@ -39,6 +39,7 @@ class ClassSettings:
     duplicate_distance: float = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
     shadow_distance: float = setting(0.0, "a detection this close to a much stronger one of the class is its shadow, m")
     shadow_ratio: float = setting(0.5, "much stronger: the weaker has less than this share of its probability")
+    merge_distance: float = setting(0.0, "a track that is not seen ends this close to one of the class that is, m")
     overlap_weight: float = setting(
         0.0, "what a whole unit of 3D GIoU counts in matching, as a squared distance in sigmas"
     )
@@ -51,6 +52,7 @@ class ClassSettings:
         require_positive(self, "birth_speed", "birth_drift")
         require_between(self, 0, 1, "min_score", "birth_score", "shadow_ratio", "gate")
         require_between(self, 0, math.inf, "duplicate_distance", "shadow_distance", "overlap_weight", "yaw_drift")
+        require_between(self, 0, math.inf, "merge_distance")
         require_positive(self, "max_distance", "max_coasting", infinite=True)
         if self.gate == 1:
             raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
@@ -98,11 +100,14 @@ class ExistenceSettings:
     newness: float = setting(0.0, "looks in vain a new track starts with in the share of looks that saw it")
     steadiness_weight: float = setting(0.0, "power of that share that a track's score is multiplied by, 0 for none")
     coasting_score: float = setting(1.0, "what a track's score is worth without a detection, besides its existence")
+    occlusion: float = setting(
+        0.0, "share of the chance of a detection that a track wholly hidden behind another loses; 0: hidden is as seen"
+    )
     give_up: float = setting(0.02, "unconfirmed tracks below this existence probability are removed")
 
     def __post_init__(self) -> None:
         require_positive(self, "lifetime", infinite=True)
-        require_between(self, 0, 1, "clutter_score", "report", "confirm", "give_up", "coasting_score")
+        require_between(self, 0, 1, "clutter_score", "report", "confirm", "give_up", "coasting_score", "occlusion")
         require_between(self, 0, math.inf, "newness", "steadiness_weight")
         if self.clutter_score in (0, 1):
             raise InputError(f"clutter_score: expected a probability inside 0 to 1, got {self.clutter_score!r}")

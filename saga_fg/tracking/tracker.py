@@ -32,8 +32,10 @@ from saga_fg.tracking.columns import TrackColumns
 from saga_fg.tracking.existence import after_hit, after_miss, reported_score
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.matching import associate
+from saga_fg.tracking.merging import duplicates
 from saga_fg.tracking.observation import Observed, observe
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
+from saga_fg.tracking.occlusion import HIDDEN, covered
 from saga_fg.tracking.roadside import Roadside, motion_of
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
@@ -277,6 +279,11 @@ class Tracker:
         missed = np.ones(len(columns.id), dtype=bool)
         missed[matching.track] = False
         p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
+        if self.settings.existence.occlusion > 0 and observed.viewpoint is not None and missed.any():
+            now = self._kinematics()
+            boxes = self._boxes(np.arange(len(columns.id)), now.position, now.velocity)
+            hidden = self.settings.existence.occlusion * covered(boxes, observed.viewpoint, ~missed)
+            p_detect, visible = p_detect * (1 - hidden), visible & (hidden < HIDDEN)
         p, settings = observed.probability[matching.detection], self.settings.existence
         # what another sensor has just seen exists, whatever this one misses
         excused = self._evidence.seen_by_others(frame.sensor, self._time - delay, self.settings.score_memory)
@@ -361,6 +368,9 @@ class Tracker:
         dead = coasting > self._of_class("max_coasting", columns.label)
         dead |= self._time - columns.last_in_view > self.settings.max_out_of_view
         dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
+        merging = self._of_class("merge_distance", columns.label)
+        if (merging > 0).any():
+            dead |= duplicates(self._kinematics().position, columns.label, coasting <= 0, merging)
         if dead.any():
             self._state.remove(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
