@@ -9,6 +9,7 @@ from factors.absolute import attitude_factor, position_factor
 from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
 from factors.calibrated_range import calibrated_range_factors
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
+from factors.edge import edge_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
     check_dimensions,
@@ -24,7 +25,7 @@ from factors.marginal import marginal_factors, marginal_moments
 from factors.measurement import Components, MeasurementModel, box, position, position_velocity
 from factors.nonlinear import Linearisable, ResidualFactor
 from factors.nonlinear_interaction import NonlinearInteraction
-from factors.odometry import odometry_factors
+from factors.odometry import ERROR_DIM, odometry_factors
 from factors.on_plane import on_plane_factor
 from factors.plane import OrientedPlane, plane, plane_factor
 from factors.point import point_factors
@@ -38,6 +39,7 @@ from factors.stacked import ResidualFactors
 from factors.variables import PlanarPose, SpatialPose, Variable, Vector
 
 __all__ = [
+    "ERROR_DIM",
     "Components",
     "FactorError",
     "Linearisable",
@@ -66,6 +68,7 @@ __all__ = [
     "check_dimensions",
     "detection_factor",
     "detection_factors",
+    "edge_factors",
     "gaussian_factor",
     "gaussian_factors",
     "gaussian_graph",

@@ -1,15 +1,17 @@
 """Odometry between consecutive poses in space, with the slow errors of the device as states of their own.
 
 A device that counts wheels or matches scans reports the increment (R_m, d) over dt seconds. Its length is wrong by a
-scale s and its heading turns with a bias b, both of which wander slowly:
+scale s, its heading turns with a bias b, and its course is off by an angle c: the device is not mounted quite straight
+beside the sensors whose axes the poses have, or the vehicle slips. All three wander slowly:
 
-    R_m = Exp(b dt e_z) R_a^T R_b Exp(noise)      d = (1 + s) R_a^T (t_b - t_a) + noise      (s, b)' = (s, b) + noise
+    R_m = Exp(b dt e_z) R_a^T R_b Exp(noise)
+    d   = (1 + s) Exp(c e_z) R_a^T (t_b - t_a) + noise          (s, b, c)' = (s, b, c) + noise
 
-Residuals, in the frame of the first pose (8 rows):
+Residuals, in the frame of the first pose (9 rows):
 
     r_rotation    = Log( R_m^T Exp(b dt e_z) R_a^T R_b )
-    r_translation = (1 + s) R_a^T (t_b - t_a) - d
-    r_error       = (s, b)' - (s, b)
+    r_translation = (1 + s) Exp(c e_z) R_a^T (t_b - t_a) - d
+    r_error       = (s, b, c)' - (s, b, c)
 
 The scale stands at the true motion, not at the measured one: there it would scale the noise of d as well, and be drawn
 to where that is small.
@@ -34,7 +36,7 @@ from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
 from factors.variables import SpatialPose
 
-ERROR_DIM = 2  # scale, yaw-rate bias in rad/s
+ERROR_DIM = 3  # scale, yaw-rate bias in rad/s, course in rad
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -43,9 +45,9 @@ def odometry_factors(
 ) -> ResidualFactors:
     """Return n factors of odometry with slow errors.
 
-    rows: (n, 4) keys of the pose before, the pose after (`gtsam.Pose3`), the errors before and after (vectors of 2:
-    scale, yaw-rate bias in rad/s); a_T_b: (n, 4, 4) measured increments; dt: (n,) s; covariances: (n, 8, 8), or one for
-    all, of rotation (rad), translation (m) and the errors' change. Raises `FactorError`.
+    rows: (n, 4) keys of the pose before, the pose after (`gtsam.Pose3`), the errors before and after (vectors of 3:
+    scale, yaw-rate bias in rad/s, course in rad); a_T_b: (n, 4, 4) measured increments; dt: (n,) s; covariances:
+    (n, 9, 9), or one for all, of rotation (rad), translation (m) and the errors' change. Raises `FactorError`.
     """
     measured = checked("a_T_b", a_T_b, (None, 4, 4))
     seconds = checked("dt", dt, (len(measured),))
@@ -56,7 +58,7 @@ def odometry_factors(
         rows=np.asarray(rows),
         dims=(SpatialPose(), SpatialPose(), ERROR_DIM, ERROR_DIM),
         residual=function.residual,
-        covariances=checked_covariances("covariances", covariances, len(measured), 8),
+        covariances=checked_covariances("covariances", covariances, len(measured), 6 + ERROR_DIM),
         jacobians=function.jacobians,
         robust=robust,
         name="odometry",
@@ -72,30 +74,43 @@ class _Odometry:
     dt: FloatArray
 
     def residual(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-        translation = (1 + before[:, :1]) * self._moved(a, b) - self.d
+        translation = self._reported(a, b, before) - self.d
         return np.concatenate([rotation_log(self._turned(a, b, before)), translation, after - before], axis=1)
 
     def jacobians(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> Sequence[FloatArray]:
         n = len(self.d)
         Ra, Rb = a[:, :3, :3], b[:, :3, :3]
         E = self._turned(a, b, before)
-        inverse, moved, scale = inverse_right_jacobian(rotation_log(E)), self._moved(a, b), 1 + before[:, 0, None, None]
-        J_a, J_b, J_before, J_after = (np.zeros((n, 8, d)) for d in (6, 6, 2, 2))
+        inverse, moved = inverse_right_jacobian(rotation_log(E)), self._moved(a, b)
+        course = (1 + before[:, 0, None, None]) * _about_up(before[:, 2])
+        J_a, J_b, J_before, J_after = (np.zeros((n, 6 + ERROR_DIM, d)) for d in (6, 6, ERROR_DIM, ERROR_DIM))
         J_a[:, :3, :3] = -inverse @ Rb.swapaxes(1, 2) @ Ra
         J_b[:, :3, :3] = inverse
         axis = E.swapaxes(1, 2) @ self.R.swapaxes(1, 2) @ _UP
         J_before[:, :3, 1] = self.dt[:, None] * (inverse @ axis[:, :, None])[:, :, 0]
-        J_a[:, 3:6, :3] = scale * cross_matrix(moved)
-        J_a[:, 3:6, 3:] = -scale * np.eye(3)
-        J_b[:, 3:6, 3:] = scale * (Ra.swapaxes(1, 2) @ Rb)
-        J_before[:, 3:6, 0] = moved
-        J_before[:, 6:] = -np.eye(2)
-        J_after[:, 6:] = np.eye(2)
+        J_a[:, 3:6, :3] = course @ cross_matrix(moved)
+        J_a[:, 3:6, 3:] = -course
+        J_b[:, 3:6, 3:] = course @ Ra.swapaxes(1, 2) @ Rb
+        reported = self._reported(a, b, before)
+        J_before[:, 3:6, 0] = reported / (1 + before[:, :1])
+        J_before[:, 3:6, 2] = np.cross(_UP, reported)
+        J_before[:, 6:] = -np.eye(ERROR_DIM)
+        J_after[:, 6:] = np.eye(ERROR_DIM)
         return [J_a, J_b, J_before, J_after]
 
     def _turned(self, a: FloatArray, b: FloatArray, before: FloatArray) -> FloatArray:
-        turned = rotation_exp((before[:, 1] * self.dt)[:, None] * _UP)
+        turned = _about_up(before[:, 1] * self.dt)
         return np.asarray(self.R.swapaxes(1, 2) @ turned @ a[:, :3, :3].swapaxes(1, 2) @ b[:, :3, :3])
+
+    def _reported(self, a: FloatArray, b: FloatArray, before: FloatArray) -> FloatArray:
+        """(n, 3) the translation as a device with these errors reports it."""
+        turned = _about_up(before[:, 2]) @ self._moved(a, b)[:, :, None]
+        return np.asarray((1 + before[:, :1]) * turned[:, :, 0])
 
     def _moved(self, a: FloatArray, b: FloatArray) -> FloatArray:
         return np.asarray((a[:, :3, :3].swapaxes(1, 2) @ (b[:, :3, 3] - a[:, :3, 3])[:, :, None])[:, :, 0])
+
+
+def _about_up(angle: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) about the vertical."""
+    return rotation_exp(angle[:, None] * _UP)

@@ -7,6 +7,7 @@ Open3D is imported when a PCD or PLY file is read.
 from data_tools.lidar.clusters import ClusterSettings, ObjectSize, detect_clusters
 from data_tools.lidar.curbs import CurbSettings, extract_curbs
 from data_tools.lidar.deskew import azimuth_times, constant_velocity, deskewed
+from data_tools.lidar.edges import Edge, EdgeSettings, straight_edges
 from data_tools.lidar.ground import Ground, GroundSettings, segment_ground
 from data_tools.lidar.planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
 from data_tools.lidar.ply import write_ply
@@ -21,6 +22,8 @@ from data_tools.lidar.voxels import voxel_downsample, voxel_keys
 __all__ = [
     "ClusterSettings",
     "CurbSettings",
+    "Edge",
+    "EdgeSettings",
     "Ground",
     "GroundSettings",
     "ObjectSize",
@@ -47,6 +50,7 @@ __all__ = [
     "register",
     "scan_to_map_residual",
     "segment_ground",
+    "straight_edges",
     "surfels_of",
     "voxel_downsample",
     "voxel_keys",

@@ -14,6 +14,7 @@ class SimulatedScans:
     """Scans of a drive along the street of a seed: `pipelines.scan_sequence.ScanSequence` with the true poses.
 
     world_T_lidar  (K, 4, 4), K >= 2, true poses; None for a drive of `count` scans
+    kerbs          whether the street has them
     """
 
     def __init__(
@@ -22,11 +23,12 @@ class SimulatedScans:
         count: int = 60,
         world_T_lidar: FloatArray | None = None,
         settings: ScannerSettings = SMALL,
+        kerbs: bool = False,
     ) -> None:
         self.world_T_ego: FloatArray = drive(count, period=settings.period) if world_T_lidar is None else world_T_lidar
         self.timestamps: FloatArray = settings.period * np.arange(len(self.world_T_ego), dtype=np.float64)
         self.ego_T_lidar: FloatArray = np.eye(4)
-        self.world = street(seed)
+        self.world = street(seed, kerbs)
         self._scans = scans(self.world, self.world_T_ego, seed, settings)
 
     def __len__(self) -> int:

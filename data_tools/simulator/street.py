@@ -11,11 +11,15 @@ from saga_fg.boxes import Boxes
 from saga_fg.geometry import inverse_transform, yaw_transform
 
 SENSOR_HEIGHT = 1.8  # m above the ground
+KERB = 6.4  # m, from the middle of the road to its edge
 SMALL = ScannerSettings(rings=24, columns=360)
 
 
-def street(seed: int = 0) -> StandingWorld:
-    """Houses of different depth along a street on the x axis, 16 m wide, and across its end."""
+def street(seed: int = 0, kerbs: bool = False) -> StandingWorld:
+    """Houses of different depth along a street on the x axis, 16 m wide, and across its end.
+
+    kerbs: whether the road ends, on both sides, in pavements that are higher, `KERB` m from its middle
+    """
     rng = np.random.default_rng(seed)
     label, position, size = [], [], []
     for side in (-1.0, 1.0):
@@ -33,6 +37,10 @@ def street(seed: int = 0) -> StandingWorld:
     label.append("house")
     position.append((120.0, 0.0, 3.0))
     size.append((6.0, 60.0, 6.0))
+    for side in (-1.0, 1.0) if kerbs else ():
+        label.append("pavement")
+        position.append((25.0, side * (KERB + 0.75), 0.075))
+        size.append((170.0, 1.5, 0.15))
     poles = np.array([[x, side * 7.0, 0.15, 5.0] for side in (-1, 1) for x in np.arange(-30.0, 80.0, 17.0) + 4 * side])
     n = len(label)
     return StandingWorld(Boxes.of(label, position, size, np.zeros(n), np.zeros((n, 2))), poles)

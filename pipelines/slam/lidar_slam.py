@@ -40,7 +40,14 @@ OdometrySource = Literal["lidar", "oxts"]
 _START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
 CALIBRATED = OdometryNoise(
-    turn_noise=1e-3, distance_noise=0.01, scale=1e-3, scale_drift=1e-4, bias=1e-4, bias_drift=1e-5
+    turn_noise=1e-3,
+    distance_noise=0.01,
+    scale=1e-3,
+    scale_drift=1e-4,
+    bias=1e-4,
+    bias_drift=1e-5,
+    course=1e-4,
+    course_drift=1e-5,
 )
 
 

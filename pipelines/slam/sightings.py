@@ -1,4 +1,4 @@
-"""What a scan shows of landmarks: walls and the ground as planes, masts and trunks as poles, as observations."""
+"""What a scan shows of landmarks: walls and the ground as planes, masts and trunks as poles, curbs as lane edges."""
 
 from __future__ import annotations
 
@@ -7,21 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.lidar import (
+    CurbSettings,
+    EdgeSettings,
     GroundSettings,
     PlaneSettings,
     PoleSettings,
+    extract_curbs,
     extract_poles,
     extract_walls,
     fit_ground,
     segment_ground,
+    straight_edges,
 )
 from saga_fg.arrays import FloatArray
-from saga_fg.landmarks import Observation, PlaneLandmark, PoleLandmark
+from saga_fg.landmarks import LaneEdgeLandmark, Observation, PlaneLandmark, PoleLandmark
 from saga_fg.settings import setting, settings_group
 
 GROUND = PlaneLandmark(name="ground")
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
+EDGE = LaneEdgeLandmark()
 
 
 @dataclass(frozen=True)
@@ -31,9 +36,12 @@ class SightingSettings:
     ground: bool = setting(False, "the ground as one plane: for level places only")
     walls: int = setting(6, "walls of a scan at most, the largest ones")
     poles: int = setting(12, "poles of a scan at most, the nearest ones")
+    edges: int = setting(2, "straight pieces of the road's edge at most, those with the most points")
     segmentation: GroundSettings = settings_group(GroundSettings, "of the ground")
     plane: PlaneSettings = settings_group(PlaneSettings, "of walls and ground")
     pole: PoleSettings = settings_group(PoleSettings, "of poles")
+    curb: CurbSettings = settings_group(CurbSettings, "of points on the road's edge")
+    edge: EdgeSettings = settings_group(EdgeSettings, "of straight pieces of it")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,4 +68,7 @@ def landmarks_seen(points: FloatArray, settings: SightingSettings | None = None)
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
         found.append(Seen(Observation(POLE, pole.foot, pole.covariance), extent))
+    curbs = extract_curbs(points, ground.height, s.curb) if s.edges else np.empty((0, 3))
+    for edge in straight_edges(curbs, s.edges, s.edge):
+        found.append(Seen(Observation(EDGE, edge.ends.ravel(), edge.covariance), edge.ends))
     return found

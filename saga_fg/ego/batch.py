@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import gtsam
 import numpy as np
 
-from factors import SolverSettings, solve
+from factors import ERROR_DIM, SolverSettings, solve
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.estimate import JointEstimate, read_estimate
 from saga_fg.ego.graph import Keyed, error_key, linear_graph, nonlinear_factors, object_key, pose_key, start_graph
@@ -53,7 +53,7 @@ def estimate_jointly(
     if not isinstance(landmarks, LandmarkPart) and len(landmarks) != len(frames):
         raise InputError(f"landmarks: expected what is observed at {len(frames)} moments, got {len(landmarks)}")
     path = odometry.path(start)
-    slow = SlowErrors(settings.odometry.scale, settings.odometry.bias)
+    slow = SlowErrors.at_start(settings)
     estimate = None
     for _ in range(settings.rounds):
         moments = register(frames, path, odometry, new_tracker(), settings.motion_noise)
@@ -107,7 +107,7 @@ def start_values(record: Keyed, path: FloatArray) -> gtsam.Values:
     place: dict[int, FloatArray] = {}
     for (k, moment), pose in zip(record, path, strict=True):
         values.insert(pose_key(k), gtsam.Pose3(pose))
-        values.insert(error_key(k), np.zeros(2))
+        values.insert(error_key(k), np.zeros(ERROR_DIM))
         place.update(zip(moment.seen.id.tolist(), transform_points(pose, moment.seen.z)[:, :2], strict=True))
         for name, node_type in zip(moment.objects.id.tolist(), moment.objects.types, strict=True):
             state = np.zeros(node_type.dim)

@@ -32,7 +32,7 @@ class JointEstimate:
 
     timestamps    (n,) s
     world_T_ego   (n, 4, 4)
-    errors        (n, 2) of the odometry: scale, bias of the yaw rate (rad/s)
+    errors        (n, 3) of the odometry: scale, bias of the yaw rate (rad/s), course (rad)
     objects       n tables
     converged     whether the last step was short enough
     solution      of the graph, with the keys of `saga_fg.ego.graph`
@@ -65,8 +65,7 @@ class JointEstimate:
         """How well the odometry's slow errors are known: at the first, the middle and the last moment, on average."""
         n = len(self._record)
         P = np.stack([self._covariance(error_key(self._record[row][0])) for row in (0, n // 2, n - 1)])
-        scale, bias = np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0))
-        return SlowErrors(float(scale), float(bias))
+        return SlowErrors(*np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)).tolist())
 
     def _covariance(self, key: int) -> FloatArray:
         try:

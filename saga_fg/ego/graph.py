@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 
 from factors import (
+    ERROR_DIM,
     Linearisable,
     ResidualFactors,
     Robust,
@@ -52,7 +53,7 @@ def pose_key(moment: int) -> int:
 
 
 def error_key(moment: int) -> int:
-    """Key of the odometry's slow errors (scale, bias of the yaw rate) at a moment."""
+    """Key of the odometry's slow errors (scale, bias of the yaw rate, course) at a moment."""
     return int(gtsam.symbol("e", moment))
 
 
@@ -64,9 +65,8 @@ def object_key(moment: int, name: int) -> int:
 def start_graph(moment: int, world_T_ego: FloatArray, settings: JointSettings) -> gtsam.NonlinearFactorGraph:
     """What is known of the vehicle at the first moment: its pose, which says where the world lies, and its errors."""
     noise = settings.odometry
-    graph = nonlinear_graph(
-        [prior_factor(error_key(moment), np.zeros(2), np.diag([noise.scale**2, noise.bias**2]))], {error_key(moment): 2}
-    )
+    slow = prior_factor(error_key(moment), np.zeros(ERROR_DIM), np.diag([noise.scale, noise.bias, noise.course]) ** 2)
+    graph = nonlinear_graph([slow], {error_key(moment): ERROR_DIM})
     sigma = gtsam.noiseModel.Isotropic.Sigma(6, settings.start_noise)
     graph.add(gtsam.PriorFactorPose3(pose_key(moment), gtsam.Pose3(world_T_ego), sigma))
     return graph

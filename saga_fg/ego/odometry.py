@@ -5,8 +5,8 @@ Per interval of dt s and d m, an increment a_T_b has independent noise
     heading      turn_noise^2 dt                     roll, pitch   tilt_noise^2 dt
     translation  distance_noise^2 d + time_noise^2 dt,  every direction
 
-and two slow errors, a scale of the distance and a bias of the yaw rate, which start as N(0, scale^2), N(0, bias^2) and
-wander as random walks (see `factors.odometry`).
+and three slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, which start as
+N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.odometry`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factors import ERROR_DIM
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances
 from saga_fg.errors import InputError
 from saga_fg.geometry import checked_transform, inverse_transform
@@ -35,21 +36,24 @@ class OdometryNoise:
     scale_drift: float = setting(0.002, "change of the scale after one second")
     bias: float = setting(0.005, "bias of the yaw rate at the start, rad/s")
     bias_drift: float = setting(0.0005, "change of the bias after one second, rad/s")
+    course: float = setting(0.01, "direction of travel against the axes in which objects are seen, at the start, rad")
+    course_drift: float = setting(0.0003, "change of that after one second, rad")
 
     def __post_init__(self) -> None:
         require_positive(self, "turn_noise", "tilt_noise", "distance_noise", "time_noise")
-        require_positive(self, "scale", "scale_drift", "bias", "bias_drift")
+        require_positive(self, "scale", "scale_drift", "bias", "bias_drift", "course", "course_drift")
 
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
-        """(n, 8, 8) of increments over `distance` (n,) m and `dt` (n,) s > 0.
+        """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
 
-        Rows: rotation (rad), translation in the frame of the earlier pose (m), change of scale, change of bias (rad/s).
+        Rows: rotation (rad), translation in the frame of the earlier pose (m), change of scale, of bias (rad/s), of
+        course (rad).
         """
         tilt, turn = self.tilt_noise**2 * dt, self.turn_noise**2 * dt
         shift = self.distance_noise**2 * distance + self.time_noise**2 * dt
-        slow = (self.scale_drift**2 * dt, self.bias_drift**2 * dt)
+        slow = (self.scale_drift**2 * dt, self.bias_drift**2 * dt, self.course_drift**2 * dt)
         variances = np.stack([tilt, tilt, turn, shift, shift, shift, *slow], axis=1)
-        return np.asarray(variances[:, :, None] * np.eye(8))
+        return np.asarray(variances[:, :, None] * np.eye(6 + ERROR_DIM))
 
 
 @dataclass(frozen=True, eq=False)

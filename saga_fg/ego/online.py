@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors import SolverSettings, marginal_factors, marginal_moments, nonlinear_graph_at, solve
+from factors import ERROR_DIM, SolverSettings, marginal_factors, marginal_moments, nonlinear_graph_at, solve
 from factors.solver import Solution
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.batch import TOLERANCE
@@ -99,7 +99,7 @@ class OnlineEstimator:
         self._kinds: dict[int, LandmarkType] = {}
         self._count: dict[int, int] = {}
         self._gone: dict[int, Landmark] = {}
-        self._slow = SlowErrors(self._settings.odometry.scale, self._settings.odometry.bias)
+        self._slow = SlowErrors.at_start(self._settings)
         self._solution: Solution | None = None
 
     def step(
@@ -147,9 +147,9 @@ class OnlineEstimator:
         if not self._record:
             return self._start
         k, last = self._record[-1]
-        scale, bias = self._values.atVector(error_key(k))
+        scale, bias, course = self._values.atVector(error_key(k))
         step = yaw_transform(yaw=-bias * (time - last.time)) @ a_T_b
-        step[:3, 3] = a_T_b[:3, 3] / (1 + scale)
+        step[:3, 3] = yaw_transform(yaw=-course)[:3, :3] @ a_T_b[:3, 3] / (1 + scale)
         return np.asarray(self._values.atPose3(pose_key(k)).matrix() @ step)
 
     def _add(self, k: int, moment: EgoMoment, pose: FloatArray) -> None:
@@ -157,7 +157,7 @@ class OnlineEstimator:
         values = self._values = gtsam.Values(self._values)
         values.insert(pose_key(k), gtsam.Pose3(pose))
         j, time = (self._record[-1][0], self._record[-1][1].time) if self._record else (k, moment.time)
-        values.insert(error_key(k), values.atVector(error_key(j)) if self._record else np.zeros(2))
+        values.insert(error_key(k), values.atVector(error_key(j)) if self._record else np.zeros(ERROR_DIM))
         seen = dict(zip(moment.seen.id.tolist(), transform_points(pose, moment.seen.z)[:, :2], strict=True))
         for name, node_type in zip(moment.objects.id.tolist(), moment.objects.types, strict=True):
             if values.exists(object_key(j, name)):

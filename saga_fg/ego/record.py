@@ -158,7 +158,7 @@ def register(
 
 
 def motion_covariances(record: Sequence[EgoMoment], settings: JointSettings) -> FloatArray:
-    """(n - 1, 8, 8) of the increments to n moments, each from the one before, as in `OdometryNoise.covariances`.
+    """(n - 1, 9, 9) of the increments to n moments, each from the one before, as in `OdometryNoise.covariances`.
 
     Where the device states covariances, rotation and translation are by these.
     """

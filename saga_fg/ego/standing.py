@@ -4,11 +4,11 @@ Around each detection of an object, within a window, D is the mean place of the 
 of the earlier half, in the world along the path assumed so far, and T the time between the two. An object that stands
 has D ~ N(0, S): noise of the detections and of the odometry over the T seconds and s metres in between,
 
-    S = R (1/n_1 + 1/n_2) + shift + (scale s)^2 + range^2 (turn + (bias T)^2)
+    S = R (1/n_1 + 1/n_2) + shift + (scale^2 + course^2) s^2 + range^2 (turn + (bias T)^2)
 
-where shift and turn are the variances that the increments in between add up to in translation and in heading; scale and
-bias their deviations as known so far. One that moves has D ~ N(0, S + (moving_speed T)^2). By Bayes, with even odds
-before,
+where shift and turn are the variances that the increments in between add up to in translation and in heading; scale,
+bias and course the odometry's deviations as known so far. One that moves has D ~ N(0, S + (moving_speed T)^2). By
+Bayes, with even odds before,
 
     P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (moving_speed T)^2))
 
@@ -30,10 +30,16 @@ from saga_fg.geometry import transform_points
 
 @dataclass(frozen=True)
 class SlowErrors:
-    """Standard deviations of what is known of the odometry's scale and of its bias of the yaw rate (rad/s)."""
+    """Standard deviations of the odometry's scale, its bias of the yaw rate (rad/s) and its course (rad), as known."""
 
     scale: float
     bias: float
+    course: float
+
+    @classmethod
+    def at_start(cls, settings: JointSettings) -> SlowErrors:
+        """What is known beforehand."""
+        return cls(settings.odometry.scale, settings.odometry.bias, settings.odometry.course)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +110,12 @@ def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings) 
     between = half(columns, middle, high) - half(columns, low, middle)
     D, (T, s, shift, turn) = between[:, :2], between[:, 2:].T
     S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
-    S = S + shift + (slow.scale * s) ** 2 + half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
+    S = (
+        S
+        + shift
+        + (slow.scale**2 + slow.course**2) * s**2
+        + half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
+    )
     M = S + (settings.moving_speed * T) ** 2
     d2 = (D**2).sum(axis=1)
     odds = np.log(M / S) - d2 / 2 * (1 / S - 1 / M)  # log, two dimensions

@@ -1,6 +1,7 @@
 """Landmarks: their types, which observation is of which, and maps built from them."""
 
 from saga_fg.landmarks.association import associate, log_odds
+from saga_fg.landmarks.edge import LaneEdgeLandmark
 from saga_fg.landmarks.factors import sighting_factors
 from saga_fg.landmarks.joint_estimate import Innovation, JointEstimate
 from saga_fg.landmarks.mapper import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting
@@ -18,6 +19,7 @@ __all__ = [
     "LandmarkMap",
     "LandmarkMapper",
     "LandmarkType",
+    "LaneEdgeLandmark",
     "MapperSettings",
     "Observation",
     "PlaneLandmark",

@@ -45,9 +45,9 @@ def odometry(rng, covariance, robust=None):
     b = a @ steps
     b[:, :3, :3] = b[:, :3, :3] @ rotation_exp(rng.normal(0, 0.3, (N, 3)))
     b[:, :3, 3] += rng.normal(0, 0.5, (N, 3))
-    errors = rng.normal(0, 0.1, (2, N, 2))
+    errors = rng.normal(0, 0.1, (2, N, 3))
     values = values_of(keys.T.ravel(), [*a, *b, *errors[0], *errors[1]])
-    R = np.stack([covariance(rng, 8) for _ in range(N)])
+    R = np.stack([covariance(rng, 9) for _ in range(N)])
     return odometry_factors(keys, steps, rng.uniform(0.1, 2, N), R, robust), values, (a, b, *errors)
 
 
@@ -105,14 +105,14 @@ def test_odometry_without_errors_is_the_increment_between_two_poses():
     rng = np.random.default_rng(1)
     a, b = random_poses(rng, 2)
     step = np.linalg.inv(a) @ b
-    factors = odometry_factors([[0, 1, 2, 3]], step[None], [0.5], np.eye(8))
-    values = values_of([0, 1, 2, 3], [a, b, np.zeros(2), np.zeros(2)])
+    factors = odometry_factors([[0, 1, 2, 3]], step[None], [0.5], np.eye(9))
+    values = values_of([0, 1, 2, 3], [a, b, np.zeros(3), np.zeros(3)])
     assert factors.error(values) == pytest.approx(0.0, abs=1e-12)
-    values.update(2, np.array([0.1, 0.2]))  # what is reported is 10 % too long and turned by 0.1 rad too much
-    values.update(3, np.array([0.1, 0.2]))
+    values.update(2, np.array([0.1, 0.2, 0.3]))  # 10 % too long, turned 0.1 rad too far, 0.3 to the left
+    values.update(3, np.array([0.1, 0.2, 0.3]))
     true = step.copy()
     true[:3, :3] = rotation_exp(np.array([[0, 0, -0.1]]))[0] @ step[:3, :3]
-    true[:3, 3] /= 1.1
+    true[:3, 3] = rotation_exp(np.array([[0, 0, -0.3]]))[0] @ step[:3, 3] / 1.1
     values.update(1, gtsam.Pose3(a @ true))
     assert factors.error(values) == pytest.approx(0.0, abs=1e-12)
 
@@ -130,13 +130,13 @@ def test_noisy_increments_do_not_pull_at_the_scale():
         np.column_stack([np.arange(n), np.arange(1, n + 1), errors[:-1], errors[1:]]),
         steps,
         np.full(n, 0.1),
-        np.diag([1e-4] * 3 + [1e-2] * 3 + [1e-10] * 2),
+        np.diag([1e-4] * 3 + [1e-2] * 3 + [1e-10] * 3),
     )
-    graph = nonlinear_graph(prior_factors([n + 1], np.zeros((1, 2)), np.eye(2)), {n + 1: 2})
+    graph = nonlinear_graph(prior_factors([n + 1], np.zeros((1, 3)), np.diag([1.0, 1.0, 1e-8])), {n + 1: 3})
     known = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     for k in range(n + 1):
         graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(poses[k]), known))
-    start = values_of(range(2 * n + 2), [*poses, *np.zeros((n + 1, 2))])
+    start = values_of(range(2 * n + 2), [*poses, *np.zeros((n + 1, 3))])
     scale = solve(graph, [factors], start).values.atVector(n + 1)[0]
     assert scale == pytest.approx(0.05, abs=4 * 0.1 / (0.1 * np.sqrt(n)))
 
@@ -150,20 +150,20 @@ def test_pose_and_objects_are_recovered_together():
     reported = step.copy()
     reported[:, :3, 3] *= 1.2
     poses, errors, names = range(5), range(5, 10), np.arange(10, 13)
-    noise = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-8] * 2)
+    noise = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-8] * 3)
     odometry = odometry_factors(
         np.column_stack([poses[:-1], poses[1:], errors[:-1], errors[1:]]), reported, np.full(4, 0.5), noise
     )
     rows = np.array([[k, name] for k in poses for name in names])
     z = [truth[k].transformTo(np.append(objects[name - 10, :2], 1.0)) for k, name in rows]
     seen = relative_detection_factors(rows, z, 1e-4 * np.eye(2), 4)
-    linear = prior_factors([5], np.zeros((1, 2)), np.eye(2)) + prior_factors(names, np.zeros((3, 4)), 1e4 * np.eye(4))
-    graph = nonlinear_graph(linear, {5: 2, **dict.fromkeys(names.tolist(), 4)})
+    linear = prior_factors([5], np.zeros((1, 3)), np.eye(3)) + prior_factors(names, np.zeros((3, 4)), 1e4 * np.eye(4))
+    graph = nonlinear_graph(linear, {5: 3, **dict.fromkeys(names.tolist(), 4)})
     graph.add(gtsam.PriorFactorPose3(0, truth[0], gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
     start = gtsam.Values()
     for k in poses:
         start.insert(k, truth[0])
-        start.insert(5 + k, np.zeros(2))
+        start.insert(5 + k, np.zeros(3))
     for name in names.tolist():
         start.insert(name, objects[name - 10] + np.append(rng.normal(0, 1, 2), [0, 0]))
     solution = solve(graph, [odometry, seen], start)
@@ -177,7 +177,7 @@ def test_pose_and_objects_are_recovered_together():
 
 def test_what_does_not_fit_is_refused():
     with pytest.raises(FactorError, match=r"dt\[0\]: expected seconds >= 0"):
-        odometry_factors([[0, 1, 2, 3]], np.eye(4)[None], [-1.0], np.eye(8))
+        odometry_factors([[0, 1, 2, 3]], np.eye(4)[None], [-1.0], np.eye(9))
     with pytest.raises(FactorError, match="position: expected distinct components"):
         relative_detection_factors([[0, 1]], np.zeros((1, 3)), np.eye(2), 4, (0, 4))
     with pytest.raises(FactorError, match="jacobians: expected a function, since there are poses"):

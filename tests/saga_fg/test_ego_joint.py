@@ -82,7 +82,7 @@ def test_with_no_objects_the_odometry_remains():
 def test_what_stands_is_told_from_what_drives():
     frames, odometry, poses, cars = drive(parked=4, moving=2)
     record = register(frames, poses, odometry, new_tracker())
-    p = standing_probabilities(record, poses, SlowErrors(1e-3, 1e-4), JointSettings())
+    p = standing_probabilities(record, poses, SlowErrors(1e-3, 1e-4, 1e-3), JointSettings())
     middle = len(record) // 2
     seen = record[middle].seen
     for name, z in zip(seen.id, seen.z, strict=True):
@@ -95,7 +95,9 @@ def test_what_stands_is_told_from_what_drives():
 def test_nothing_is_said_of_an_object_seen_once():
     frames, odometry, poses, _ = drive(n=1)
     record = register(frames, poses, odometry, new_tracker())
-    assert all((p == 0).all() for p in standing_probabilities(record, poses, SlowErrors(0.01, 0.01), JointSettings()))
+    assert all(
+        (p == 0).all() for p in standing_probabilities(record, poses, SlowErrors(0.01, 0.01, 0.01), JointSettings())
+    )
 
 
 def test_frames_and_odometry_must_fit():
