@@ -3,11 +3,12 @@
 Each pair of points, far enough apart, is a candidate line; the one with the most points beside it, in an unbroken row,
 is fitted by least squares, its points are taken out, and the next is looked for (RANSAC of Fischler and Bolles, 1981,
 over all pairs instead of drawn ones: there are few points). With n points of deviation sigma across the line, at u_i
-along it, the line at u has the covariance
+along it, the two ends at u and u' have the covariance
 
-    cov(e(u), e(u')) = sigma^2 ( 1/n + (u - m)(u' - m) / sum (u_i - m)^2 ) + bias^2
+    cov(e(u), e(u')) = sigma^2 ( 1/n + (u - m)(u' - m) / sum (u_i - m)^2 ) + bias^2 [u = u']
 
-where the bias is what the points of a curb have in common: a step shows where the first point above it lies.
+where the bias, of each end, is what neighbouring points have in common: a step shows where the first point above it
+lies, and rings cross a curb at the same angle.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class EdgeSettings:
     length: float = setting(6.0, "least length, m")
     points: int = setting(8, "least points")
     noise: float = setting(0.1, "least deviation of a point across the line, m")
-    bias: float = setting(0.1, "deviation that all points of a piece have in common, m")
+    bias: float = setting(0.1, "deviation of either end that its points have in common, m")
 
     def __post_init__(self) -> None:
         require_positive(self, "width", "gap", "length", "points", "noise", "bias")

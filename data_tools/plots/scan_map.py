@@ -17,13 +17,13 @@ def scan_map_from_above(
     points: FloatArray,
     paths: Mapping[str, FloatArray],
     poles: FloatArray,
-    walls: FloatArray,
+    lines: Mapping[str, FloatArray],
     tracks: Sequence[FloatArray] = (),
 ) -> Any:
     """A matplotlib `Figure`; everything in world coordinates, m.
 
-    points  (N, 3); paths (K, 3), each under its name; poles (P, 2); walls (W, 2, 2) their two ends; tracks (n, 2) of
-    objects
+    points  (N, 3); paths (K, 3), each under its name; poles (P, 2); lines (W, 2, 2) of walls and edges,
+    their two ends, under the name of their kind; tracks (n, 2) of objects
     """
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -35,7 +35,9 @@ def scan_map_from_above(
     x, y, z = chosen.T
     dots = ax.scatter(x, y, c=z, s=0.3, cmap="viridis", vmin=low, vmax=high, linewidths=0)
     figure.colorbar(dots, ax=ax, label="height, m", shrink=0.7)
-    ax.add_collection(LineCollection(list(walls), colors="#d62728", linewidths=1.5, label="walls"))
+    for (name, ends), colour in zip(lines.items(), ("#d62728", "#9467bd"), strict=False):
+        if len(ends):
+            ax.add_collection(LineCollection(list(ends), colors=colour, linewidths=1.5, label=name))
     if len(poles):
         ax.plot(
             *poles.T, "o", color="#ff7f0e", markersize=4, markeredgecolor="black", markeredgewidth=0.4, label="poles"

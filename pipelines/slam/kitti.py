@@ -32,13 +32,14 @@ from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_p
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.object_tracks import tracks, tracks_csv
-from pipelines.slam.sightings import POLE
+from pipelines.slam.sightings import EDGE, POLE, WALL
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.arrays import FloatArray
 from saga_fg.geometry import transform_points
 from saga_fg.landmarks import Landmark
 
 POLE_HEIGHT = 3.0  # m above the first pose, to which poles are drawn
+_EDGE_COLOUR = (148, 103, 189)
 _COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
 
 
@@ -82,7 +83,7 @@ def write_lidar_slam(
         if objects is not None:
             write_text(folder / "tracks.csv", tracks_csv(objects))
         driven = () if objects is None else tuple(tracks(objects).values())
-        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _wall_ends(result), driven)
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _lines(result), driven)
         write_bytes(folder / "above.png", png(figure))
         write_text(folder / "metrics.json", json.dumps(figures, indent=1) + "\n")
     return figures
@@ -124,7 +125,11 @@ def _write_landmarks(folder: Path, result: LidarSlam) -> None:
         z = np.arange(start - 1.5, start + POLE_HEIGHT, 0.1)
         drawn.append(np.column_stack([np.broadcast_to(pole, (len(z), 2)), z]))
         colours.append(np.full((len(z), 3), _COLOURS[True], dtype=np.uint8))
-    for a, b in _wall_ends(result):
+    for a, b in _pieces(result, EDGE.name):
+        share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(b - a) / 0.2)))
+        drawn.append(np.column_stack([a + share[:, None] * (b - a), np.full(len(share), start - 1.7)]))
+        colours.append(np.full((len(share), 3), _EDGE_COLOUR, dtype=np.uint8))
+    for a, b in _pieces(result, WALL.name):
         share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(b - a) / 0.2)))
         z = np.arange(start - 1.0, start + POLE_HEIGHT, 0.4)
         foot = np.repeat(a + share[:, None] * (b - a), len(z), axis=0)
@@ -133,19 +138,25 @@ def _write_landmarks(folder: Path, result: LidarSlam) -> None:
     write_ply(folder / "landmarks.ply", np.concatenate(drawn), np.concatenate(colours))
 
 
+def _lines(result: LidarSlam) -> dict[str, FloatArray]:
+    """Pieces of walls and lane edges, under their names."""
+    return {"walls": _pieces(result, WALL.name), "lane edges": _pieces(result, EDGE.name)}
+
+
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
     """Places (P, 2) of the poles."""
     return np.array([mark.state for mark in landmarks if mark.kind == POLE], dtype=np.float64).reshape(-1, 2)
 
 
-def _wall_ends(result: LidarSlam) -> FloatArray:
-    """Ends (W, 2, 2), from above, of the seen piece of each wall: the outermost feet of its sightings."""
+def _pieces(result: LidarSlam, kind: str) -> FloatArray:
+    """Ends (W, 2, 2), from above, of the seen piece of each wall or lane edge: the outermost feet of its sightings."""
     ends = []
     for mark in result.landmarks:
-        if mark.kind.name != "wall":
+        if mark.kind.name != kind:
             continue
-        nx, ny, _, d = mark.state.planeCoefficients().tolist()
-        normal = np.array([nx, ny]) / np.hypot(nx, ny)
+        place = mark.kind.coordinates(mark.state)
+        foot = np.array([place["x"], place["y"]])
+        normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
         along = np.array([-normal[1], normal[0]])
         centres = [
             transform_points(result.world_T_lidar[seen.pose], extent)[:, :2]
@@ -153,6 +164,6 @@ def _wall_ends(result: LidarSlam) -> FloatArray:
             if seen.landmark == mark.number
         ]
         u = np.concatenate(centres) @ along
-        foot = -d / np.hypot(nx, ny) * normal
+        foot = (foot @ normal) * normal
         ends.append(np.stack([foot + u.min() * along, foot + u.max() * along]))
     return np.array(ends).reshape(-1, 2, 2)

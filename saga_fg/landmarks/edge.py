@@ -48,4 +48,5 @@ class LaneEdgeLandmark:
 
     def coordinates(self, state: FloatArray) -> dict[str, float]:
         theta, rho = state.tolist()
-        return {"x": rho * np.cos(theta), "y": rho * np.sin(theta), "theta": theta, "rho": rho}
+        nx, ny = float(np.cos(theta)), float(np.sin(theta))
+        return {"x": rho * nx, "y": rho * ny, "nx": nx, "ny": ny, "rho": rho}

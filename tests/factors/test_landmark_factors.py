@@ -13,6 +13,7 @@ from factors import (
     Vector,
     attitude_factor,
     bearing_range_factor,
+    edge_factors,
     lane_boundary_factors,
     lane_keeping_factors,
     on_plane_factor,
@@ -94,6 +95,11 @@ def keeping(rng, keys, covariance):
     return factor, [rng.normal(0, 5, 5), rng.normal(0, [1, 0.3, 0.02])]
 
 
+def edge(rng, keys, covariance):
+    factor = edge_factors([keys], rng.normal(0, 5, (1, 2, 3)), covariance(rng, 2))
+    return factor, [some_pose(rng), np.array([rng.uniform(-3, 3), rng.normal(0, 5)])]
+
+
 def standing(rng, keys, covariance):
     return on_plane_factor(*keys, 0.8, 0.01, state_dim=6, position=(4, 0, 2)), [rng.normal(0, 5, 6), some_plane(rng)]
 
@@ -102,7 +108,7 @@ CASES = {
     "point in the plane": point(2), "point in space": point(3), "plane": plane, "range in the plane": distance(True),
     "range in space": distance(False), "bearing in the plane": bearing(True), "bearing in space": bearing(False),
     "position": satellite, "attitude": attitude, "lane boundary": boundary, "lane keeping": keeping,
-    "on a plane": standing,
+    "on a plane": standing, "straight edge": edge,
 }  # fmt: skip
 
 

@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from data_tools.lidar import read_scan
 from data_tools.simulator.scan_drive import SimulatedScans
-from data_tools.simulator.street import drive
+from data_tools.simulator.street import KERB, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.kitti import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
-from pipelines.slam.sightings import POLE
+from pipelines.slam.sightings import EDGE, POLE
 from saga_fg.errors import InputError
 from saga_fg.geometry import inverse_transform, yaw_transform
 
@@ -71,6 +72,18 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
     found = lidar_slam(scans, "oxts", settings)
     before = trajectory_errors(found.odometry, truth, "start").ate
     assert trajectory_errors(found.trajectory, truth, "start").ate < 0.7 * before
+
+
+def test_lane_edges_are_found_where_the_road_ends() -> None:
+    scans = SimulatedScans(0, 16, kerbs=True)
+    settings = LidarSlamSettings(loop_closures=False)
+    edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == EDGE]
+    assert len(edges) == 2
+    for mark in edges:  # the lines y = KERB and y = -KERB
+        truth = np.array([np.pi / 2 * np.sign(mark.state[0]), KERB])
+        off = mark.state - truth
+        assert off @ np.linalg.solve(mark.covariance, off) < chi2.ppf(0.9999, 2)
+        assert abs(off[1]) < 0.2
 
 
 def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
