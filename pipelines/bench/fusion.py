@@ -1,6 +1,7 @@
 """What a second sensor is worth, on simulated traffic seen by a LiDAR and a camera.
 
-* Accuracy: AMOTA of the nuScenes tracking task, of each sensor alone and of both; paired bootstrap over the scenes.
+* Accuracy: AMOTA of the nuScenes tracking task over all scenes, of each sensor alone and of both; paired bootstrap over
+  the scenes. What no sensor can see counts neither for a tracker nor, where it carries it on, against it.
 * A gap: the better sensor says nothing for some seconds in the middle. Of the objects that were followed before and
   stay in the other sensor's view, how many are followed by the same track at the end of the gap?
 * A poor sensor joins: wide noise, few true detections, much clutter, scores that tell nothing. What does it cost?
@@ -17,20 +18,19 @@ from data_tools.metrics import (
     Interval,
     NuScenesTrackingScene,
     TrackTable,
-    difference,
     match_scene,
     nuscenes_tracking_metrics,
-    paired_bootstrap,
-    ratio_of_sums,
 )
 from data_tools.simulator import SensorSettings, SimulatorSettings, simulate_scene
+from pipelines.bench.drawn_differences import FiguresOf, drawn_differences
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import track_scene
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.arrays import BoolArray
 from saga_fg.dataset import Scene
 from saga_fg.sensor import DEFAULT, NoiseModel, ScoreCalibration, Sensor, sensor_model
 from saga_fg.track import Tracks
 
+DRAWS = 100  # of scenes, for the intervals
 BOTH, WITH_POOR, POOR = "both", "both and a poor one", "poor"
 
 Progress = Callable[[str, int, int], None]
@@ -38,7 +38,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class FusionResult:
-    """amota: of each contender, mean over scenes; better: the better single sensor; gain: of both over it.
+    """amota: of each contender, over all scenes; better: the better single sensor; gain: of both over it.
 
     survival  share of objects that kept their track through the gap: with both, and with the better sensor alone
     followed  number of objects these shares are of;  poor_loss: AMOTA with the poor sensor less that without
@@ -93,18 +93,19 @@ def fusion(
     simulator = simulator or SimulatorSettings()
     singles = tuple(simulator.sensors)
     with_poor = replace(config, sensors={**config.sensors, POOR: poor_model()})
-    amota: dict[str, list[float]] = {name: [] for name in (*singles, BOTH, WITH_POOR)}
+    compared: dict[str, list[NuScenesTrackingScene]] = {name: [] for name in (*singles, BOTH, WITH_POOR)}
     scenes = []
     for seed in seeds:
         scene = simulate_scene(simulator, seed)
         poor = simulate_scene(replace(simulator, sensors={POOR: poor_sensor()}), seed)
         seen = {name: of_sensors(scene, (name,)) for name in singles} | {BOTH: scene, WITH_POOR: _joined(scene, poor)}
         for name, part in seen.items():
-            amota[name].append(scene_amota(scene, track_scene(part, with_poor.new_tracker(method)).tracks))
+            compared[name].append(on_visible(scene, track_scene(part, with_poor.new_tracker(method)).tracks))
         scenes.append(scene)
         if progress is not None:
             progress("tracking", len(scenes), len(seeds))
-    better = max(singles, key=lambda name: float(np.mean(amota[name])))
+    amota = {name: _amota(of_name)(range(len(scenes)))["AMOTA"] for name, of_name in compared.items()}
+    better = max(singles, key=lambda name: amota[name])
     others = {name: sensor_model(config.sensors, name) for name in singles if name != better}
     kept: dict[str, list[BoolArray]] = {BOTH: [], better: []}
     for done, scene in enumerate(scenes):
@@ -115,12 +116,12 @@ def fusion(
             progress("through the gap", done + 1, len(seeds))
     followed = {name: np.concatenate(found) for name, found in kept.items()}
     return FusionResult(
-        amota={name: float(np.mean(values)) for name, values in amota.items()},
+        amota=amota,
         better=better,
-        gain=_compared(amota[BOTH], amota[better]),
+        gain=_gain(compared[BOTH], compared[better]),
         survival={name: float(found.mean()) if len(found) else float("nan") for name, found in followed.items()},
         followed=len(followed[BOTH]),
-        poor_loss=_compared(amota[WITH_POOR], amota[BOTH]),
+        poor_loss=_gain(compared[WITH_POOR], compared[BOTH]),
         seeds=tuple(seeds),
     )
 
@@ -164,16 +165,20 @@ def survived(scene: Scene, tracks: Sequence[Tracks], sensors: Mapping[str, Senso
     return np.array([carriers[1].get(name) == carriers[0][name] for name in followed], dtype=np.bool_)
 
 
-def scene_amota(scene: Scene, tracks: Sequence[Tracks]) -> float:
-    """AMOTA of one scene over the classes that occur in it; objects that no sensor can see don't count."""
+def on_visible(scene: Scene, tracks: Sequence[Tracks]) -> NuScenesTrackingScene:
+    """The scene as it is scored: without the objects that no sensor can see, and without the boxes that follow them."""
     assert scene.ground_truth is not None
-    compared = NuScenesTrackingScene(
+    scored = []
+    for truth, found, pairs in zip(scene.ground_truth, tracks, match_scene(scene.ground_truth, tracks), strict=True):
+        counts = np.ones(len(found), dtype=bool)
+        counts[pairs.track_row[~truth.visible[pairs.object_row]]] = False
+        scored.append(found.select(counts))
+    return NuScenesTrackingScene(
         scene.timestamps,
         scene.world_T_ego[:, :2, 3],
         TrackTable.of_annotations(scene.ground_truth, hidden=False),
-        TrackTable.of_tracks(tracks),
+        TrackTable.of_tracks(scored),
     )
-    return nuscenes_tracking_metrics([compared]).overall.amota
 
 
 def _gap(scene: Scene, gap: float) -> tuple[float, float]:
@@ -186,10 +191,10 @@ def _joined(scene: Scene, other: Scene) -> Scene:
     return replace(scene, frames=tuple(frames))
 
 
-def _compared(a: Sequence[float], b: Sequence[float]) -> Interval:
-    """Difference of the means over scenes."""
+def _amota(scenes: Sequence[NuScenesTrackingScene]) -> FiguresOf:
+    return lambda rows: {"AMOTA": nuscenes_tracking_metrics([scenes[row] for row in rows]).overall.amota}
 
-    def sums(values: Sequence[float]) -> FloatArray:
-        return np.array([[value, 1.0] for value in values])
 
-    return paired_bootstrap(sums(a), sums(b), ratio_of_sums, difference)
+def _gain(a: Sequence[NuScenesTrackingScene], b: Sequence[NuScenesTrackingScene]) -> Interval:
+    """AMOTA of `a` less that of `b`."""
+    return drawn_differences(_amota(a), _amota(b), len(a), DRAWS)["AMOTA"]

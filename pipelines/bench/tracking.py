@@ -7,15 +7,13 @@ errors at labels from their sums, the figures averaged over recall by scoring ea
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.coasting import coasting_errors
+from pipelines.bench.drawn_differences import drawn_differences
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
@@ -110,7 +108,6 @@ def bench_set(
     compared = variants(base, settings.components)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
-    seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
     coasting: list[dict[str, ErrorSample]] = []
     scenes = recordings.dataset.scenes
     for number, name in enumerate(scenes):
@@ -143,35 +140,15 @@ def graph_differences(
     """Saga against kf: headline figures as differences, RMSEs as relative changes. Needs two scenes; else empty."""
     if len(saga.errors) < 2:
         return {}
-    result = headline_differences(saga, kf, settings.draws, settings.seed) if settings.draws else {}
+    result = {}
+    if settings.draws:
+        result = drawn_differences(saga.figures_of, kf.figures_of, len(saga.errors), settings.draws, settings.seed)
     for name in ("position", "velocity", "heading"):
         a, b = ([errors.sample(name).square_sums for errors in score.errors] for score in (saga, kf))
         result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
     if coasting:
         a, b = ([scene[name].square_sums for scene in coasting] for name in (SAGA, KF))
         result["coasting RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
-    return result
-
-
-def headline_differences(a: Score, b: Score, draws: int, seed: int, confidence: float = 0.95) -> dict[str, Interval]:
-    """a less b in each headline figure, with the percentile interval over drawn sets of scenes."""
-    rng = np.random.default_rng(seed)
-    count = len(a.errors)
-    drawn: dict[str, list[float]] = {}
-    for _ in range(draws):
-        rows = rng.integers(count, size=count).tolist()
-        first, second = a.figures_of(rows), b.figures_of(rows)
-        for name in first:
-            if name in second:
-                drawn.setdefault(name, []).append(first[name] - second[name])
-    tail = (1 - confidence) / 2
-    ours, theirs = a.figures, b.figures
-    result = {}
-    for name, values in drawn.items():
-        known = [value for value in values if math.isfinite(value)]
-        if name in ours and name in theirs and known:
-            low, high = np.quantile(known, [tail, 1 - tail]).tolist()
-            result[name] = Interval(ours[name] - theirs[name], low, high, confidence)
     return result
 
 

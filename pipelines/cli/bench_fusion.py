@@ -48,7 +48,7 @@ def fusion(
     settings = load_config("simulated", config)
     with progress_bar(unit="scenes") as progress:
         result = run(settings, range(seed, seed + scenes), gap, method, world, progress)
-    table = Table("sensors", "AMOTA", title=f"{scenes} simulated scenes, mean", title_justify="left")
+    table = Table("sensors", "AMOTA", title=f"{scenes} simulated scenes", title_justify="left")
     for name, value in result.amota.items():
         table.add_row(name, f"{value:.4f}")
     Console().print(table)
