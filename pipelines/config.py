@@ -10,6 +10,7 @@ from typing import Literal
 
 from pipelines.configuration import load_settings, read_settings
 from pipelines.tracking import OnlineTracker
+from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.node import ConstantVelocity
 from saga_fg.sensor import DEFAULT, Sensor
 from saga_fg.settings import settings_group
@@ -59,6 +60,11 @@ class TrackConfig:
             classes[label] = replace(settings_of(classes, label), motion=motion)
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
+    def with_interactions(self, learned: LearnedInteractions) -> TrackConfig:
+        """The same with learned edge rules, and the process noise that was learned beside them."""
+        tracker = replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
+        return replace(self, tracker=tracker).with_acceleration_noise(learned.acceleration_noise)
+
     def new_tracker(self, method: Method, observer: Observer | None = None) -> OnlineTracker:
         """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre).
 
@@ -71,6 +77,11 @@ class TrackConfig:
     def of_method(self, method: Method) -> TrackConfig:
         """The same, without edges unless the method has them."""
         return self if method == "saga" else replace(self, tracker=replace(self.tracker, edges=()))
+
+
+def load_interactions(path: Path) -> LearnedInteractions:
+    """What `saga-fg learn interactions` wrote. Raises `InputError` naming the file and the dotted key of a mistake."""
+    return load_settings(LearnedInteractions, path)
 
 
 def load_config(family: Family, path: Path | None = None) -> TrackConfig:

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
+from saga_fg.edge_features import EdgeFeatures, features_of
 from saga_fg.errors import InputError
-from saga_fg.geometry import wrap_angle
-from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity
+from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.node import distinct_types
 from saga_fg.road.cone_geometry import ConeGeometry, anticipated
 from saga_fg.scene_graph import Edges, SceneGraph
@@ -49,7 +49,9 @@ class EdgeRule(Protocol):
 class Neighbours:
     """Moving objects that are close and head the same way share something, by default their velocity."""
 
-    interaction: SharedVelocity | CarFollowing = settings_group(SharedVelocity, "interaction function of the edges")
+    interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
+        SharedVelocity, "interaction function of the edges"
+    )
     rate: float = setting(0.3, "strength of an edge at distance and heading difference zero, 1/s")
     distance_scale: float = setting(8.0, "sigma of the distance kernel, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
@@ -57,27 +59,41 @@ class Neighbours:
     max_distance: float = setting(20.0, "no edge beyond this distance, m")
     min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
     max_degree: int = setting(4, "edges kept per influenced node, strongest first")
+    parked: bool = setting(False, "couples objects that were never seen moving, whatever their speed, and no others")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "rate", "max_distance", "min_speed", "max_degree")
         require_positive(self, "distance_scale", "heading_scale", "speed_scale", infinite=True)
 
+    def strength(self, f: EdgeFeatures) -> FloatArray:
+        """Rates (...), 1/s, of edges with these features, whatever the classes of their ends."""
+        if self.parked:
+            able = (f.target_moved == 0) & (f.source_moved == 0)
+        else:
+            able = (f.target_speed >= self.min_speed) & (f.source_speed >= self.min_speed)
+        exponent = (f.distance / self.distance_scale) ** 2 + (f.turn / self.heading_scale) ** 2
+        rate = self.rate * np.exp(-(exponent + (f.velocity_difference / self.speed_scale) ** 2) / 2)
+        return np.where(able & (f.distance <= self.max_distance), rate, 0.0)
+
     def pairs(self, nodes: NodeTable) -> Pairs:
-        able = of_classes(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
-        target, source, distance = _close_pairs(nodes.position, able, self.max_distance)
-        turn = wrap_angle(nodes.heading[target] - nodes.heading[source])
-        difference = np.hypot(*(nodes.velocity[target] - nodes.velocity[source]).T)
-        exponent = (distance / self.distance_scale) ** 2 + (turn / self.heading_scale) ** 2
-        rate = self.rate * np.exp(-(exponent + (difference / self.speed_scale) ** 2) / 2)
-        return _strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
+        able = of_classes(nodes.label, self.classes)
+        if not self.parked:
+            able &= np.hypot(*nodes.velocity.T) >= self.min_speed
+        elif nodes.has_moved is not None:
+            able &= ~nodes.has_moved
+        target, source = close_pairs(nodes.position, able, self.max_distance)
+        rate = self.strength(features_of(nodes, target, source))
+        return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
 
 @dataclass(frozen=True)
 class Following:
     """A vehicle is led by the nearest vehicle ahead in its lane, as far as headings tell the lane."""
 
-    interaction: SharedVelocity | CarFollowing = settings_group(CarFollowing, "interaction function of the edges")
+    interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
+        CarFollowing, "interaction function of the edges"
+    )
     rate: float = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
     max_gap: float = setting(40.0, "no leader further ahead than this, centre to centre, m")
     gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
@@ -93,26 +109,34 @@ class Following:
         require_between(self, 0, math.inf, "rate", "max_gap")
         require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
 
+    def strength(self, f: EdgeFeatures) -> FloatArray:
+        """Rates (...), 1/s, of edges with these features, whatever the classes of their ends and whoever is nearer."""
+        lateral = lateral_of_arc(f)
+        led = (f.ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
+        if not self.parked:
+            led &= f.target_moved > 0
+        exponent = (
+            (f.ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (f.turn / self.heading_scale) ** 2
+        )
+        return np.where(led & (f.distance <= self.max_gap), self.rate * np.exp(-exponent / 2), 0.0)
+
+    def remoteness(self, f: EdgeFeatures) -> FloatArray:
+        """What is least for the leader among all that are ahead, m."""
+        return np.asarray(f.ahead + 10 * np.abs(lateral_of_arc(f)))
+
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = of_classes(nodes.label, self.classes)
-        position = nodes.position if self.cones is None else anticipated(nodes, self.classes, self.cones)
-        target, source, _ = _close_pairs(position, able, self.max_gap)
-        offset = position[source] - position[target]
-        heading = nodes.heading[target]
-        c, s = np.cos(heading), np.sin(heading)
-        ahead, lateral = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
-        turn = wrap_angle(heading - nodes.heading[source])
-        # in a bend the leader has turned by `turn`: its lateral offset is that of the arc, ahead * tan(turn / 2)
-        lateral = lateral + ahead * np.tan(np.clip(turn, -1.5, 1.5) / 2)
-        led = (ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(turn) < 3 * self.heading_scale)
-        exponent = (
-            (ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (turn / self.heading_scale) ** 2
-        )
-        if nodes.has_moved is not None and not self.parked:
-            led &= nodes.has_moved[target]
-        rate = np.where(led, self.rate * np.exp(-exponent / 2), 0.0)
-        nearest = _nearest_leader(target, np.where(led, ahead + 10 * np.abs(lateral), np.inf), len(nodes))
+        seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
+        target, source = close_pairs(seen.position, able, self.max_gap)
+        features = features_of(seen, target, source)
+        rate = self.strength(features)
+        nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
+
+
+def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
+    """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
+    return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))
 
 
 def build_graph(
@@ -166,18 +190,17 @@ def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
     return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))
 
 
-def _close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray, FloatArray]:
-    """All ordered pairs of able nodes within `radius` m: target rows, source rows, distances."""
+def close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray]:
+    """All ordered pairs of able nodes within `radius` m: target rows, source rows."""
     rows = np.flatnonzero(able)
     if len(rows) < 2:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     pairs = cKDTree(position[rows]).query_pairs(radius, output_type="ndarray")
     a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
-    distance = np.hypot(*(position[a] - position[b]).T)
-    return np.concatenate([a, b]), np.concatenate([b, a]), np.concatenate([distance, distance])
+    return np.concatenate([a, b]), np.concatenate([b, a])
 
 
-def _strongest(pairs: Pairs, n: int, degree: int) -> Pairs:
+def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:
     """At most `degree` edges into each node, the strongest."""
     order = np.lexsort((-pairs.rate, pairs.target))
     rank = np.arange(len(order)) - np.searchsorted(pairs.target[order], np.arange(n))[pairs.target[order]]

@@ -7,6 +7,7 @@ heading of node i and R_ij the rotation from the heading of j to that of i:
 
     shared velocity    dv_i/dt += rate ( R_ij v_j - v_i )
     car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( u_i.(p_j - p_i) - gap_ij - headway u_i.v_i ) / tau )
+    shared course      dv_i/dt += -rate m_j m_j.v_i,  m_j normal to u_j
 
 Car-following is Helly's linear law (Helly 1959); with the gap taken from the present estimate it keeps the formation.
 """
@@ -104,7 +105,9 @@ class SharedVelocity:
 class CarFollowing:
     """Helly's linear car-following law along the follower's heading; the source is the leader."""
 
-    time_constant: float = setting(4.0, "tau: time over which a wrong gap is made good, s")
+    time_constant: float = setting(
+        4.0, "tau: time over which a wrong gap is made good, s; .inf: only speeds are shared"
+    )
     headway: float = setting(0.0, "part of the desired gap that grows with the follower's speed, s")
     gap: Literal["present", "standstill"] = setting(
         "present", "desired gap: the one of the present estimate (formation), or standstill_gap + headway * speed"
@@ -112,7 +115,7 @@ class CarFollowing:
     standstill_gap: float = setting(2.0, "bumper to bumper, m; used with gap: standstill")
 
     def __post_init__(self) -> None:
-        require_positive(self, "time_constant")
+        require_positive(self, "time_constant", infinite=True)
         require_between(self, 0, math.inf, "headway", "standstill_gap")
         require_one_of(self, "gap", ("present", "standstill"))
 
@@ -139,6 +142,22 @@ class CarFollowing:
             return np.asarray(self.standstill_gap + (nodes.length[target] + nodes.length[source]) / 2)
         distance = ((nodes.position[source] - nodes.position[target]) * u_i).sum(axis=1)
         return np.asarray(distance - self.headway * (nodes.velocity[target] * u_i).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class SharedCourse:
+    """A node turns to where its leader heads: what of its velocity is across the leader's heading fades."""
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(VELOCITY)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        u_j = unit(nodes.heading[source])
+        m_j = np.stack([-u_j[:, 1], u_j[:, 0]], axis=-1)
+        v_i = nodes.types[target[0]].index(VELOCITY)
+        triples = no_triples(nodes, target, source)
+        triples.A_self[:, v_i[:, None], v_i] = -m_j[:, :, None] * m_j[:, None, :]
+        return triples
 
 
 def unit(heading: FloatArray) -> FloatArray:

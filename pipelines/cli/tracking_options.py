@@ -41,6 +41,10 @@ AssociationOption = Annotated[
         "graph: relative positions count as well.  [default: as configured]",
     ),
 ]
+InteractionsOption = Annotated[
+    Path | None,
+    typer.Option("--interactions", help="Edge rules from `saga-fg learn interactions`.", metavar="FILE"),
+]
 ExplainOption = Annotated[
     bool,
     typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
@@ -68,6 +72,17 @@ def association_fits(method: str, association: str | None) -> None:
     """Raise `InputError` where --association would have no effect."""
     if method == "centerpoint" and association is not None:
         raise InputError("--association: the method centerpoint has its own")
+
+
+def with_interactions(config: TrackConfig, method: Method, interactions: Path | None) -> TrackConfig:
+    """The configuration with learned edge rules, if a file of them is given; it has an effect on saga alone."""
+    from pipelines.config import load_interactions
+
+    if interactions is None:
+        return config
+    if method != "saga":
+        raise InputError(f"--interactions {interactions}: goes with --method saga, {method} has no interactions")
+    return config.with_interactions(load_interactions(interactions))
 
 
 def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:

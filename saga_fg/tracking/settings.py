@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from saga_fg.arrays import FloatArray, StrArray, distinct
+from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
 from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
@@ -155,7 +156,7 @@ class TrackerSettings:
         default_factory=lambda: {DEFAULT: ClassSettings()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    edges: tuple[Following | Neighbours | RedLight | InLane | ConeEdge | Attached, ...] = settings_group(
+    edges: tuple[Following | Neighbours | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = settings_group(
         lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
     )
     explained_noise: float = setting(

@@ -1,0 +1,160 @@
+"""Rates, kernel widths and process noise of edge rules by the likelihood of innovations after gaps.
+
+The parameters are the logarithms of rates and widths within fixed bounds, so that rates stay positive and the dynamics
+stable, the logarithm of each class's acceleration noise, and the explained noise. The objective (`gap_prediction`) is
+maximised by L-BFGS-B with differences for derivatives; a weak Gaussian prior about the template decides what the
+recordings leave open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.edge_features import EdgeFeatures
+from saga_fg.edge_rules import VEHICLES, Following, Neighbours
+from saga_fg.errors import InputError
+from saga_fg.interactions import CarFollowing, SharedCourse
+from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
+from saga_fg.learning.gaps import GapSample
+from saga_fg.sensor import DEFAULT
+
+Rule = Following | Neighbours
+
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "rate": (1e-3, 5.0),
+    "distance_scale": (0.5, 100.0),
+    "gap_scale": (3.0, 100.0),
+    "lateral_scale": (0.3, 5.0),
+    "heading_scale": (0.05, 3.0),
+    "speed_scale": (0.1, 10.0),
+}
+NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
+EXPLAINED_BOUNDS = (0.0, 3.0)  # s
+PRIOR = 2e-3  # weight of a unit of squared difference from the template, against the mean over the gaps
+FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
+MOST_GAPS = 1500  # that are learned from, drawn at random; more add nothing but time
+
+ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
+TEMPLATE: tuple[Rule, ...] = (
+    Following(CarFollowing(time_constant=math.inf), rate=1.0, gap_scale=16.0, lateral_scale=0.8, classes=ROAD_USERS),
+    Following(SharedCourse(), rate=0.7, gap_scale=16.0, lateral_scale=0.8, classes=ROAD_USERS),
+    Neighbours(
+        rate=1.0,
+        distance_scale=25.0,
+        heading_scale=math.inf,
+        speed_scale=1.0,
+        max_distance=50.0,
+        max_degree=8,
+        parked=True,
+        classes=ROAD_USERS,
+    ),
+    Neighbours(
+        rate=0.1,
+        distance_scale=1.5,
+        heading_scale=math.inf,
+        speed_scale=0.5,
+        max_distance=6.0,
+        min_speed=0.2,
+        classes=("pedestrian",),
+    ),
+)
+"""Following and turning after a leader; parked objects, which share the pose's errors; groups of people."""
+
+
+@dataclass(frozen=True)
+class FittedInteractions:
+    """rules with their values; acceleration_noise by class, m^2/s^3; explained_noise, s; loss per moment."""
+
+    rules: tuple[Rule, ...]
+    acceleration_noise: dict[str, float]
+    explained_noise: float
+    loss: float
+
+
+def couple_rules(rules: Sequence[Rule], sample: GapSample) -> Callable[[EdgeFeatures, FloatArray], list[Coupling]]:
+    """The rates of rules for the neighbours of a sample, as `predict_gaps` takes them."""
+    able = [_able(rule, sample) for rule in rules]
+
+    def couple(features: EdgeFeatures, seen: FloatArray) -> list[Coupling]:
+        found = []
+        for rule, mask in zip(rules, able, strict=True):
+            rate = np.where(mask & (seen > 0), rule.strength(features), 0.0)
+            if isinstance(rule, Following):
+                remoteness = np.where(rate > 0, rule.remoteness(features), np.inf)
+                rate = np.where(remoteness <= remoteness.min(axis=1, keepdims=True), rate, 0.0)
+            found.append(Coupling(rule.interaction, rate))
+        return found
+
+    return couple
+
+
+def predict_with(sample: GapSample, fitted: FittedInteractions) -> GapPrediction:
+    """Coast through gaps with fitted interactions."""
+    noise = np.array([fitted.acceleration_noise.get(c, fitted.acceleration_noise[DEFAULT]) for c in sample.label])
+    return predict_gaps(sample, couple_rules(fitted.rules, sample), noise, fitted.explained_noise)
+
+
+def fit_interactions(
+    sample: GapSample,
+    position_noise: float,
+    acceleration_noise: Mapping[str, float],
+    template: Sequence[Rule] = TEMPLATE,
+    seed: int = 0,
+    iterations: int = 25,
+) -> FittedInteractions:
+    """The most likely values of the template's rules, from gaps in recordings.
+
+    position_noise      standard deviation of the measured positions, m
+    acceleration_noise  by class, with `default`: where the search begins
+
+    Rules whose classes do not occur are left out. Raises `InputError` for a sample without gaps.
+    """
+    if len(sample) == 0:
+        raise InputError("sample: expected at least one object that is followed for long enough")
+    if len(sample) > MOST_GAPS:
+        sample = sample.select(np.sort(np.random.default_rng(seed).choice(len(sample), MOST_GAPS, replace=False)))
+    rules = [rule for rule in template if _able(rule, sample).any()]
+    names = [
+        (k, name) for k, rule in enumerate(rules) for name in BOUNDS if math.isfinite(getattr(rule, name, math.inf))
+    ]
+    labels, count = np.unique(sample.label, return_counts=True)
+    own = [str(label) for label in labels[count >= FEWEST_GAPS]]
+    classes = [*own, DEFAULT]
+    class_of = np.array([classes.index(c) if c in own else len(own) for c in sample.label.tolist()])
+    noise = [acceleration_noise.get(c, acceleration_noise[DEFAULT]) for c in classes]
+    start = np.array([math.log(getattr(rules[k], name)) for k, name in names] + [*np.log(noise), 0.0])
+    bounds = [tuple(np.log(BOUNDS[name])) for _, name in names]
+    bounds += [tuple(np.log(NOISE_BOUNDS))] * len(classes) + [EXPLAINED_BOUNDS]
+    start = np.clip(start, *np.array(bounds).T)
+
+    def valued(x: FloatArray) -> list[Rule]:
+        values: list[dict[str, float]] = [{} for _ in rules]
+        for (k, name), value in zip(names, np.exp(x), strict=False):
+            values[k][name] = float(value)
+        return [replace(rule, **changes) for rule, changes in zip(rules, values, strict=True)]
+
+    def loss(x: FloatArray) -> float:
+        q = np.exp(x[len(names) : -1])[class_of]
+        prediction = predict_gaps(sample, couple_rules(valued(x), sample), q, x[-1])
+        prior = PRIOR * ((x[: len(names)] - start[: len(names)]) ** 2).sum()
+        return float(negative_log_likelihood(sample, prediction, position_noise) + prior)
+
+    found = minimize(loss, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations, "eps": 1e-3})
+    q = np.exp(found.x[len(names) : -1])
+    return FittedInteractions(
+        tuple(valued(found.x)),
+        {label: float(value) for label, value in zip(classes, q, strict=True)},
+        float(found.x[-1]),
+        float(found.fun),
+    )
+
+
+def _able(rule: Rule, sample: GapSample) -> BoolArray:
+    """(W, M) whether the classes of both ends take part."""
+    return np.asarray(np.isin(sample.label, rule.classes)[:, None] & np.isin(sample.other_label, rule.classes))

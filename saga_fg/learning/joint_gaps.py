@@ -1,0 +1,145 @@
+"""Gaps in trajectories as the joint filter lives through them: all objects in one state, coupled by edge rules.
+
+Up to a gap every object is measured at every moment at which it is seen. Then the joint state is kept, and for every
+gap that begins here it goes on from there: neighbours are measured at every step, the hidden object is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.discretisation import discretise
+from saga_fg.edge_rules import EdgeRule, build_graph
+from saga_fg.estimators import JointKalmanFilter, Measurements
+from saga_fg.interactions import NodeTable
+from saga_fg.learning.gap_prediction import SUBSTEPS, TURNS_ABOVE
+from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments
+from saga_fg.learning.independent_filter import BIRTH_SPEED, FilteredTrajectories
+from saga_fg.learning.trajectories import Trajectories
+from saga_fg.node import ConstantVelocity, NodeType
+from saga_fg.sensor import DEFAULT
+
+_H = np.eye(2, 4)
+
+
+class JointGaps:
+    """One recording under some edge rules.
+
+    filtered        headings and who has moved; the estimates are the joint filter's own
+    noise           acceleration noise by class, m^2/s^3, with `default`; position_noise, m
+    """
+
+    def __init__(
+        self,
+        trajectories: Trajectories,
+        filtered: FilteredTrajectories,
+        noise: Mapping[str, float],
+        position_noise: float,
+        rules: Sequence[EdgeRule],
+        explained_noise: float = 0.0,
+    ) -> None:
+        self._of, self._filtered, self._rules, self._explained = trajectories, filtered, tuple(rules), explained_noise
+        self._R = position_noise**2 * np.eye(2)
+        by_class = {c: NodeType(c, ConstantVelocity(noise.get(c, noise[DEFAULT]))) for c in set(trajectories.label)}
+        self._types = [by_class[c] for c in trajectories.label]
+        self._birth = np.diag(np.repeat([position_noise**2, BIRTH_SPEED**2], 2))
+
+    def errors(self, gaps: GapSample, settings: GapSettings) -> FloatArray:
+        """(W, S) distances, m, between where the objects of the gaps are and where they were predicted."""
+        _, stride, steps = gap_moments(self._of, settings)
+        seen = np.isfinite(self._of.position[..., 0])
+        state, errors = JointKalmanFilter(), np.full((len(gaps), steps), np.nan)
+        present = np.empty(0, dtype=np.int64)
+        for k in range(int(gaps.moment.max(initial=-1)) + 1):
+            now = np.flatnonzero(seen[k])
+            gone = np.setdiff1d(present, now)
+            if len(gone):
+                state.marginalise(gone)
+            kept = np.setdiff1d(present, gone)
+            if k and len(kept):
+                self._predict(
+                    state, kept, self._filtered.heading[k - 1], k - 1, self._of.time[k] - self._of.time[k - 1]
+                )
+                self._measure(state, kept, k)
+            born = np.setdiff1d(now, kept)
+            if len(born):
+                mean = np.concatenate([self._of.position[k, born], np.zeros((len(born), 2))], axis=1)
+                state.add(born, mean, np.tile(self._birth, (len(born), 1, 1)))
+            present = now
+            rows = np.flatnonzero(gaps.moment == k)
+            if len(rows):
+                start = state.snapshot()
+                for w in rows.tolist():
+                    state.restore(start)
+                    errors[w] = self._gap(state, present, int(gaps.row[w]), k, stride, steps)
+                state.restore(start)
+        return errors
+
+    def _gap(
+        self, state: JointKalmanFilter, present: IntArray, hidden: int, k: int, stride: int, steps: int
+    ) -> FloatArray:
+        """(S,) errors of one object that is hidden from moment k on."""
+        errors = np.full(steps, np.nan)
+        course = self._filtered.heading[k].copy()
+        for step in range(steps):
+            before, at = k + step * stride, k + (step + 1) * stride
+            if at >= len(self._of):
+                break
+            dt = (self._of.time[at] - self._of.time[before]) / SUBSTEPS
+            for _ in range(SUBSTEPS):
+                heading = self._filtered.heading[before].copy()
+                heading[hidden] = course[hidden]
+                v = state.mean([hidden])[0, 2:]
+                self._predict(
+                    state,
+                    present,
+                    heading,
+                    before,
+                    dt,
+                    hidden_moved=bool(self._filtered.has_moved[k, hidden]),
+                    hidden=hidden,
+                )
+                new = state.mean([hidden])[0, 2:]
+                if self._filtered.has_moved[k, hidden] and v @ v > TURNS_ABOVE**2:
+                    course[hidden] += np.arctan2(v[0] * new[1] - v[1] * new[0], v @ new)
+            here = np.isfinite(self._of.position[at, :, 0])
+            gone = present[~here[present] & (present != hidden)]
+            if len(gone):
+                state.marginalise(gone)
+                present = np.setdiff1d(present, gone)
+            self._measure(state, present[present != hidden], at)
+            errors[step] = np.hypot(*(self._of.position[at, hidden] - state.mean([hidden])[0, :2]))
+        return errors
+
+    def _predict(
+        self,
+        state: JointKalmanFilter,
+        rows: IntArray,
+        heading: FloatArray,
+        k: int,
+        dt: float,
+        hidden: int = -1,
+        hidden_moved: bool = False,
+    ) -> None:
+        mean = state.mean(rows)
+        moved = self._filtered.has_moved[k, rows].copy()
+        moved[rows == hidden] = hidden_moved
+        nodes = NodeTable(
+            rows,
+            self._of.label[rows],
+            tuple(self._types[row] for row in rows),
+            mean[:, :2],
+            mean[:, 2:],
+            np.where(np.isfinite(heading[rows]), heading[rows], np.arctan2(mean[:, 3], mean[:, 2])),
+            self._of.length[rows],
+            np.trace(state.covariance(rows)[:, 2:, 2:], axis1=1, axis2=2) / 2,
+            moved,
+        )
+        state.predict(discretise(build_graph(nodes, self._rules, explained_noise=self._explained), dt))
+
+    def _measure(self, state: JointKalmanFilter, rows: IntArray, k: int) -> None:
+        if len(rows):
+            state.update(Measurements(rows, self._of.position[k, rows], _H, self._R))

@@ -1,0 +1,61 @@
+"""Where the objects of a recording were: one table, to learn from how they move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.dataset import Scene
+from saga_fg.errors import InputError
+from saga_fg.track import Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """N objects at K moments, NaN where one is not seen.
+
+    time (K,) s; id (N,), label (N,); length (N,) m, 0 where unknown; position (K, N, 2) m from a local origin;
+    heading (K, N) rad, NaN where unknown
+    """
+
+    time: FloatArray
+    id: StrArray
+    label: StrArray
+    length: FloatArray
+    position: FloatArray
+    heading: FloatArray
+
+    @classmethod
+    def of_truth(cls, scene: Scene) -> Self:
+        """The annotated objects. Raises `InputError` for a scene without ground truth."""
+        if scene.ground_truth is None:
+            raise InputError(f"scene {scene.name}: expected ground truth, there is none")
+        rows = [(moment.id, moment.boxes) for moment in scene.ground_truth]
+        return cls._of(scene.timestamps, rows)
+
+    @classmethod
+    def of_tracks(cls, tracks: list[Tracks]) -> Self:
+        """What a tracker saw in a recording: its tracks at the moments at which they have a detection."""
+        seen = [(moment, np.flatnonzero(moment.coasting == 0)) for moment in tracks]
+        rows = [(moment.id[at].astype(np.str_), moment.boxes.select(at)) for moment, at in seen]
+        return cls._of(np.array([moment.timestamp for moment in tracks]), rows)
+
+    @classmethod
+    def _of(cls, time: FloatArray, rows: list) -> Self:  # type: ignore[type-arg]
+        names = np.unique(np.concatenate([ids for ids, _ in rows])) if rows else np.empty(0, dtype=np.str_)
+        K, N = len(rows), len(names)
+        position, heading = np.full((K, N, 2), np.nan), np.full((K, N), np.nan)
+        length, label = np.zeros(N), np.full(N, "", dtype="U64")
+        for k, (ids, boxes) in enumerate(rows):
+            at = np.searchsorted(names, ids)
+            position[k, at], heading[k, at] = boxes.position[:, :2], boxes.yaw
+            length[at], label[at] = np.nan_to_num(boxes.size[:, 0]), boxes.label
+        known = np.isfinite(position[..., 0])
+        origin = np.round(position[known].mean(axis=0)) if known.any() else np.zeros(2)
+        return cls(time, names, label, length, position - origin, heading)
+
+    def __len__(self) -> int:
+        return len(self.time)
