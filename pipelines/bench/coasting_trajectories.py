@@ -21,17 +21,36 @@ import numpy as np
 
 from data_tools.metrics import Interval
 from data_tools.metrics.block_bootstrap import Average, relative_change_of_errors
-from saga_fg.arrays import FloatArray, IntArray
+from pipelines.figures import FigureTable, cell
+from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.edge_rules import EdgeRule
-from saga_fg.learning.gap_prediction import gap_errors, predict_gaps
-from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments, sample_gaps
-from saga_fg.learning.interaction_fit import FittedInteractions, fit_interactions
-from saga_fg.learning.joint_gaps import JointGaps
-from saga_fg.learning.own_motion_fit import OwnMotion, OwnMotionLikelihood
-from saga_fg.learning.trajectories import Trajectories
+from saga_fg.learning import (
+    FittedInteractions,
+    GapSample,
+    GapSettings,
+    JointGaps,
+    OwnMotion,
+    OwnMotionLikelihood,
+    Trajectories,
+    fit_interactions,
+    gap_errors,
+    gap_moments,
+    predict_gaps,
+    sample_gaps,
+)
 
+CLASSES = {
+    "kitti": ("car",),
+    "nuscenes": ("car", "pedestrian"),
+    "eth_ucy": ("pedestrian",),
+    "argoverse": ("car",),
+    "simulated": ("car",),
+}
+"""The classes that are hidden, by kind of recordings; all others are neighbours."""
+GAPS = (1.0, 2.0, 3.0)  # s
 Method = str
 Progress = Callable[[str, int, int], None]
+AVERAGES: tuple[Average, Average] = ("median", "mean")
 STRETCH = 10.0  # s
 
 
@@ -41,7 +60,7 @@ class CoastingErrors:
 
     recording: IntArray
     stretch: IntArray
-    label: np.ndarray
+    label: StrArray
     gap: FloatArray
     errors: dict[Method, FloatArray]
 
@@ -116,3 +135,59 @@ def _sample(
     trajectories: Trajectories, own: OwnMotion, classes: tuple[str, ...], settings: GapSettings, number: int
 ) -> GapSample:
     return sample_gaps(trajectories, own.filtered(trajectories), classes, settings, number)
+
+
+@dataclass(frozen=True)
+class CoastingFigure:
+    """Errors of one method at the end of gaps of one class, m, and their changes against kf (None for kf itself)."""
+
+    label: str
+    gap: float
+    method: Method
+    gaps: int
+    median: float
+    mean: float
+    median_change: Interval | None
+    mean_change: Interval | None
+
+
+def coasting_figures(errors: CoastingErrors) -> list[CoastingFigure]:
+    """All classes, gaps and methods."""
+    rows = []
+    for label in np.unique(errors.label).tolist():
+        for gap in GAPS:
+            for method in errors.errors:
+                e = errors.of(method, label, gap)
+                if len(e):
+                    changes = [
+                        None if method == "kf" else errors.change(method, "kf", label, gap, average)
+                        for average in AVERAGES
+                    ]
+                    rows.append(
+                        CoastingFigure(label, gap, method, len(e), float(np.median(e)), float(e.mean()), *changes)
+                    )
+    return rows
+
+
+def coasting_table(figures: Sequence[CoastingFigure], title: str) -> FigureTable:
+    """The figures as people read them."""
+
+    def change(of: Interval | None) -> str:
+        return "-" if of is None else f"{100 * of.estimate:+.1f} % ({100 * of.low:+.1f} to {100 * of.high:+.1f})"
+
+    return FigureTable(
+        f"{title}: position error when a hidden object reappears, m; 95 % intervals",
+        ("class, gap", "method", "gaps", "median", "against kf", "mean", "against kf"),
+        tuple(
+            (
+                f"{row.label}, {row.gap:g} s",
+                row.method,
+                str(row.gaps),
+                cell(row.median),
+                change(row.median_change),
+                cell(row.mean),
+                change(row.mean_change),
+            )
+            for row in figures
+        ),
+    )

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.cli.bench_association import association
+from pipelines.cli.bench_coasting import coasting
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_fusion import fusion
 from pipelines.cli.bench_joint import joint
@@ -35,6 +36,7 @@ Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to 
 
 
 bench_app.command()(association)
+bench_app.command()(coasting)
 bench_app.command()(estimators)
 bench_app.command()(fusion)
 bench_app.command()(scaling)

@@ -33,6 +33,54 @@ def learn() -> None:
     """Learn settings from recordings."""
 
 
+@learn_app.command()
+def interactions(
+    data: Annotated[
+        str,
+        typer.Option(
+            "--data",
+            help="Recordings: kitti=, nuscenes=, eth_ucy=, argoverse= with their folder, simulated= with a number of "
+            "scenes, file= with a table of detections.",
+            metavar="KIND=PLACE",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write, for `--interactions`.")],
+    recordings: Annotated[
+        str | None, typer.Option("--recordings", help="Recordings with commas between them; all if left out.")
+    ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option("--detections", help="Learn from a tracker's view of these detections, not from the truth."),
+    ] = None,
+    verbose: Verbose = False,
+) -> None:
+    """Learn who follows whom, how strongly, and what noise is left: edge rules for `saga-fg track --interactions`.
+
+    Objects are hidden for up to 3 s while their neighbours stay in view; learned is what makes the places at which they
+    reappear most likely.
+
+    \b
+    Examples:
+      saga-fg learn interactions --data kitti=data/kitti --recordings 0000,0011,0020 --output interactions.yaml
+      saga-fg learn interactions --data file=detections.csv --output interactions.yaml
+      saga-fg track file detections.csv --interactions interactions.yaml --output tracks.csv
+    """
+    from data_tools.atomic_files import check_writable, write_text
+    from pipelines.configuration import write_settings
+    from pipelines.learning import TrajectorySource, learn_interactions
+
+    check_writable(output)
+    chosen = names("--recordings", recordings) if recordings is not None else None
+    source = TrajectorySource.parsed(data, chosen, detections)
+    found = source.trajectories()
+    told = "tracks" if detections is not None or source.kind == "file" else "trajectories"
+    origin = f"{told} of {counted(len(found), 'recording')}, {source.kind}: {', '.join(found)}"
+    with progress_bar(unit="recordings") as progress:
+        learned = learn_interactions(found, origin, progress)
+    write_text(output, write_settings(learned))
+    typer.echo(f"{output}: {counted(len(learned.edges), 'edge rule')} learned from {origin}")
+
+
 @noise_app.callback()
 def noise() -> None:
     """Learn what sensors are like, and how objects move, from recordings.

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, LagOption, MethodOption, configured
+from pipelines.cli.tracking_options import (
+    AssociationOption,
+    EstimatorOption,
+    InteractionsOption,
+    LagOption,
+    MethodOption,
+    configured,
+)
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,6 +46,7 @@ def serve(
     estimator: EstimatorOption = None,
     lag: LagOption = None,
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -57,7 +65,7 @@ def serve(
 
     from pipelines.serving import StreamSettings, StreamTracker
 
-    settings = configured("file", config, method, estimator, lag, association)
+    settings = configured("file", config, method, estimator, lag, association, interactions)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), StreamSettings(reorder=reorder))
     # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
     with threadpool_limits(limits=1, user_api="blas"):

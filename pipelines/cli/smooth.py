@@ -12,7 +12,13 @@ from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import counted
-from pipelines.cli.tracking_options import AssociationOption, MethodOption, association_fits
+from pipelines.cli.tracking_options import (
+    AssociationOption,
+    InteractionsOption,
+    MethodOption,
+    association_fits,
+    with_interactions,
+)
 
 if TYPE_CHECKING:
     from pipelines.config import Family
@@ -48,6 +54,7 @@ def nuscenes(
     scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
     method: MethodOption = "saga",
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -68,7 +75,7 @@ def nuscenes(
     from pipelines.scale_out import HeldScene, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_nuscenes_run
 
-    settings = _configured("nuscenes", config, method, association)
+    settings = _configured("nuscenes", config, method, association, interactions)
     with local_nuscenes(dataroot, version, sensor_locations(detections)) as (root, files):
         chosen = chosen_scenes(root, version, split, scenes)
         dataset = NuScenes(root, version, files, chosen)
@@ -104,6 +111,7 @@ def kitti(
     ] = None,
     method: MethodOption = "saga",
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -121,7 +129,7 @@ def kitti(
     from pipelines.scale_out import KittiInput, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_kitti_run
 
-    settings = _configured("kitti", config, method, association)
+    settings = _configured("kitti", config, method, association, interactions)
     chosen = names("--sequences", sequences) if sequences is not None else None
     with local_kitti(dataroot, detections, chosen) as dataset:
         if at_scale(workers, ray):
@@ -146,6 +154,7 @@ def simulated(
     ] = None,
     method: MethodOption = "saga",
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -164,7 +173,7 @@ def simulated(
     from pipelines.scale_out import SimulatedInput, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_labels
 
-    settings = _configured("simulated", config, method, association)
+    settings = _configured("simulated", config, method, association, interactions)
     traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
     dataset = SimulatedTraffic(traffic, scenes, seed)
     if at_scale(workers, ray):
@@ -185,6 +194,7 @@ def file(
     ] = None,
     method: MethodOption = "saga",
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
@@ -206,7 +216,7 @@ def file(
     from pipelines.scale_out import DetectionFileInput, SmoothTask
     from pipelines.smoothing import smooth_stream, write_streamed_labels
 
-    settings = _configured("file", config, method, association)
+    settings = _configured("file", config, method, association, interactions)
     if at_scale(workers, ray):
         urls = several(detections, scenes)
         task = SmoothTask(settings, method, "table", f".{table}")
@@ -234,10 +244,17 @@ def _show(output: Path, runs: tuple[SmoothedScene, ...] | tuple[StreamedScene, .
     )
 
 
-def _configured(family: Family, config: Path | None, method: str, association: AssociationName | None) -> SmoothConfig:
+def _configured(
+    family: Family,
+    config: Path | None,
+    method: str,
+    association: AssociationName | None,
+    interactions: Path | None,
+) -> SmoothConfig:
     """The settings of a run: the family's, the file's, then the options'."""
     from pipelines.smoothing import load_smooth_config
 
     association_fits(method, association)
     settings = load_smooth_config(family, config)
-    return replace(settings, tracking=settings.tracking.with_association(association))
+    tracking = with_interactions(settings.tracking, method, interactions)
+    return replace(settings, tracking=tracking.with_association(association))

@@ -15,6 +15,7 @@ from pipelines.cli.tracking_options import (
     AssociationOption,
     EstimatorOption,
     ExplainOption,
+    InteractionsOption,
     LagOption,
     MethodOption,
     configured,
@@ -46,6 +47,7 @@ def nuscenes(
     estimator: EstimatorOption = None,
     lag: LagOption = None,
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -74,7 +76,7 @@ def nuscenes(
     from pipelines.scale_out import HeldScene, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("nuscenes", config, method, estimator, lag, association)
+    settings = configured("nuscenes", config, method, estimator, lag, association, interactions)
     locations = sensor_locations(detections)
     apart(output, *(Path(location) for location in locations.values() if not is_url(location)))
     with local_nuscenes(dataroot, version, locations) as (root, files):
@@ -116,6 +118,7 @@ def kitti(
     estimator: EstimatorOption = None,
     lag: LagOption = None,
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -134,7 +137,7 @@ def kitti(
     from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("kitti", config, method, estimator, lag, association)
+    settings = configured("kitti", config, method, estimator, lag, association, interactions)
     chosen = names("--sequences", sequences) if sequences is not None else None
     with local_kitti(dataroot, detections, chosen) as dataset:
         kept = journal(explain, output, at_scale(workers, ray))
@@ -165,6 +168,7 @@ def file(
     estimator: EstimatorOption = None,
     lag: LagOption = None,
     association: AssociationOption = None,
+    interactions: InteractionsOption = None,
     explain: ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -191,7 +195,7 @@ def file(
     from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("file", config, method, estimator, lag, association)
+    settings = configured("file", config, method, estimator, lag, association, interactions)
     kept = journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
         urls = several(detections, scenes)

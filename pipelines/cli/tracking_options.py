@@ -58,11 +58,12 @@ def configured(
     estimator: EstimatorName | None,
     lag: float | None,
     association: AssociationName | None = None,
+    interactions: Path | None = None,
 ) -> TrackConfig:
     """The settings of a run: the family's, the file's, then the options'."""
     from pipelines.config import load_config
 
-    settings = load_config(family, config)
+    settings = with_interactions(load_config(family, config), method, interactions)
     _estimator_fits(method, estimator, lag, settings.tracker.estimator)
     association_fits(method, association)
     return settings.with_estimator(estimator, lag).with_association(association)
@@ -74,7 +75,7 @@ def association_fits(method: str, association: str | None) -> None:
         raise InputError("--association: the method centerpoint has its own")
 
 
-def with_interactions(config: TrackConfig, method: Method, interactions: Path | None) -> TrackConfig:
+def with_interactions(config: TrackConfig, method: str, interactions: Path | None) -> TrackConfig:
     """The configuration with learned edge rules, if a file of them is given; it has an effect on saga alone."""
     from pipelines.config import load_interactions
 

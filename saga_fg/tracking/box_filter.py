@@ -108,6 +108,13 @@ class BoxFilter:
         self._turn(along < -MOVING)
         self.votes = np.where(np.abs(along) > MOVING, MOST_VOTES, self.votes)
 
+    def turn_with(self, before: FloatArray, after: FloatArray) -> None:
+        """Turn the headings of what is clearly in motion as its velocity (n, 2) turns in a prediction."""
+        cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+        moving = np.hypot(*before.T) > MOVING
+        turn = np.where(moving, np.arctan2(cross, (before * after).sum(axis=1)), 0.0)
+        self.yaw = wrap_angle(self.yaw + turn)
+
     def _turn(self, rows: BoolArray) -> None:
         self.yaw = np.where(rows, wrap_angle(self.yaw + np.pi), self.yaw)
         self.votes = np.abs(self.votes)

@@ -199,7 +199,9 @@ class Tracker:
                 noise = self._standing_noise(dt / steps)
                 nodes, explained = self._nodes(), self.settings.explained_noise
                 self.graph = build_graph(nodes, self.rules, explained_noise=explained, noise_scale=noise)
+                before = self._kinematics().velocity
                 self._state.predict(self.graph, dt / steps)
+                self._box.turn_with(before, self._kinematics().velocity)
                 self.roadside.predict(dt / steps)
             self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
         self._time = timestamp

@@ -1,0 +1,48 @@
+"""Interactions from recordings: the noise of the classical filter first, then what neighbours say beyond it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.learned_interactions import LearnedInteractions
+from saga_fg.learning import (
+    GapSample,
+    GapSettings,
+    OwnMotion,
+    OwnMotionLikelihood,
+    Trajectories,
+    fit_interactions,
+    sample_gaps,
+)
+
+Progress = Callable[[str, int, int], None]
+
+
+def learn_interactions(
+    recordings: Mapping[str, Trajectories], origin: str, progress: Progress | None = None
+) -> LearnedInteractions:
+    """Learn from recordings of one kind; `origin` says in the file where from.
+
+    Raises `InputError` where no object is followed for long enough.
+    """
+    settings = GapSettings()
+    classes = tuple(sorted({str(c) for t in recordings.values() for c in np.unique(t.label)}))
+    likelihoods = []
+    for done, (name, trajectories) in enumerate(recordings.items()):
+        likelihoods.append(OwnMotionLikelihood(trajectories, classes, settings))
+        if progress is not None:
+            progress(f"own motion {name}", done + 1, len(recordings))
+    if not any(n for of in likelihoods for n in of.count.values()):
+        raise InputError(f"{origin}: expected objects that are followed for {settings.followed:g} s and more")
+    own = OwnMotion.most_likely(likelihoods)
+    samples = [sample_gaps(t, own.filtered(t), classes, settings, k) for k, t in enumerate(recordings.values())]
+    fitted = fit_interactions(GapSample.pool(samples), own.position_noise, own.acceleration_noise)
+    return LearnedInteractions(
+        learned_from=origin,
+        edges=fitted.rules,
+        explained_noise=fitted.explained_noise,
+        acceleration_noise=fitted.acceleration_noise,
+    )
