@@ -87,6 +87,14 @@ class EdgeNetwork:
             rate = np.where(features.ahead > 0, rate, 0.0)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
+    def candidate_rates(self, weights: dict[str, Any], features: EdgeFeatures, able: Any, xp: Any = np) -> Any:
+        """Rates (W, M) of the edges from M candidates into each of W nodes; able (W, M) whether one takes part."""
+        present = xp.where(able & (features.distance <= self.max_distance), 1.0, 0.0)
+        message = messages(weights, features, xp)
+        heard = (present[..., None] * message).sum(axis=1) / (1 + present.sum(axis=1))[:, None]
+        rate = present * edge_rates(weights, message, heard[:, None], self.max_rate, xp)
+        return xp.where(features.ahead > 0, rate, 0.0) if self.ahead_only else rate
+
     def weights(self) -> dict[str, Any]:
         """The weights as arrays."""
         h = len(self.edge_bias)

@@ -126,7 +126,7 @@ def coasting_errors(
         recording,
         stretch,
         np.concatenate([gaps.label for gaps, _, _ in parts]),
-        step * np.arange(1, steps + 1),
+        np.asarray(step * np.arange(1, steps + 1), dtype=np.float64),
         {method: np.concatenate([errors[method] for _, _, errors in parts]) for method in parts[0][2]},
     ), learned
 

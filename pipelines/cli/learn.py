@@ -52,6 +52,9 @@ def interactions(
         Path | None,
         typer.Option("--detections", help="Learn from a tracker's view of these detections, not from the truth."),
     ] = None,
+    network: Annotated[
+        bool, typer.Option("--network", help="Train networks with JAX (extra [learn]) in place of kernels.")
+    ] = False,
     verbose: Verbose = False,
 ) -> None:
     """Learn who follows whom, how strongly, and what noise is left: edge rules for `saga-fg track --interactions`.
@@ -76,7 +79,7 @@ def interactions(
     told = "tracks" if detections is not None or source.kind == "file" else "trajectories"
     origin = f"{told} of {counted(len(found), 'recording')}, {source.kind}: {', '.join(found)}"
     with progress_bar(unit="recordings") as progress:
-        learned = learn_interactions(found, origin, progress)
+        learned = learn_interactions(found, origin, network, progress)
     write_text(output, write_settings(learned))
     typer.echo(f"{output}: {counted(len(learned.edges), 'edge rule')} learned from {origin}")
 

@@ -15,6 +15,7 @@ from saga_fg.learning import (
     OwnMotionLikelihood,
     Trajectories,
     fit_interactions,
+    fit_networks,
     sample_gaps,
 )
 
@@ -22,11 +23,12 @@ Progress = Callable[[str, int, int], None]
 
 
 def learn_interactions(
-    recordings: Mapping[str, Trajectories], origin: str, progress: Progress | None = None
+    recordings: Mapping[str, Trajectories], origin: str, network: bool = False, progress: Progress | None = None
 ) -> LearnedInteractions:
     """Learn from recordings of one kind; `origin` says in the file where from.
 
-    Raises `InputError` where no object is followed for long enough.
+    network: train networks (extra [learn]) in place of fitting kernels. Raises `InputError` where no object is followed
+    for long enough.
     """
     settings = GapSettings()
     classes = tuple(sorted({str(c) for t in recordings.values() for c in np.unique(t.label)}))
@@ -39,7 +41,8 @@ def learn_interactions(
         raise InputError(f"{origin}: expected objects that are followed for {settings.followed:g} s and more")
     own = OwnMotion.most_likely(likelihoods)
     samples = [sample_gaps(t, own.filtered(t), classes, settings, k) for k, t in enumerate(recordings.values())]
-    fitted = fit_interactions(GapSample.pool(samples), own.position_noise, own.acceleration_noise)
+    fit = fit_networks if network else fit_interactions
+    fitted = fit(GapSample.pool(samples), own.position_noise, own.acceleration_noise)
     return LearnedInteractions(
         learned_from=origin,
         edges=fitted.rules,

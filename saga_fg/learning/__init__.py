@@ -8,6 +8,7 @@ from saga_fg.learning.independent_filter import FilteredTrajectories, filter_ind
 from saga_fg.learning.interaction_fit import TEMPLATE, FittedInteractions, fit_interactions, predict_with
 from saga_fg.learning.joint_gaps import JointGaps
 from saga_fg.learning.measurement_noise import fit_position_noise
+from saga_fg.learning.network_fit import fit_networks
 from saga_fg.learning.own_motion_fit import OwnMotion, OwnMotionLikelihood
 from saga_fg.learning.process_noise import Sightings, fit_acceleration_noise, fit_acceleration_noise_by_class
 from saga_fg.learning.score_calibration import fit_score_calibration
@@ -36,6 +37,7 @@ __all__ = [
     "fit_acceleration_noise",
     "fit_acceleration_noise_by_class",
     "fit_interactions",
+    "fit_networks",
     "fit_position_noise",
     "fit_score_calibration",
     "fit_sensor",

@@ -136,7 +136,7 @@ def sample_gaps(
         )
     if not parts:
         return _empty(steps, M)
-    return GapSample(*(np.concatenate(column) for column in zip(*parts, strict=True)))  # type: ignore[arg-type]
+    return GapSample(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _padded(columns: IntArray, M: int) -> IntArray:
@@ -146,5 +146,21 @@ def _padded(columns: IntArray, M: int) -> IntArray:
 
 def _empty(S: int, M: int) -> GapSample:
     none, text = np.empty(0, dtype=np.int64), np.empty(0, dtype="U64")
-    shapes = ((4,), (4, 4), (), (), (S,), (S, 2), (S, M, 4), (S, M), (S, M), (S, M))
-    return GapSample(none, none, none, text, *(np.empty((0, *shape)) for shape in shapes), np.empty((0, M), "U64"))
+    one, pair = np.empty(0), np.empty((0, S, M))
+    return GapSample(
+        moment=none,
+        row=none,
+        recording=none,
+        label=text,
+        mean=np.empty((0, 4)),
+        P=np.empty((0, 4, 4)),
+        heading=one,
+        has_moved=one,
+        dt=np.empty((0, S)),
+        measured=np.empty((0, S, 2)),
+        other_mean=np.empty((0, S, M, 4)),
+        other_heading=pair,
+        other_moved=pair,
+        other_seen=pair,
+        other_label=np.empty((0, M), dtype="U64"),
+    )

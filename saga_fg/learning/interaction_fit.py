@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
 from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.edge_features import EdgeFeatures
+from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import VEHICLES, Following, Neighbours
 from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, SharedCourse
@@ -71,19 +73,26 @@ TEMPLATE: tuple[Rule, ...] = (
 class FittedInteractions:
     """rules with their values; acceleration_noise by class, m^2/s^3; explained_noise, s; loss per moment."""
 
-    rules: tuple[Rule, ...]
+    rules: tuple[Following | Neighbours | EdgeNetwork, ...]
     acceleration_noise: dict[str, float]
     explained_noise: float
     loss: float
 
 
-def couple_rules(rules: Sequence[Rule], sample: GapSample) -> Callable[[EdgeFeatures, FloatArray], list[Coupling]]:
+def couple_rules(
+    rules: Sequence[Rule | EdgeNetwork], sample: GapSample
+) -> Callable[[EdgeFeatures, FloatArray], list[Coupling]]:
     """The rates of rules for the neighbours of a sample, as `predict_gaps` takes them."""
-    able = [_able(rule, sample) for rule in rules]
+    able = [acting_classes(rule.classes, sample) for rule in rules]
 
     def couple(features: EdgeFeatures, seen: FloatArray) -> list[Coupling]:
         found = []
         for rule, mask in zip(rules, able, strict=True):
+            if isinstance(rule, EdgeNetwork):
+                found.append(
+                    Coupling(rule.interaction, rule.candidate_rates(rule.weights(), features, mask & (seen > 0)))
+                )
+                continue
             rate = np.where(mask & (seen > 0), rule.strength(features), 0.0)
             if isinstance(rule, Following):
                 remoteness = np.where(rate > 0, rule.remoteness(features), np.inf)
@@ -105,7 +114,6 @@ def fit_interactions(
     position_noise: float,
     acceleration_noise: Mapping[str, float],
     template: Sequence[Rule] = TEMPLATE,
-    seed: int = 0,
     iterations: int = 25,
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
@@ -117,9 +125,8 @@ def fit_interactions(
     """
     if len(sample) == 0:
         raise InputError("sample: expected at least one object that is followed for long enough")
-    if len(sample) > MOST_GAPS:
-        sample = sample.select(np.sort(np.random.default_rng(seed).choice(len(sample), MOST_GAPS, replace=False)))
-    rules = [rule for rule in template if _able(rule, sample).any()]
+    sample = thinned(sample)
+    rules = [rule for rule in template if acting_classes(rule.classes, sample).any()]
     names = [
         (k, name) for k, rule in enumerate(rules) for name in BOUNDS if math.isfinite(getattr(rule, name, math.inf))
     ]
@@ -134,7 +141,7 @@ def fit_interactions(
     start = np.clip(start, *np.array(bounds).T)
 
     def valued(x: FloatArray) -> list[Rule]:
-        values: list[dict[str, float]] = [{} for _ in rules]
+        values: list[dict[str, Any]] = [{} for _ in rules]
         for (k, name), value in zip(names, np.exp(x), strict=False):
             values[k][name] = float(value)
         return [replace(rule, **changes) for rule, changes in zip(rules, values, strict=True)]
@@ -155,6 +162,13 @@ def fit_interactions(
     )
 
 
-def _able(rule: Rule, sample: GapSample) -> BoolArray:
-    """(W, M) whether the classes of both ends take part."""
-    return np.asarray(np.isin(sample.label, rule.classes)[:, None] & np.isin(sample.other_label, rule.classes))
+def acting_classes(classes: tuple[str, ...], sample: GapSample) -> BoolArray:
+    """(W, M) whether both ends of an edge are of these classes."""
+    return np.asarray(np.isin(sample.label, classes)[:, None] & np.isin(sample.other_label, classes))
+
+
+def thinned(sample: GapSample) -> GapSample:
+    """At most `MOST_GAPS` gaps, drawn at random, the same ones every time."""
+    if len(sample) <= MOST_GAPS:
+        return sample
+    return sample.select(np.sort(np.random.default_rng(0).choice(len(sample), MOST_GAPS, replace=False)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.boxes import Boxes
 from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
 from saga_fg.track import Tracks
@@ -37,14 +39,14 @@ class Trajectories:
         return cls._of(scene.timestamps, rows)
 
     @classmethod
-    def of_tracks(cls, tracks: list[Tracks]) -> Self:
+    def of_tracks(cls, tracks: Sequence[Tracks]) -> Self:
         """What a tracker saw in a recording: its tracks at the moments at which they have a detection."""
         seen = [(moment, np.flatnonzero(moment.coasting == 0)) for moment in tracks]
         rows = [(moment.id[at].astype(np.str_), moment.boxes.select(at)) for moment, at in seen]
         return cls._of(np.array([moment.timestamp for moment in tracks]), rows)
 
     @classmethod
-    def _of(cls, time: FloatArray, rows: list) -> Self:  # type: ignore[type-arg]
+    def _of(cls, time: FloatArray, rows: list[tuple[StrArray, Boxes]]) -> Self:
         names = np.unique(np.concatenate([ids for ids, _ in rows])) if rows else np.empty(0, dtype=np.str_)
         K, N = len(rows), len(names)
         position, heading = np.full((K, N, 2), np.nan), np.full((K, N), np.nan)
