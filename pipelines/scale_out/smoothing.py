@@ -49,16 +49,17 @@ class SmoothTask:
 
         runs = tuple(smooth_dataset(dataset, self.settings, self.method))
         labels = [(run.scene, run.labels) for run in runs]
+        tracks = [(run.scene, run.tracks) for run in runs]
         for kind in {"nuscenes": ("labels", "tracking", "objects")}.get(self.form, ("labels",)):
             (folder / kind).mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
         if self.form == "nuscenes":
-            write_tracking_results(folder / self.tracking(name), [(run.scene, run.tracks) for run in runs], self.meta)
+            write_tracking_results(folder / self.tracking(name), tracks, self.meta)
             write_label_part(folder / self.objects(name), labels)
         elif self.form == "kitti":
             assert isinstance(dataset, KittiTracking)
             write_kitti_labels(folder / "label_02", dataset, labels)
-            write_kitti_results(folder / "results", dataset, [(run.scene, run.observed_tracks) for run in runs])
+            write_kitti_results(folder / "results", dataset, tracks)
         return asdict(LabelCounts.sum(run.counts for run in runs))
 
     def tracking(self, name: str) -> str:

@@ -5,7 +5,7 @@ summary.json     how many boxes of each scene were observed, filled, extended an
 tracking.json    nuScenes: the official tracking result
 VERSION/         nuScenes: tables whose annotations are the labels
 label_02/        KITTI: text as of ground truth
-results/         KITTI: the observed ones with scores, as evaluators take them
+results/         KITTI: the same with scores, as evaluators take it
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def write_kitti_run(
         done = tuple(runs)
         _write_common(folder, done, suffix)
         write_kitti_labels(folder / "label_02", dataset, [(run.scene, run.labels) for run in done])
-        write_kitti_results(folder / "results", dataset, [(run.scene, run.observed_tracks) for run in done])
+        write_kitti_results(folder / "results", dataset, [(run.scene, run.tracks) for run in done])
     return done
 
 

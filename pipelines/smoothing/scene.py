@@ -39,11 +39,6 @@ class SmoothedScene:
         """The labels as tracks."""
         return tuple(moment.tracks for moment in self.labels)
 
-    @property
-    def observed_tracks(self) -> tuple[Tracks, ...]:
-        """Those that a detector saw: what is scored where the truth, as KITTI's, leaves out what nobody can see."""
-        return tuple(moment.tracks.select(moment.source == "observed") for moment in self.labels)
-
 
 def smooth_scene(
     scene: Scene, config: SmoothConfig, method: Method = "saga", progress: Progress | None = None
