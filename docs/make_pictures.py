@@ -11,10 +11,13 @@ from pathlib import Path
 from concept_pictures import write_concept_pictures
 
 from data_tools.simulator import simulate_scene
+from data_tools.simulator.scan_drive import SimulatedScans
 from pipelines.bench.scaling import ScalingSettings, bench_scaling, write_picture
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint
+from pipelines.slam.kitti import write_lidar_slam
+from pipelines.slam.lidar_slam import lidar_slam
 from pipelines.slam.simulated import street, write_joint
 from saga_fg.ego import JointSettings
 
@@ -42,6 +45,9 @@ def main() -> None:
         run = run_joint(simulate_scene(street(), 0), load_config("simulated"), JointSettings(), "lidar", 0)
         write_joint(Path(folder) / "joint", run)
         shutil.copy(Path(folder) / "joint" / "above.png", HERE / "joint_above.png")
+        scans = SimulatedScans(seed=0, count=40, kerbs=True)
+        write_lidar_slam(Path(folder) / "slam", lidar_slam(scans), scans)
+        shutil.copy(Path(folder) / "slam" / "above.png", HERE / "slam_above.png")
 
 
 if __name__ == "__main__":

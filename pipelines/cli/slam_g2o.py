@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import working
 from pipelines.cli.summary import counted
+
+Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 
 
 def g2o(
@@ -18,6 +21,13 @@ def g2o(
     compare: Annotated[
         bool, typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt and iSAM2 (QR) on the graph too.")
     ] = False,
+    robust: Annotated[
+        Loss | None,
+        typer.Option("--robust", help="Loss over the measurements that do not join successive poses: false loops."),
+    ] = None,
+    robust_scale: Annotated[
+        float, typer.Option("--robust-scale", help="Scale of that loss, standard deviations.")
+    ] = 3.0,
     verbose: Verbose = False,
 ) -> None:
     """Optimise a pose graph, whatever the guess in the file is worth.
@@ -28,16 +38,24 @@ def g2o(
     Examples:
       saga-fg slam g2o sphere2500.g2o --output sphere
       saga-fg slam g2o MIT.g2o --output MIT --compare
+      saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
     """
     from data_tools.pose_graphs import read_g2o
+    from factors import Robust
     from pipelines.slam.pose_graph import write_pose_graph
     from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
+    from saga_fg.errors import InputError
     from saga_fg.pose_graph import factor_graph, optimise_poses, pose_values
 
+    if robust is not None and compare:
+        raise InputError("--compare: expected without --robust, GTSAM's optimisers are run without a loss")
+    if not 0 < robust_scale < math.inf:
+        raise InputError(f"--robust-scale {robust_scale:g}: expected a number > 0")
+    loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
     with working("optimising"):
-        optimised = optimise_poses(graph)
-    guess = factor_graph(graph).error(pose_values(graph.world_T_pose))
+        optimised = optimise_poses(graph, loss)
+    guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,41 @@ def test_the_command_writes_the_optimum(tmp_path: Path, dim: int) -> None:
     assert rows["id"].tolist() == graph.ids.tolist()
     assert (rows["P11"] > 0).all()
     assert (output / "above.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
+    graph, truth = loop(2, seed=0)
+    wrong = graph.first_T_second.copy()
+    false = np.flatnonzero(np.abs(graph.second - graph.first) > 1)[:3]
+    wrong[false, :2, 2] += [7.0, -5.0]
+    write_g2o(tmp_path / "false.g2o", replace(graph, first_T_second=wrong))
+    off = {}
+    for name, options in (("plain", []), ("robust", ["--robust", "geman-mcclure"])):
+        output = tmp_path / name
+        result = CliRunner().invoke(
+            app, ["slam", "g2o", str(tmp_path / "false.g2o"), "--output", str(output), *options]
+        )
+        assert result.exit_code == 0, result.output
+        found = read_g2o(output / "poses.g2o").world_T_pose
+        found = np.linalg.inv(found[0]) @ found
+        off[name] = np.abs((found - np.linalg.inv(truth[0]) @ truth)[:, :2, 2]).max()
+    assert off["robust"] < 0.3 * off["plain"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--robust", "huber", "--compare"], "--compare: expected without --robust"),
+        (["--robust", "huber", "--robust-scale", "-1"], "--robust-scale -1: expected a number > 0"),
+    ],
+)
+def test_options_that_do_not_go_together(tmp_path: Path, options: list[str], message: str) -> None:
+    graph, _ = loop(2, seed=0)
+    write_g2o(tmp_path / "loop.g2o", graph)
+    arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), *options]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
 
 
 def test_a_broken_file_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
