@@ -109,7 +109,7 @@ def _draw_disturbances(
             turning = mine[:1] if lane_wise and len(mine) > 1 else mine[:0]  # the innermost lane turns off
             own = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
             stop_lines += [StopLine(np.setdiff1d(mine, turning), place, shared), StopLine(turning, place, own)]
-        else:
+        elif lanes.taper == 0:  # cones are disturbance enough
             for group in mine[:, None] if lane_wise else [mine]:
                 speed = float(rng.uniform(*settings.slow_speed))
                 active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)

@@ -1,7 +1,7 @@
 """Kinds of scenes in which more than cars matters, as settings of the simulator.
 
 red-light    a queue before a traffic light; frames bring a map along, the camera sees the colours
-road-works   cones close the right lane, whose traffic is pushed into the lane beside
+road-works   cones close the right lane, whose traffic is pushed into the lane beside; the map has the lanes of before
 towing       many trucks, most of them with a trailer
 cycling      riders on bicycles beside slow traffic
 """
@@ -42,7 +42,12 @@ def _red_light() -> SimulatorSettings:
 
 
 def _road_works() -> SimulatorSettings:
-    return SimulatorSettings(road=RoadSettings(merge_probability=1.0), roadworks=RoadworkSettings(probability=1.0))
+    return SimulatorSettings(
+        road=RoadSettings(lanes=(1, 1), merge_probability=1.0),
+        traffic=TrafficSettings(platoon_size=(2, 5), platoon_gap=(15.0, 60.0)),  # a lane less is no jam yet
+        roadworks=RoadworkSettings(probability=1.0),
+        lights=LightSettings(mapped=True),
+    )
 
 
 def _towing() -> SimulatorSettings:

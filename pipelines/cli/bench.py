@@ -15,6 +15,7 @@ from pipelines.cli.bench_association import association
 from pipelines.cli.bench_coasting import coasting
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_fusion import fusion
+from pipelines.cli.bench_heterogeneous import heterogeneous
 from pipelines.cli.bench_joint import joint
 from pipelines.cli.bench_lidar import lidar
 from pipelines.cli.bench_metrics import metrics
@@ -40,6 +41,7 @@ bench_app.command()(coasting)
 bench_app.command()(estimators)
 bench_app.command()(fusion)
 bench_app.command()(scaling)
+bench_app.command()(heterogeneous)
 bench_app.command()(service)
 bench_app.command()(metrics)
 bench_app.command()(joint)

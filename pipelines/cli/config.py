@@ -13,7 +13,7 @@ from saga_fg.errors import InputError
 
 def config(
     kind: Annotated[
-        Literal["file", "nuscenes", "kitti", "simulated"],
+        Literal["file", "nuscenes", "kitti", "simulated", "heterogeneous"],
         typer.Option("--for", help="The kind of data whose shipped defaults to print."),
     ] = "file",
     simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -20,6 +20,10 @@ def demo(
     ),
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of simulated scenes.")] = 3,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
+    scenario: Annotated[
+        Literal["traffic", "red-light", "road-works", "towing", "cycling"],
+        typer.Option("--scenario", help="What the scenes are about; all but traffic by the heterogeneous settings."),
+    ] = "traffic",
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -31,13 +35,16 @@ def demo(
     Examples:
       saga-fg demo
       saga-fg demo --output out --scenes 1 --seed 3
+      saga-fg demo --output out --scenario road-works --scenes 1
     """
+    from data_tools.simulator.scenarios import scenario_settings
     from pipelines.comparison import COLUMNS, table_rows
     from pipelines.config import load_config
     from pipelines.demo import run_demo
 
     with progress_bar() as progress:
-        result = run_demo(output, load_config("simulated", config), scenes=scenes, seed=seed, progress=progress)
+        settings = load_config("simulated" if scenario == "traffic" else "heterogeneous", config)
+        result = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
     table = Table(title=f"{counted(scenes, 'simulated scene')}, seed {seed}", title_justify="left")
     for k, column in enumerate(COLUMNS):
         table.add_column(column, justify="right" if k else "left", no_wrap=k == 0)

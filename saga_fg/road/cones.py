@@ -57,8 +57,8 @@ class ConeEdge:
     """Vehicles before an edge of cones pass it, and keep to it."""
 
     cones: ConeGeometry = settings_group(ConeGeometry, "which cones concern a vehicle, and how it passes them")
-    rate: float = setting(2.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
-    band: float = setting(0.7, "sigma of the kernel on the distance from where the edge is just cleared, m")
+    rate: float = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
+    band: float = setting(0.5, "sigma of the kernel on the distance from where the edge is just cleared, m")
     vehicles: tuple[str, ...] = setting(VEHICLES, "classes that are pushed")
 
     def __post_init__(self) -> None:

@@ -18,9 +18,12 @@ from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.edge_rules import VEHICLES, Pairs
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.node import NodeType
+from saga_fg.road.cone_geometry import ConeGeometry, anticipated
 from saga_fg.road.polyline import direction_at, feet, on_it
 from saga_fg.road.road_map import LANE
 from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+PUSHED = 0.5  # m aside, from which cones decide and no longer the lane
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,20 @@ class InLane:
     rate: float = setting(2.0, "strength of an edge, 1/s")
     drift_scale: float = setting(0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    cones: ConeGeometry | None = settings_group(
+        lambda: None, "who is pushed out of the lane by cones does not keep it; null: cones play no part"
+    )
 
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "rate")
         require_positive(self, "drift_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        vehicles = np.flatnonzero(np.isin(nodes.label, self.classes))
+        able = np.isin(nodes.label, self.classes)
+        if self.cones is not None:
+            aside = anticipated(nodes, self.classes, self.cones) - nodes.position
+            able &= np.hypot(*aside.T) < PUSHED
+        vehicles = np.flatnonzero(able)
         targets, sources, rates = [vehicles[:0]], [vehicles[:0]], [np.empty(0)]
         u = unit(nodes.heading[vehicles])
         for lane in np.flatnonzero(nodes.label == LANE).tolist() if len(vehicles) else ():

@@ -35,7 +35,6 @@ from saga_fg.road.road_map import LANE, STOP_LINE
 from saga_fg.settings import require_between, require_positive, setting, settings_group
 
 LEAST_GAP = 0.5  # m; nearer, v^2 / (2 g) is all noise
-LEAST_SPEED = 0.1  # m/s
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
 
 
@@ -81,7 +80,7 @@ class Stopping:
     """Even deceleration to a halt before a line; the source is the line."""
 
     time_constant: float = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
-    margin: float = setting(1.5, "way left between the front of a vehicle and the line's middle at the halt, m")
+    margin: float = setting(3.0, "way left between the front of a vehicle and the line's middle at the halt, m")
 
     def __post_init__(self) -> None:
         require_positive(self, "time_constant")
@@ -91,7 +90,7 @@ class Stopping:
         return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
-        """g (E,), m, for ways from the centres to the line."""
+        """g (E,), m, for ways (E,) from the centres to the line."""
         return np.maximum(way - nodes.length[target] / 2 - self.margin, LEAST_GAP)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
@@ -136,21 +135,17 @@ class RedLight:
         near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= self.max_distance
         target, source = target[near], source[near]
         ways = approach(nodes, target, source)
-        g = self.interaction.gap(nodes, target, ways.way)
-        v = np.einsum("ei,ei->e", nodes.velocity[target], ways.direction)
-        needed = np.maximum(v, 0.0) ** 2 / (2 * g)
+        v = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0)
         front = ways.way - nodes.length[target] / 2  # of the vehicle, before the line
-        stops = ways.comes & (front > 0) & (v**2 <= 2 * self.hardest * front)
-        first = _first(source, np.where(stops, ways.way, np.inf), ways.crossing)
-        ramp = np.clip((needed - self.noticed) / max(self.firm - self.noticed, 1e-9), 0.0, 1.0)
-        # at a crawl nothing needs to be braked any more
-        rate = self.rate * nodes.closed[source] * ramp * (v > LEAST_SPEED)
-        return Pairs(target[first], source[first], rate[first])
+        stops = np.flatnonzero(ways.comes & (front > 0) & (v**2 <= 2 * self.hardest * front))
+        preceded = _in_one_lane(source[stops], ways.crossing[stops]) & (ways.way[stops] < ways.way[stops, None])
+        first = stops[~preceded.any(axis=1)]
+        target, source, v = target[first], source[first], v[first]
+        g = self.interaction.gap(nodes, target, ways.way[first])
+        ramp = np.clip((v**2 / (2 * g) - self.noticed) / max(self.firm - self.noticed, 1e-9), 0.0, 1.0)
+        return Pairs(target, source, self.rate * nodes.closed[source] * ramp)
 
 
-def _first(line: IntArray, way: FloatArray, crossing: FloatArray) -> IntArray:
-    """The pairs with a finite way that no other of the same line, which crosses it within a metre or two, precedes."""
-    same = line[:, None] == line
-    same &= np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE
-    preceded = (same & (way < way[:, None])).any(axis=1)
-    return np.flatnonzero(np.isfinite(way) & ~preceded)
+def _in_one_lane(line: IntArray, crossing: FloatArray) -> BoolArray:
+    """(E, E) which pairs are of one line and cross it within a metre or two of each other."""
+    return np.asarray((line[:, None] == line) & (np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE))

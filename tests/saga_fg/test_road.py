@@ -121,7 +121,7 @@ def test_a_red_light_stops_the_first_of_each_lane():
     assert rate == pytest.approx([1.0, 1.0])
     assert RedLight().pairs(queue(closed=0.4)).rate == pytest.approx([0.4, 0.4])
     acceleration = pull(queue(), RedLight())
-    assert acceleration[0, 0] == pytest.approx(-(10**2) / (2 * (30 - 2 - 1.5)))
+    assert acceleration[0, 0] == pytest.approx(-(10**2) / (2 * (30 - 2 - 3)))
     assert np.allclose(acceleration[[1, 2, 4]], 0)
 
 
@@ -222,6 +222,14 @@ def test_who_leaves_a_lane_is_let_go():
     assert leaving.rate[0] < 0.1
     rows[0] = ("car", 0, 2.5, 10, 0, 4)
     assert len(InLane().pairs(table(rows, np.zeros(2), straight, {1: 3.5})).target) == 0
+
+
+def test_who_is_pushed_out_of_a_lane_by_cones_does_not_keep_it():
+    rows = [("car", 0, 0, 10, 0, 4), ("lane", 0, 0, 0, 0, 0)]
+    rows += [("traffic_cone", 10 + 5 * k, -2 + k, 0, 0, 0.4) for k in range(5)]
+    nodes = table(rows, np.zeros(7), {1: np.array([[-50.0, 0.0], [50.0, 0.0]])}, {1: 3.5})
+    assert len(InLane().pairs(nodes).target) == 1
+    assert len(InLane(cones=ConeGeometry()).pairs(nodes).target) == 0
 
 
 # cones

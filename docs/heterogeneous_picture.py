@@ -1,0 +1,98 @@
+"""The picture of docs/guides/heterogeneous-graphs.md: predictions over two seconds, cars alone and the full graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from data_tools.simulator.affected import affected
+from data_tools.simulator.scenarios import ScenarioName, scenario_settings
+from data_tools.simulator.scene import scene_in
+from data_tools.simulator.world import World, build_world
+from pipelines.bench.heterogeneous import cars_alone
+from pipelines.config import TrackConfig, load_config
+from saga_fg.arrays import FloatArray
+from saga_fg.boxes import Boxes
+from saga_fg.dataset import Scene
+from saga_fg.geometry import inverse_transform
+from saga_fg.track import Tracks
+
+HORIZON, MOMENT = 2.0, 5.0  # s: of the prediction, and when it is made
+SCENES: tuple[tuple[ScenarioName, int, str], ...] = (
+    ("red-light", 500, "a red light"),
+    ("road-works", 500, "cones close the right lane"),
+)
+COLOURS = {"cars alone": "#1f77b4", "full graph": "#d62728"}
+
+
+def predicted(scene: Scene, config: TrackConfig, row: int) -> Tracks:
+    """The tracks `HORIZON` s after the moment `row` of a scene, from the frames up to it."""
+    tracker = config.new_tracker("saga")
+    for frame in scene.frames:
+        if frame.timestamp <= scene.timestamps[row]:
+            tracker.step(frame)
+    return tracker.tracks(float(scene.timestamps[row]) + HORIZON)
+
+
+def draw(axes: Any, boxes: Boxes, world_T_local: FloatArray, **style: Any) -> None:
+    """Outlines of boxes."""
+    local = boxes.transformed(inverse_transform(world_T_local))
+    for corners in local.corners():
+        axes.fill(*corners.T, **style)
+
+
+def panel(axes: Any, kind: ScenarioName, seed: int, title: str) -> None:
+    """One scene: what is there, and where the affected vehicles are and are said to be two seconds on."""
+    settings = replace(scenario_settings(kind), duration=MOMENT + HORIZON + 1)
+    world: World = build_world(settings, seed)
+    scene = scene_in(world, settings, seed)
+    row = round(MOMENT * settings.keyframe_rate)
+    then = scene.ground_truth[row + round(HORIZON * settings.keyframe_rate)]  # type: ignore[index]
+    now = scene.ground_truth[row]  # type: ignore[index]
+    asked = np.isin(then.id, affected(world, world.start + MOMENT))
+    pose = scene.world_T_ego[row]
+    draw(axes, now.boxes, pose, facecolor="#dddddd", edgecolor="none")
+    draw(axes, then.boxes.select(asked), pose, facecolor="none", edgecolor="black", linewidth=1.2)
+    full = load_config("heterogeneous")
+    for name, config in (("cars alone", cars_alone(full)), ("full graph", full)):
+        tracks = predicted(scene, config, row)
+        truth = then.boxes.position[asked, None, :2]
+        near = np.linalg.norm(tracks.boxes.position[:, :2] - truth, axis=-1).min(axis=0, initial=np.inf) < 6.0
+        moving = near & np.isin(tracks.boxes.label, ("car", "truck", "bus"))
+        draw(axes, tracks.boxes.select(moving), pose, facecolor="none", edgecolor=COLOURS[name], linewidth=1.2)
+    local = inverse_transform(pose)
+    if world.road_map is not None:
+        for line in world.road_map.stop_lines:
+            ends = line.ends @ local[:2, :2].T + local[:2, 3]
+            axes.plot(*ends.T, color="#d62728", linewidth=3)
+    cones = now.boxes.position[now.boxes.label == "traffic_cone", :2] @ local[:2, :2].T + local[:2, 3]
+    axes.plot(*cones.T, "^", color="#ff7f0e", markersize=5)
+    axes.set(xlim=(-40, 60), ylim=(-13, 13), aspect="equal", ylabel="left, m")
+    axes.set_title(title, loc="left", fontsize=11)
+
+
+def write_heterogeneous_picture(folder: Path) -> None:
+    """`heterogeneous.png`."""
+    figure = Figure(figsize=(10, 6.4), layout="constrained")
+    for axes, scene in zip(figure.subplots(len(SCENES), 1), SCENES, strict=True):
+        panel(axes, *scene)
+    figure.axes[-1].set_xlabel("ahead, m")
+    handles = [
+        Patch(facecolor="#dddddd", label="now"),
+        Patch(facecolor="none", edgecolor="black", label="affected vehicles, true, in 2 s"),
+        *(Patch(facecolor="none", edgecolor=colour, label=f"predicted by {n}") for n, colour in COLOURS.items()),
+        Line2D([], [], color="#d62728", linewidth=3, label="stop line"),
+        Line2D([], [], color="#ff7f0e", marker="^", linestyle="none", label="cone"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.savefig(folder / "heterogeneous.png", dpi=110)
+
+
+if __name__ == "__main__":
+    write_heterogeneous_picture(Path(__file__).parent)

@@ -1,0 +1,188 @@
+"""What nodes of other kinds are worth: predictions with lights, lanes, cones and couplings against cars alone.
+
+For every kind of scene the same frames go to four trackers, which are asked every half second where the objects will be
+in two seconds:
+
+    full     everything that the configuration declares
+    cars     the same settings without the edges that cones, the roadside and couplings take part in
+    shipped  the graph of cars as shipped for simulated traffic
+    kf       no edges
+
+*Affected* are the moving objects that a closed light, cones or a coupling concerns at the moment of the question,
+whatever they do later; all other moving objects are the *others*, whom the additional nodes must not harm. Compared are
+objects that all trackers follow at that moment. Intervals are paired bootstraps over scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from data_tools.metrics import Interval, paired_bootstrap
+from data_tools.metrics.bootstrap import ratio_of_sums
+from data_tools.simulator.affected import affected
+from data_tools.simulator.scenarios import ScenarioName, scenario_settings
+from data_tools.simulator.scene import scene_in
+from data_tools.simulator.world import build_world
+from pipelines.bench.predictions import Asked, prediction_errors
+from pipelines.config import TrackConfig, load_config
+from pipelines.figures import FigureTable, cell
+from pipelines.tracking import Progress
+from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.dataset import Annotations
+from saga_fg.edge_rules import Following, Neighbours
+
+HORIZON = 2.0  # s
+FIRST, EVERY = 2.0, 0.5  # s: the first question, and from one to the next
+RATE = 5.0  # frames a second of either sensor
+MOVING = 0.5  # m/s
+GROUPS = ("affected", "others")
+BASELINES = ("cars", "shipped", "kf")
+
+
+@dataclass(frozen=True, eq=False)
+class GroupFigures:
+    """Of one group of objects in one kind of scenes.
+
+    count    predictions
+    mean, rmse, median  errors by method, m
+    change   of the mean error of `full` against each baseline, less 1
+    """
+
+    count: int
+    mean: Mapping[str, float]
+    rmse: Mapping[str, float]
+    median: Mapping[str, float]
+    change: Mapping[str, Interval]
+
+
+@dataclass(frozen=True, eq=False)
+class KindFigures:
+    """One kind of scenes: its seeds, and the figures by group."""
+
+    kind: ScenarioName
+    seeds: tuple[int, ...]
+    groups: Mapping[str, GroupFigures]
+
+
+def contenders(config: TrackConfig) -> dict[str, TrackConfig]:
+    """The configurations by name, see the module."""
+    return {
+        "full": config,
+        "cars": cars_alone(config),
+        "shipped": load_config("simulated"),
+        "kf": config.of_method("kf"),
+    }
+
+
+def cars_alone(config: TrackConfig) -> TrackConfig:
+    """The same without the edges that anything but moving objects, each by itself, takes part in."""
+    edges = tuple(
+        replace(edge, cones=None) if isinstance(edge, Following) else edge
+        for edge in config.tracker.edges
+        if isinstance(edge, Following | Neighbours)
+    )
+    return replace(config, tracker=replace(config.tracker, edges=edges))
+
+
+def heterogeneous(
+    config: TrackConfig,
+    kinds: Sequence[ScenarioName],
+    seeds: Sequence[int],
+    duration: float,
+    progress: Progress | None = None,
+) -> list[KindFigures]:
+    """Simulate scenes of `duration` s and compare the predictions."""
+    methods = contenders(config)
+    results, done = [], 0
+    for kind in kinds:
+        errors: dict[str, list[dict[str, list[float]]]] = {group: [] for group in GROUPS}
+        for seed in seeds:
+            for group, found in _errors_of_scene(kind, seed, duration, methods).items():
+                errors[group].append(found)
+            done += 1
+            if progress is not None:
+                progress(kind, done, len(kinds) * len(seeds))
+        results.append(KindFigures(kind, tuple(seeds), {group: _figures(parts) for group, parts in errors.items()}))
+    return results
+
+
+def _errors_of_scene(
+    kind: ScenarioName, seed: int, duration: float, methods: Mapping[str, TrackConfig]
+) -> dict[str, dict[str, list[float]]]:
+    """Errors, m, by group and method, of the same questions for all methods."""
+    settings = replace(scenario_settings(kind), duration=duration)
+    sensors = {name: replace(sensor, rate=RATE) for name, sensor in settings.sensors.items()}
+    settings = replace(settings, sensors=sensors)
+    world = build_world(settings, seed)
+    scene = scene_in(world, settings, seed)
+    assert scene.ground_truth is not None
+    ahead, step = (round(time * settings.keyframe_rate) for time in (HORIZON, EVERY))
+    rows = list(range(round(FIRST * settings.keyframe_rate), len(scene) - ahead, step))
+    offset = float(scene.timestamps[0]) - world.start
+    concerned = {row: set(affected(world, float(scene.timestamps[row]) - offset).tolist()) for row in rows}
+    moving = {row: _moving(scene.ground_truth[row]) for row in rows}
+    answers = {
+        name: prediction_errors(scene, method.new_tracker("saga"), HORIZON, rows, moving.__getitem__)
+        for name, method in methods.items()
+    }
+    common: list[Asked] = sorted(set.intersection(*(set(found) for found in answers.values())))
+    groups: dict[str, list[Asked]] = {group: [] for group in GROUPS}
+    for object_id, row in common:
+        groups["affected" if object_id in concerned[row] else "others"].append((object_id, row))
+    return {group: {name: [answers[name][q] for q in asked] for name in methods} for group, asked in groups.items()}
+
+
+def _moving(truth: Annotations) -> StrArray:
+    """Ids of the moving objects of a moment."""
+    return np.asarray(truth.id[np.hypot(*np.nan_to_num(truth.boxes.velocity).T) > MOVING])
+
+
+def _figures(scenes: Sequence[Mapping[str, Sequence[float]]]) -> GroupFigures:
+    names = ("full", *BASELINES)
+    pooled = {name: np.concatenate([np.asarray(scene[name], dtype=np.float64) for scene in scenes]) for name in names}
+    sums = {name: np.array([[sum(scene[name]), len(scene[name])] for scene in scenes], dtype=float) for name in names}
+    count = len(pooled["full"])
+
+    def each(figure: Any) -> dict[str, float]:
+        return {name: float(figure(errors)) if count else float("nan") for name, errors in pooled.items()}
+
+    change = {name: paired_bootstrap(sums["full"], sums[name], ratio_of_sums) for name in BASELINES}
+    return GroupFigures(count, each(np.mean), each(_rms), each(np.median), change)
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def tables(results: Sequence[KindFigures]) -> list[FigureTable]:
+    """For people: errors, and what the full graph changes in the mean error."""
+    found = []
+    for group in GROUPS:
+        columns = (
+            "scenes",
+            "predictions",
+            "full",
+            "cars",
+            "shipped",
+            "kf",
+            *(f"full / {name} - 1" for name in BASELINES),
+        )
+        rows = []
+        for result in results:
+            figures = result.groups[group]
+            if figures.count:
+                means = (cell(figures.mean[name], 2) for name in ("full", *BASELINES))
+                changes = (_percent(figures.change[name]) for name in BASELINES)
+                rows.append((result.kind, str(figures.count), *means, *changes))
+        title = f"{group}: mean error of predictions over {HORIZON:g} s, m; change with its 95 % interval"
+        if rows:
+            found.append(FigureTable(title, columns, tuple(rows)))
+    return found
+
+
+def _percent(change: Interval) -> str:
+    return f"{100 * change.estimate:+.0f} % [{100 * change.low:+.0f}, {100 * change.high:+.0f}]"
