@@ -6,7 +6,7 @@ amber. A light is seen by those who come to it, with a colour that is wrong by c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,12 +88,13 @@ def map_of(
         ends, _ = lanes.pose(np.repeat(line.lanes[:1], 2), np.full(2, line.s), np.array(borders[::sign]), np.zeros(2))
         left, right = ends + off()
         mapped.append(road.StopLine(f"line-{number}", point(left), point(right), name))
+    before = replace(lanes, taper=0.0)  # no map knows of cones
     found = []
     for lane in range(len(lanes.offset)):
         along = np.arange(focus + MAPPED[0], focus + MAPPED[1], SPACING)
         s = along if lanes.direction[lane] > 0 else lanes.road.length - along[::-1]
         same = np.full(len(s), lane)
-        d, slope = lanes.lateral(same, s)
+        d, slope = before.lateral(same, s)
         centre, _ = lanes.pose(same, s, d, slope)
         moved = centre + off()
         found.append(road.Lane(f"lane-{lane}", tuple(point(place) for place in moved), 2 * float(half)))

@@ -124,7 +124,8 @@ class Roadside:
             return tracks
         position, _ = state.places(self.id, self.label)
         moved = tracks.has_moved
-        closed = self._settings.closed(np.array([self._belief[light] for light in self._light if light]))
+        beliefs = [self._belief[light] for light in self._light if light]
+        closed = self._settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))
         governed = np.array([bool(light) for light in self._light])
         weight = np.zeros(n + m)
         weight[n:][governed] = closed

@@ -157,6 +157,13 @@ def test_a_map_may_come_in_the_settings_or_bit_by_bit():
     assert len(in_settings.roadside) == 4
 
 
+def test_a_map_may_be_of_lanes_alone():
+    only = RoadMap(lanes=MAP.lanes)
+    tracker = tracked([replace(frame, road_map=only) for frame in queue_frames(duration=1.0)])
+    assert len(tracker.roadside) == 1
+    assert {edges.interaction for edges in tracker.graph.edges} == {"KeepLane", "SharedVelocity"}
+
+
 def test_without_edges_the_roadside_changes_nothing():
     plain = replace(SETTINGS, edges=(), max_step=np.inf)
     frames = list(queue_frames())
