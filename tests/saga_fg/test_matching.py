@@ -109,6 +109,12 @@ def test_greed_takes_the_nearest_pair_first(method, chosen):
     assert pairs(boxes([0.0, 3.0]), boxes([2.0, 6.0]), method=method) == chosen
 
 
+def test_the_graph_of_nothing_within_reach_is_empty():
+    for tracks, found in ((boxes([0.0, 5.0]), boxes([90.0])), (boxes([0.0]), boxes([90.0])), (boxes([0.0]), boxes([]))):
+        assert pairs(tracks, found, method="graph", shared=0.9) == []
+    assert pairs(boxes([0.0]), boxes([0.1]), method="graph") == [(0, 0)]
+
+
 ROW = np.arange(0.0, 25.0, 5.0)  # a group in a row, one behind the other
 
 
