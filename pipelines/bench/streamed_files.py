@@ -21,6 +21,7 @@ from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scen
 from saga_fg.smoothing import Labels
 
 ROADS, APART = 400, 30.0  # side by side, m apart: platoons do not meet
+PART = 30.0  # s that are read at a time, after which memory is looked at
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,10 @@ def bench_files(settings: StreamingBenchSettings, progress: Callable[[str, int, 
             if progress is not None:
                 progress(name, done, frames)
 
+        rows_read = round(PART * settings.rate * settings.objects)
         (done,) = write_streamed_labels(
             Path(folder) / "labels",
-            lambda spools: smooth_stream(read_scenes_in_parts(table), config, spools, progress=look),
+            lambda spools: smooth_stream(read_scenes_in_parts(table, rows_read), config, spools, progress=look),
         )
         cpu = time.thread_time() - begin
         rows.append(FileRow(settings.seconds, resident_memory(), cpu))
