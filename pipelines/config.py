@@ -61,9 +61,10 @@ class TrackConfig:
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
     def with_interactions(self, learned: LearnedInteractions) -> TrackConfig:
-        """The same with learned edge rules, and the process noise that was learned beside them."""
-        tracker = replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
-        return replace(self, tracker=tracker).with_acceleration_noise(learned.acceleration_noise)
+        """The same with learned edge rules. The process noise stays: association needs more room than prediction."""
+        return replace(
+            self, tracker=replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
+        )
 
     def new_tracker(self, method: Method, observer: Observer | None = None) -> OnlineTracker:
         """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre).

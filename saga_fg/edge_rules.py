@@ -59,7 +59,9 @@ class Neighbours:
     max_distance: float = setting(20.0, "no edge beyond this distance, m")
     min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
     max_degree: int = setting(4, "edges kept per influenced node, strongest first")
-    parked: bool = setting(False, "couples objects that were never seen moving, whatever their speed, and no others")
+    parked: bool = setting(
+        False, "couples objects never seen moving whose velocity is known to within speed_scale, and no others"
+    )
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
     def __post_init__(self) -> None:
@@ -80,8 +82,9 @@ class Neighbours:
         able = of_classes(nodes.label, self.classes)
         if not self.parked:
             able &= np.hypot(*nodes.velocity.T) >= self.min_speed
-        elif nodes.has_moved is not None:
-            able &= ~nodes.has_moved
+        else:  # a new track may move for all that is known of it
+            able &= nodes.velocity_variance < self.speed_scale**2
+            able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
         rate = self.strength(features_of(nodes, target, source))
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)

@@ -1,5 +1,7 @@
 """Edge rules: who is coupled with whom, and how strongly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -283,3 +285,12 @@ def test_a_users_rule_that_makes_no_sense_is_named(chosen, message):
 
 def test_a_users_rule_may_return_plain_lists():
     assert build_graph(table(*straight(3)), (Fixed([0], [1], [0.5]),)).edge_count == 1
+
+
+def test_parked_objects_are_coupled_once_it_is_known_that_they_stand():
+    nodes = replace(table(*straight(3, gap=8.0), speed=0.0), has_moved=np.array([False, False, True]))
+    rule = Neighbours(parked=True, speed_scale=0.5)
+    assert edges(rule.pairs(replace(nodes, velocity_variance=np.full(3, 0.01)))).keys() == {0, 1}
+    new = replace(nodes, velocity_variance=np.array([0.01, 25.0, 0.01]))
+    assert not edges(rule.pairs(new))
+    assert not edges(rule.pairs(replace(nodes, has_moved=None)))
