@@ -10,7 +10,7 @@ in two seconds:
 
 *Affected* are the moving objects that a closed light, cones or a coupling concerns at the moment of the question,
 whatever they do later; all other moving objects are the *others*, whom the additional nodes must not harm. Compared are
-objects that all trackers follow at that moment. Intervals are paired bootstraps over scenes.
+objects that have been in view for a while and that all trackers follow. Intervals are paired bootstraps over scenes.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ HORIZON = 2.0  # s
 FIRST, EVERY = 2.0, 0.5  # s: the first question, and from one to the next
 RATE = 5.0  # frames a second of either sensor
 MOVING = 0.5  # m/s
+FOLLOWED = 1.5  # s in view before the question: sooner, nobody knows a velocity
 GROUPS = ("affected", "others")
 BASELINES = ("cars", "shipped", "kf")
 
@@ -124,7 +125,8 @@ def _errors_of_scene(
     rows = list(range(round(FIRST * settings.keyframe_rate), len(scene) - ahead, step))
     offset = float(scene.timestamps[0]) - world.start
     concerned = {row: set(affected(world, float(scene.timestamps[row]) - offset).tolist()) for row in rows}
-    moving = {row: _moving(scene.ground_truth[row]) for row in rows}
+    back = round(FOLLOWED * settings.keyframe_rate)
+    moving = {row: _followed(scene.ground_truth[row - back : row + 1]) for row in rows}
     answers = {
         name: prediction_errors(scene, method.new_tracker("saga"), HORIZON, rows, moving.__getitem__)
         for name, method in methods.items()
@@ -136,9 +138,13 @@ def _errors_of_scene(
     return {group: {name: [answers[name][q] for q in asked] for name in methods} for group, asked in groups.items()}
 
 
-def _moving(truth: Annotations) -> StrArray:
-    """Ids of the moving objects of a moment."""
-    return np.asarray(truth.id[np.hypot(*np.nan_to_num(truth.boxes.velocity).T) > MOVING])
+def _followed(moments: Sequence[Annotations]) -> StrArray:
+    """Ids of the objects that were visible at all these moments and move at the last."""
+    last = moments[-1]
+    names = last.id[np.hypot(*np.nan_to_num(last.boxes.velocity).T) > MOVING]
+    for moment in moments:
+        names = np.intersect1d(names, moment.id[moment.visible])
+    return np.asarray(names)
 
 
 def _figures(scenes: Sequence[Mapping[str, Sequence[float]]]) -> GroupFigures:
