@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from data_tools.simulator.affected import affected
-from data_tools.simulator.scenarios import ScenarioName, scenario_settings
+from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import World, build_world
 from pipelines.bench.heterogeneous import cars_alone
@@ -24,10 +24,7 @@ from saga_fg.geometry import inverse_transform
 from saga_fg.track import Tracks
 
 HORIZON, MOMENT = 2.0, 5.0  # s: of the prediction, and when it is made
-SCENES: tuple[tuple[ScenarioName, int, str], ...] = (
-    ("red-light", 500, "a red light"),
-    ("road-works", 500, "cones close the right lane"),
-)
+KIND, SEED, TITLE = "red-light", 500, "before a red light"
 COLOURS = {"cars alone": "#1f77b4", "full graph": "#d62728"}
 
 
@@ -47,11 +44,11 @@ def draw(axes: Any, boxes: Boxes, world_T_local: FloatArray, **style: Any) -> No
         axes.fill(*corners.T, **style)
 
 
-def panel(axes: Any, kind: ScenarioName, seed: int, title: str) -> None:
+def panel(axes: Any) -> None:
     """One scene: what is there, and where the affected vehicles are and are said to be two seconds on."""
-    settings = replace(scenario_settings(kind), duration=MOMENT + HORIZON + 1)
-    world: World = build_world(settings, seed)
-    scene = scene_in(world, settings, seed)
+    settings = replace(scenario_settings(KIND), duration=MOMENT + HORIZON + 1)
+    world: World = build_world(settings, SEED)
+    scene = scene_in(world, settings, SEED)
     row = round(MOMENT * settings.keyframe_rate)
     then = scene.ground_truth[row + round(HORIZON * settings.keyframe_rate)]  # type: ignore[index]
     now = scene.ground_truth[row]  # type: ignore[index]
@@ -71,24 +68,21 @@ def panel(axes: Any, kind: ScenarioName, seed: int, title: str) -> None:
         for line in world.road_map.stop_lines:
             ends = line.ends @ local[:2, :2].T + local[:2, 3]
             axes.plot(*ends.T, color="#d62728", linewidth=3)
-    cones = now.boxes.position[now.boxes.label == "traffic_cone", :2] @ local[:2, :2].T + local[:2, 3]
-    axes.plot(*cones.T, "^", color="#ff7f0e", markersize=5)
     axes.set(xlim=(-40, 60), ylim=(-13, 13), aspect="equal", ylabel="left, m")
-    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_title(TITLE, loc="left", fontsize=11)
 
 
 def write_heterogeneous_picture(folder: Path) -> None:
     """`heterogeneous.png`."""
-    figure = Figure(figsize=(10, 6.4), layout="constrained")
-    for axes, scene in zip(figure.subplots(len(SCENES), 1), SCENES, strict=True):
-        panel(axes, *scene)
-    figure.axes[-1].set_xlabel("ahead, m")
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    axes = figure.subplots()
+    panel(axes)
+    axes.set_xlabel("ahead, m")
     handles = [
         Patch(facecolor="#dddddd", label="now"),
         Patch(facecolor="none", edgecolor="black", label="affected vehicles, true, in 2 s"),
         *(Patch(facecolor="none", edgecolor=colour, label=f"predicted by {n}") for n, colour in COLOURS.items()),
         Line2D([], [], color="#d62728", linewidth=3, label="stop line"),
-        Line2D([], [], color="#ff7f0e", marker="^", linestyle="none", label="cone"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     figure.savefig(folder / "heterogeneous.png", dpi=110)
