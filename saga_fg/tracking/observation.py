@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.boxes import Boxes
 from saga_fg.frame import Frame
 from saga_fg.road.signal import SIGHTINGS
 from saga_fg.sensor import Sensor
 from saga_fg.tracking.settings import ClassSettings, class_values
-from saga_fg.tracking.suppression import strongest
+from saga_fg.tracking.suppression import of_one_class, strongest
 
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 
@@ -46,12 +46,14 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     detections = sensor.in_world(frame)
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
-    objects = ~np.isin(label, SIGHTINGS)  # the colours of lights are not objects of their own
+    objects = ~of_classes(label, SIGHTINGS)  # the colours of lights are not objects of their own
     keep = np.flatnonzero(objects & (probability >= class_values(classes, "min_score", label)))
     limits = (
         class_values(classes, name, label[keep]) for name in ("duplicate_distance", "shadow_distance", "shadow_ratio")
     )
     keep = keep[strongest(detections.boxes.select(keep), probability[keep], *limits)]
+    overlap = class_values(classes, "class_overlap", label[keep])
+    keep = keep[of_one_class(detections.boxes.select(keep), probability[keep], overlap)]
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
     boxes = detections.boxes
     R = np.zeros((len(boxes), 4, 4))

@@ -41,6 +41,9 @@ class ClassSettings:
     shadow_distance: float = setting(0.0, "a detection this close to a much stronger one of the class is its shadow, m")
     shadow_ratio: float = setting(0.5, "much stronger: the weaker has less than this share of its probability")
     merge_distance: float = setting(0.0, "a track that is not seen ends this close to one of the class that is, m")
+    class_overlap: float = setting(
+        1.0, "a detection whose IoU, from above, with a more probable one of another class is larger goes; 1: never"
+    )
     overlap_weight: float = setting(
         0.0, "what a whole unit of 3D GIoU counts in matching, as a squared distance in sigmas"
     )
@@ -51,7 +54,7 @@ class ClassSettings:
 
     def __post_init__(self) -> None:
         require_positive(self, "birth_speed", "birth_drift")
-        require_between(self, 0, 1, "min_score", "birth_score", "shadow_ratio", "gate")
+        require_between(self, 0, 1, "min_score", "birth_score", "shadow_ratio", "class_overlap", "gate")
         require_between(self, 0, math.inf, "duplicate_distance", "shadow_distance", "overlap_weight", "yaw_drift")
         require_between(self, 0, math.inf, "merge_distance")
         require_positive(self, "max_distance", "max_coasting", infinite=True)

@@ -2,6 +2,7 @@
 
 Closer than `distance` always; closer than `shadow` where it has less than `ratio` of the other's probability: two
 people may walk half a metre apart, but a weak detection that close to a strong one is most often its shadow.
+Boxes of different classes stand in each other's place only where they overlap.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.boxes import Boxes
+from saga_fg.overlap import paired_bev_iou, touching_pairs
 
 
 def strongest(
@@ -32,8 +34,29 @@ def strongest(
     duplicate = apart < np.minimum(distance[a], distance[b])
     duplicate |= (apart < np.minimum(shadow[a], shadow[b])) & (probability[weak] < ratio[strong] * probability[strong])
     rival = (boxes.label[a] == boxes.label[b]) & duplicate
-    strong, weak = strong[rival], weak[rival]
-    alive = np.ones(len(boxes), dtype=bool)
+    return _survivors(strong[rival], weak[rival], probability)
+
+
+def of_one_class(boxes: Boxes, probability: FloatArray, overlap: FloatArray) -> IntArray:
+    """Rows of the boxes that stay, ascending, of those that detectors take for several classes at once.
+
+    boxes (n); probability (n,); overlap (n,): a box whose IoU, seen from above, with a more probable one of another
+    class is larger than this goes; from 1 on it never does.
+    """
+    if len(boxes) < 2 or (overlap >= 1).all():
+        return np.arange(len(boxes))
+    a, b = touching_pairs(boxes, boxes)
+    across = (a < b) & (boxes.label[a] != boxes.label[b])
+    a, b = a[across], b[across]
+    swap = probability[b] > probability[a]
+    strong, weak = np.where(swap, b, a), np.where(swap, a, b)
+    rival = paired_bev_iou(boxes.select(strong), boxes.select(weak)) > overlap[weak]
+    return _survivors(strong[rival], weak[rival], probability)
+
+
+def _survivors(strong: IntArray, weak: IntArray, probability: FloatArray) -> IntArray:
+    """Rows that stay where strong[k] drives out weak[k]; the most probable have the first word."""
+    alive = np.ones(len(probability), dtype=bool)
     for k in np.argsort(-probability[strong], kind="stable"):
         if alive[strong[k]]:
             alive[weak[k]] = False

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Boxes
-from saga_fg.tracking.suppression import strongest
+from saga_fg.tracking.suppression import of_one_class, strongest
 
 
 def kept(x, probability, distance=1.0, label="car", shadow=0.0, ratio=0.5):
@@ -61,3 +61,29 @@ def test_what_stays_is_apart_and_what_goes_was_beaten(seed, n):
     assert not rival[np.ix_(stays, stays)].any()
     for k in np.setdiff1d(np.arange(n), stays):
         assert (rival[k, stays] & (probability[stays] > probability[k])).any()
+
+
+def of_one_class_kept(x, probability, label, overlap):
+    n = len(x)
+    boxes = Boxes.of(label, np.stack([x, np.zeros(n), np.zeros(n)], axis=-1), [[4.0, 2.0, 1.5]] * n, np.zeros(n))
+    return of_one_class(boxes, np.asarray(probability), np.full(n, overlap)).tolist()
+
+
+def test_of_two_classes_in_one_place_the_less_probable_goes():
+    assert of_one_class_kept([0.0, 0.4], [0.4, 0.9], ["truck", "car"], 0.5) == [1]
+    assert of_one_class_kept([0.0, 0.4], [0.4, 0.9], ["truck", "car"], 0.9) == [0, 1], "IoU 3.6 / 4.4 is less"
+    assert of_one_class_kept([0.0, 0.4], [0.4, 0.9], ["truck", "car"], 1.0) == [0, 1], "1 is never"
+
+
+def test_within_a_class_overlap_says_nothing():
+    assert of_one_class_kept([0.0, 0.4], [0.4, 0.9], ["car", "car"], 0.1) == [0, 1]
+
+
+def test_one_that_was_driven_out_drives_out_nothing():
+    # 0 and 2 are too far apart; 1, between them, gives way to 0 and no longer counts
+    assert of_one_class_kept([0.0, 1.5, 3.0], [0.9, 0.8, 0.7], ["car", "truck", "bus"], 0.3) == [0, 2]
+
+
+def test_a_box_of_unknown_size_stays():
+    boxes = Boxes.of(["car", "truck"], np.zeros((2, 3)))
+    assert of_one_class(boxes, np.array([0.9, 0.1]), np.full(2, 0.1)).tolist() == [0, 1]
