@@ -8,7 +8,7 @@ interactions act on the velocity alone, so that over a step with rates frozen at
 with, for each edge j -> i at rate r (K is the sum of all r), u the unit heading and m the normal of a heading,
 
     shared velocity   D -= r I              c += r R_ij v_j
-    car-following     D -= r u_i u_i^T      c += r u_i (u_j . v_j)          gap kept as it is
+    car-following     D -= r u_i u_i^T      c += r u_i (u_j . v_j)          time constant infinite: speeds alone
     shared course     D -= r m_j m_j^T
 
 D is negative semidefinite, and the implicit midpoint rule, E = (I - D h/2)^{-1} (I + D h/2), keeps every step stable.
@@ -19,12 +19,14 @@ innovation is taken to be Student's t with covariance scale S = H P H^T + R; `xp
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from saga_fg.edge_features import EdgeEnds, EdgeFeatures, edge_features
+from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, Interaction, SharedCourse, SharedVelocity
 from saga_fg.learning.gaps import GapSample
 
@@ -58,7 +60,10 @@ def predict_gaps(
     explained_noise: Any,
     xp: Any = np,
 ) -> GapPrediction:
-    """Coast through all gaps; acceleration_noise q, m^2/s^3, a number or (W,)."""
+    """Coast through all gaps; acceleration_noise q, m^2/s^3, a number or (W,).
+
+    Raises `InputError` for interactions other than those above.
+    """
     p, v, heading = sample.mean[:, :2], sample.mean[:, 2:], sample.heading
     P_pp, P_pv, P_vv = sample.P[:, :2, :2], sample.P[:, :2, 2:], sample.P[:, 2:, 2:]
     eye = xp.eye(2)
@@ -118,12 +123,17 @@ def _dynamics(couplings: Sequence[Coupling], target: EdgeEnds, source: EdgeEnds,
                 )
                 D = D - total[:, None, None] * xp.eye(2)
                 c = c + (rate[..., None] * v_j).sum(axis=1)
-            case CarFollowing():
+            case CarFollowing(time_constant=math.inf):
                 D = D - total[:, None, None] * (u_i[:, 0, :, None] * u_i[:, 0, None, :])
                 c = c + u_i[:, 0] * (rate * (u_j * source.velocity).sum(axis=-1)).sum(axis=-1)[:, None]
             case SharedCourse():
                 m_j = xp.stack([-u_j[..., 1], u_j[..., 0]], axis=-1)
                 D = D - (rate[..., None, None] * m_j[..., :, None] * m_j[..., None, :]).sum(axis=1)
+            case _:
+                raise InputError(
+                    "interaction: expected shared velocity, shared course, or car-following with the time constant .inf, "
+                    f"got {interaction}"
+                )
         K = K + total
     return D, c, K
 

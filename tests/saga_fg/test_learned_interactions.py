@@ -62,6 +62,10 @@ def test_what_is_written_is_read_again():
         ("acceleration_noise: {car: -1.0}", "acceleration_noise.car: expected a finite number > 0"),
         ("edges: [{kind: following, rate: 50.0}]", r"edges\[0\].rate: expected at most 20 1/s, got 50"),
         ("edges: [{kind: neighbours, rate: -1.0}]", "rate: expected a finite number >= 0"),
+        (
+            "edges: [{kind: neighbours, interaction: {kind: car_following, time_constant: 0.1}, rate: 5.0}]",
+            r"edges\[0\]: expected stable steps, what two nodes .* grows by the factor",
+        ),
         ("edges: [{kind: edge_network, edge_bias: [1.0]}]", "edge_weights: expected 1 x 12 finite numbers"),
     ],
 )
