@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import FloatArray, IntArray, of_classes
 from saga_fg.edge_rules import Pairs
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples
@@ -62,7 +62,7 @@ class Attached:
         require_positive(self, "heading_scale", "speed_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        parts, carriers = (np.flatnonzero(np.isin(nodes.label, names)) for names in (self.attached, self.carriers))
+        parts, carriers = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.attached, self.carriers))
         if len(parts) == 0 or len(carriers) == 0:
             return Pairs(parts[:0], carriers[:0], np.empty(0))
         apart = _distance(nodes.position, parts, carriers) - (nodes.length[parts, None] + nodes.length[carriers]) / 2

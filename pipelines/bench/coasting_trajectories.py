@@ -14,7 +14,7 @@ into folds: what is measured on one was fitted on the others. Intervals are boot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from data_tools.metrics import Interval
 from data_tools.metrics.block_bootstrap import Average, relative_change_of_errors
 from pipelines.figures import FigureTable, cell
+from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.edge_rules import EdgeRule
 from saga_fg.learning import (
@@ -49,7 +50,6 @@ CLASSES = {
 """The classes that are hidden, by kind of recordings; all others are neighbours."""
 GAPS = (1.0, 2.0, 3.0)  # s
 Method = str
-Progress = Callable[[str, int, int], None]
 AVERAGES: tuple[Average, Average] = ("median", "mean")
 STRETCH = 10.0  # s
 

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics import Interval, paired_bootstrap
-from data_tools.metrics.bootstrap import ratio_of_sums
+from data_tools.metrics import Interval, paired_bootstrap, ratio_of_sums
 from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
+from pipelines.bench.measuring import one_thread
 from pipelines.smoothing import SmoothConfig, smooth_known_objects
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
@@ -46,7 +46,7 @@ def hidden_objects(config: SmoothConfig, seeds: Sequence[int], progress: Progres
         object_of = true_objects(scene, evidence, names)
         for edges in (True, False):
             tracker = config.tracking.of_method("saga" if edges else "kf").tracker
-            with threadpool_limits(limits=1, user_api="blas"):
+            with one_thread():
                 states = smooth_known_objects(evidence, object_of, config.smoothing, tracker)
             error = _hidden_errors(scene, evidence, states, names)
             sums[edges].append((float(np.sum(error**2)), float(len(error))))

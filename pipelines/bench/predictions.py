@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from pipelines.bench.measuring import one_thread
 from pipelines.tracking import OnlineTracker
 from saga_fg.arrays import IntArray, StrArray
 from saga_fg.association import assign
@@ -31,7 +31,7 @@ def prediction_errors(
     assert scene.ground_truth is not None
     errors: dict[Asked, float] = {}
     done = 0
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_thread():
         for row in rows:
             time = float(scene.timestamps[row])
             while done < len(scene.frames) and scene.frames[done].timestamp <= time:

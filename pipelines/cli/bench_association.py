@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Verbose, names
+from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, show_tables
 
@@ -29,12 +29,8 @@ def association(
     from data_tools.atomic_files import check_writable
     from pipelines.bench.association import bench_association
     from pipelines.figures import FigureTable, cell, write_figures
-    from saga_fg.errors import InputError
 
-    try:
-        sizes = tuple(int(size) for size in names("--objects", objects))
-    except ValueError:
-        raise InputError(f"--objects: expected whole numbers with commas between them, got {objects!r}") from None
+    sizes = counts("--objects", objects)
     if json_file is not None:
         check_writable(json_file)
     with progress_bar(unit="sizes") as progress:

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.cli.options import Verbose, names
+from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
 
 if TYPE_CHECKING:
@@ -52,14 +52,9 @@ def estimators(
     from data_tools.atomic_files import check_writable
     from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
     from pipelines.figures import write_figures
-    from saga_fg.errors import InputError
 
-    try:
-        numbers = tuple(int(size) for size in names("--sizes", sizes))
-    except ValueError:
-        raise InputError(f"--sizes: expected whole numbers with commas between them, got {sizes!r}") from None
     settings = EstimatorBenchSettings(
-        numbers, frames, seconds, batch_frames, batch_nodes, soak_frames, soak_nodes, seed, everything
+        counts("--sizes", sizes), frames, seconds, batch_frames, batch_nodes, soak_frames, soak_nodes, seed, everything
     )
     if json_file is not None:
         check_writable(json_file)

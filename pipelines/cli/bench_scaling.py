@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Verbose, names
+from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, show_tables
 
@@ -38,12 +38,8 @@ def scaling(
     from data_tools.atomic_files import check_writable
     from pipelines.bench.scaling import ScalingSettings, bench_scaling, write_picture
     from pipelines.figures import FigureTable, cell, write_figures
-    from saga_fg.errors import InputError
 
-    try:
-        sizes = tuple(int(size) for size in names("--objects", objects))
-    except ValueError:
-        raise InputError(f"--objects: expected whole numbers with commas between them, got {objects!r}") from None
+    sizes = counts("--objects", objects)
     for path in (json_file, output):
         if path is not None:
             check_writable(path)

@@ -68,3 +68,11 @@ def names(option: str, value: str) -> tuple[str, ...]:
     if not entries:
         raise InputError(f"{option}: expected names with commas between them, got {value!r}")
     return entries
+
+
+def counts(option: str, value: str) -> tuple[int, ...]:
+    """The entries of a comma-separated option as whole numbers > 0, each once."""
+    entries = names(option, value)
+    if not all(entry.isdecimal() and int(entry) > 0 for entry in entries):
+        raise InputError(f"{option}: expected whole numbers > 0 with commas between them, got {value!r}")
+    return tuple(map(int, entries))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
+from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.learning import (
@@ -18,8 +19,6 @@ from saga_fg.learning import (
     fit_networks,
     sample_gaps,
 )
-
-Progress = Callable[[str, int, int], None]
 
 
 def learn_interactions(

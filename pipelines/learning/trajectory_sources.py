@@ -86,7 +86,7 @@ class TrajectorySource:
         elif self.kind == "simulated":
             from data_tools.simulator import SimulatedTraffic
 
-            if not self.place.isdigit() or int(self.place) == 0:
+            if not self.place.isdecimal() or int(self.place) == 0:
                 raise InputError(f"--data simulated={self.place}: expected a number of scenes")
             dataset = SimulatedTraffic(scenes=int(self.place))
         elif self.kind == "eth_ucy":

@@ -14,12 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.interactions import NodeTable, unit
 from saga_fg.settings import require_positive, setting
 
 CONES = ("traffic_cone", "barrier")
 MIN_SPEED = 1.0  # m/s; who is slower is not pushed, since he goes nowhere
+BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still beside it
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,12 @@ class Edge(NamedTuple):
 
 def edge_before(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) -> Edge:
     """The edge that cones form before `vehicles` (n,), rows of `nodes`."""
-    cones = np.flatnonzero(np.isin(nodes.label, geometry.classes))
+    cones = np.flatnonzero(of_classes(nodes.label, geometry.classes))
     u = unit(nodes.heading[vehicles])
     offset = nodes.position[cones] - nodes.position[vehicles, None]
     ahead = np.einsum("nmi,ni->nm", offset, u)
     left = u[:, None, 0] * offset[..., 1] - u[:, None, 1] * offset[..., 0]
-    known = (ahead > -3.0) & (ahead < geometry.reach) & (np.abs(left) < geometry.corridor)
+    known = (ahead > -BESIDE) & (ahead < geometry.reach) & (np.abs(left) < geometry.corridor)
     order = np.argsort(np.where(known, ahead, np.inf), axis=1)
     ahead, left, known = (np.take_along_axis(x, order, axis=1) for x in (ahead, left, known))
     first = left[:, 0] if len(cones) else np.zeros(len(vehicles))
@@ -68,8 +69,8 @@ def edge_before(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) ->
 def anticipated(nodes: NodeTable, classes: tuple[str, ...], geometry: ConeGeometry) -> FloatArray:
     """Positions (n, 2) of all nodes, those of vehicles moved aside as far as the cones before them will push them."""
     position = nodes.position.copy()
-    vehicles = np.flatnonzero(np.isin(nodes.label, classes))
-    if len(vehicles) == 0 or not np.isin(nodes.label, geometry.classes).any():
+    vehicles = np.flatnonzero(of_classes(nodes.label, classes))
+    if len(vehicles) == 0 or not of_classes(nodes.label, geometry.classes).any():
         return position
     edge = edge_before(nodes, vehicles, geometry)
     pushed = np.where(edge.known & (edge.ahead > 0), edge.demand, 0.0).max(axis=1, initial=0.0)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import IntArray
+from saga_fg.arrays import IntArray, of_classes
 from saga_fg.edge_rules import VEHICLES, Pairs
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.node import NodeType
@@ -71,9 +71,9 @@ class ConeEdge:
         return PassCones(self.cones)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        vehicles = np.flatnonzero(np.isin(nodes.label, self.vehicles))
+        vehicles = np.flatnonzero(of_classes(nodes.label, self.vehicles))
         none = Pairs(vehicles[:0], vehicles[:0], np.empty(0))
-        if len(vehicles) == 0 or not np.isin(nodes.label, self.cones.classes).any():
+        if len(vehicles) == 0 or not of_classes(nodes.label, self.cones.classes).any():
             return none
         edge = edge_before(nodes, vehicles, self.cones)
         distance = self.cones.preview * edge.speed

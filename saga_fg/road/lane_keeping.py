@@ -1,10 +1,11 @@
 r"""Vehicles keep to the centre of their lane, and turn with it.
 
-    dv_i/dt += rate n ( w n.t(s + w / rate) - n.v_i - n.(p_i - f) / tau )
+    dv_i/dt += rate n ( w n.t(s + w lag) - n.v_i - n.(p_i - f) / tau )
 
 with s the place of vehicle i along the lane j, f the nearest point of the centre line, n the normal there, t the
-direction of the lane, and w the vehicle's speed: its sideways velocity relaxes to that of the lane, as far ahead as the
-relaxation lags behind, and its offset is made good within tau. f moves with the lane's own state.
+direction of the lane, and w the vehicle's speed: its sideways velocity relaxes to that of the lane `lag` seconds ahead,
+about what the relaxation lags behind (1 / rate), and its offset is made good within tau. f moves with the lane's own
+state.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import FloatArray, IntArray, of_classes
 from saga_fg.edge_rules import VEHICLES, Pairs
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.node import NodeType
@@ -78,7 +79,7 @@ class InLane:
         require_positive(self, "drift_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        able = np.isin(nodes.label, self.classes)
+        able = of_classes(nodes.label, self.classes)
         if self.cones is not None:
             aside = anticipated(nodes, self.classes, self.cones) - nodes.position
             able &= np.hypot(*aside.T) < PUSHED

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.edge_rules import VEHICLES, Pairs
 from saga_fg.geometry import wrap_angle
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
@@ -52,7 +52,7 @@ class Approach(NamedTuple):
 def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     """How vehicles `target` (E,) stand to stop lines `source` (E,)."""
     offset = nodes.position[source] - nodes.position[target]
-    u = unit(nodes.heading[target])
+    u = facing = unit(nodes.heading[target])
     way = np.einsum("ei,ei->e", offset, u)
     left, right = (np.array([nodes.outline[j][end] for j in source.tolist()]).reshape(-1, 2) for end in (0, 1))
     aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
@@ -65,7 +65,7 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
         centre, width = nodes.outline[lane], nodes.width[lane]
         mine = feet(centre, nodes.position[vehicles]).select(of_vehicle)
         its = feet(centre, nodes.position[lines]).select(of_line)
-        in_lane = (np.abs(mine.e) <= width / 2) & (np.einsum("ei,ei->e", mine.direction, u) > 0)
+        in_lane = (np.abs(mine.e) <= width / 2) & (np.einsum("ei,ei->e", mine.direction, facing) > 0)
         in_lane &= on_it(centre, mine.s)
         crossed = (np.abs(its.e) <= half) & (np.cos(np.arctan2(*its.direction.T[::-1]) - nodes.heading[source]) > 0)
         way = np.where(in_lane & crossed, its.s - mine.s, way)
@@ -128,7 +128,7 @@ class RedLight:
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         lines = np.flatnonzero(nodes.label == STOP_LINE)
-        vehicles = np.flatnonzero(np.isin(nodes.label, self.classes))
+        vehicles = np.flatnonzero(of_classes(nodes.label, self.classes))
         if len(lines) == 0 or len(vehicles) == 0 or nodes.closed is None:
             return Pairs(vehicles[:0], lines[:0], np.empty(0))
         target, source = np.repeat(vehicles, len(lines)), np.tile(lines, len(vehicles))

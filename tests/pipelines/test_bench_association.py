@@ -25,7 +25,9 @@ def test_a_row_for_every_method_and_size(tmp_path: Path) -> None:
         assert row["whole_milliseconds"] > row["milliseconds"] > 0
 
 
-def test_a_number_that_is_none_is_refused() -> None:
-    result = CliRunner().invoke(app, ["bench", "association", "--objects", "many"])
-    assert result.exit_code != 0
-    assert "whole numbers" in result.output
+@pytest.mark.parametrize("objects", ["many", "0", "-3", "5,2.5", "\u00b2"])
+@pytest.mark.parametrize("command", ["association", "scaling"])
+def test_a_number_that_is_none_is_refused(command: str, objects: str) -> None:
+    result = CliRunner().invoke(app, ["bench", command, f"--objects={objects}"])
+    assert result.exit_code == 2
+    assert "--objects: expected whole numbers > 0" in result.output
