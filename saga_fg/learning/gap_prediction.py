@@ -131,7 +131,7 @@ def _dynamics(couplings: Sequence[Coupling], target: EdgeEnds, source: EdgeEnds,
                 D = D - (rate[..., None, None] * m_j[..., :, None] * m_j[..., None, :]).sum(axis=1)
             case _:
                 raise InputError(
-                    "interaction: expected shared velocity, shared course, or car-following with the time constant .inf, "
+                    "interaction: expected shared velocity, shared course, or car-following with time constant .inf, "
                     f"got {interaction}"
                 )
         K = K + total

@@ -102,7 +102,7 @@ def test_no_rate_makes_a_gap_run_away():
 
 def test_a_template_whose_interaction_gaps_do_not_know_is_refused():
     _, sample = gaps_of(following_pairs(pairs=2, moments=80))
-    with pytest.raises(InputError, match=r"with the time constant \.inf, got CarFollowing\(time_constant=4\.0"):
+    with pytest.raises(InputError, match=r"with time constant \.inf, got CarFollowing\(time_constant=4\.0"):
         fit_interactions(sample, 0.02, {"default": 0.3}, [Following(CarFollowing(time_constant=4.0))])
 
 
