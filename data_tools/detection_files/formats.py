@@ -75,6 +75,7 @@ def _read_csv(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
             header = [name.strip() for name in next(reader, [])]
             if len(set(header)) != len(header):
                 raise InputError(f"{path}: line 1: expected every column once, got {', '.join(header)}")
+            _check_names(path, set(header), layout)
             moment = [header.index(name) for name in ("scene", "timestamp") if name in header]
             for lines, rows in _parts(
                 _csv_rows(path, reader, len(header)), most, lambda row: [row[i].strip() for i in moment]
@@ -86,7 +87,6 @@ def _read_csv(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
                     )
                     if name in layout.columns
                 }
-                _check_names(path, set(header), layout)
                 yield RawTable(path, columns, len(rows), partial(_line, lines), numerals=True)
         except csv.Error as error:
             raise InputError(f"{path}: line {reader.line_num}: expected comma-separated values: {error}") from error
