@@ -32,6 +32,8 @@ def name_of(location: str) -> str:
 def local_copy(location: str) -> Iterator[Path]:
     """A local file with the content of `location`, under its name: itself, or a copy for the length of the block.
 
+    An `InputError` that is raised in the block, about the copy, names `location` instead.
+
     Raises `InputError` where it cannot be read, `MissingExtraError` for a URL without the packages it takes.
     """
     if not is_url(location):
@@ -44,7 +46,8 @@ def local_copy(location: str) -> Iterator[Path]:
             file_system.get_file(remote, str(path))
         except Exception as error:  # each protocol has its own
             raise InputError(f"{location}: cannot be read: {type(error).__name__}: {error}") from error
-        yield path
+        with _called(path, location):
+            yield path
 
 
 @contextmanager
@@ -62,7 +65,7 @@ def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
     file_system, remote = _file_system(location)
     remote = remote.rstrip("/")
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+        folder = Path(temporary).resolve()  # the system's folder for such may be a link
         try:
             for found in (name for pattern in patterns for name in sorted(file_system.glob(f"{remote}/{pattern}"))):
                 path = folder / PurePosixPath(found).relative_to(remote)
@@ -74,10 +77,8 @@ def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
             raise
         except Exception as error:  # each protocol has its own
             raise InputError(f"{location}: cannot be read: {type(error).__name__}: {error}") from error
-        try:
+        with _called(folder, location.rstrip("/")):
             yield folder
-        except InputError as error:
-            raise InputError(str(error).replace(str(folder), location.rstrip("/"))) from error
 
 
 def expanded(locations: Sequence[str]) -> list[str]:
@@ -103,6 +104,15 @@ def expanded(locations: Sequence[str]) -> list[str]:
     if not found:
         raise InputError(f"{', '.join(locations)}: expected at least one file, there is none")
     return list(dict.fromkeys(found))
+
+
+@contextmanager
+def _called(copy: Path, location: str) -> Iterator[None]:
+    """In any `InputError` of the block, put the place a copy is of where the copy is named."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace(str(copy), location)) from error
 
 
 def _text(path: Path, location: str) -> str:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.located import located
-from data_tools.remote_files import is_url, local_copy, name_of
+from data_tools.remote_files import local_copy, name_of
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.scale_out.job import OpenedInput, sha256
 from saga_fg.dataset import Dataset, Scene
@@ -101,12 +100,7 @@ class DetectionFileInput:
         from data_tools.detection_files import read_detections
 
         with local_copy(self.url) as path:
-
-            def read() -> Dataset:
-                with located(self.url) if is_url(self.url) else nullcontext():
-                    return read_detections(path)
-
-            yield OpenedInput({name_of(self.url): _file_digest(path)}, read)
+            yield OpenedInput({name_of(self.url): _file_digest(path)}, lambda: read_detections(path))
 
 
 def scene_digests(scene: Scene) -> dict[str, str]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
-from data_tools.remote_files import expanded, local_copy, name_of
+from data_tools.remote_files import expanded, local_copy, local_tree, name_of
 from saga_fg.errors import InputError, MissingExtraError
 
 
@@ -22,6 +23,27 @@ def test_a_path_is_itself_and_a_url_a_copy_that_goes_away(tmp_path: Path) -> Non
         assert path != original
     assert not path.exists()
     assert original.exists()
+
+
+def test_an_error_about_a_copy_names_the_url(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    (tmp_path / "a.csv").write_text("x")
+    url = f"file://{tmp_path}/a.csv"
+    with pytest.raises(InputError) as caught, local_copy(url) as path:
+        raise InputError(f"{path}: line 1: wrong")
+    assert str(caught.value) == f"{url}: line 1: wrong"
+
+
+def test_the_folder_for_temporary_files_may_be_a_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fsspec")
+    for name in ("data", "temporary"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "data" / "a.csv").write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path / "temporary")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "link"))
+    with local_tree(f"file://{tmp_path}/data", ["*.csv"]) as folder:
+        assert (folder / "a.csv").read_text() == "x"
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 def test_names() -> None:
