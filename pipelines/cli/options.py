@@ -55,11 +55,11 @@ def chosen_scenes(dataroot: Path, version: str, split: str | None, scenes: str |
     return split_scenes(dataroot, version, split) if split is not None else names("--scenes", scenes or "")
 
 
-def apart(output: Path, *inputs: Path) -> None:
-    """Raise `InputError` where the output would overwrite what is read."""
+def apart(output: Path, *inputs: Path, option: str = "--output") -> None:
+    """Raise `InputError` where the output, which `option` names, would overwrite what is read."""
     for path in inputs:
         if output.resolve() == path.resolve():
-            raise InputError(f"--output {output}: expected another file than the detections")
+            raise InputError(f"{option} {output}: expected another file than those that are read")
 
 
 def names(option: str, value: str) -> tuple[str, ...]:

@@ -59,7 +59,7 @@ def nuscenes(
 
     chosen, files = chosen_scenes(dataroot, version, split, scenes), sensor_files(detections or [])
     if save is not None:
-        apart(save, result, *files.values())
+        apart(save, result, *files.values(), option="--save")
     _show(result, save, lambda: nuscenes_view(result, dataroot, version, chosen, files, spacing))
 
 
@@ -110,7 +110,7 @@ def file(
     from pipelines.view.sources import table_view
 
     if save is not None:
-        apart(save, result, *([detections] if detections is not None else []))
+        apart(save, result, *([detections] if detections is not None else []), option="--save")
     _show(result, save, lambda: table_view(result, detections))
 
 

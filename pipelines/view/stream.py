@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from data_tools.atomic_files import atomic_file
-from saga_fg.errors import MissingExtraError
+from saga_fg.errors import InputError, MissingExtraError
 
 APPLICATION = "saga-fg"
 Draw = Callable[[Any], None]
@@ -30,14 +30,25 @@ def write_view(path: Path, name: str, roots: Sequence[str], draw: Draw) -> None:
 
     name   of the recording, for the viewer's list
     roots  entities that get a view in space each
+
+    Raises `InputError` where the file cannot be written, `MissingExtraError` without rerun.
     """
     rerun = load_rerun()
     with atomic_file(path) as file:
         stream = rerun.RecordingStream(APPLICATION, recording_id=name)
         stream.save(file.name, default_blueprint=_blueprint(roots))
-        draw(stream)
+        try:
+            draw(stream)
+            _flushed(stream, path)
+        finally:
+            stream.disconnect()
+
+
+def _flushed(stream: Any, path: Path) -> None:
+    try:
         stream.flush()
-        stream.disconnect()
+    except RuntimeError as error:  # rerun writes in a thread of its own, and says no more than that it failed
+        raise InputError(f"{path}: not written, is the disk full? {error}") from error
 
 
 def show_view(name: str, roots: Sequence[str], draw: Draw) -> None:

@@ -169,3 +169,17 @@ def test_without_rerun_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     result = run("file", tmp_path / "t.csv", "--save", tmp_path / "t.rrd")
     assert result.exit_code == 2
     assert 'pip install "saga-fg[view]"' in result.stderr
+
+
+def test_a_file_that_cannot_be_written_to_its_end_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rerun = pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
+
+    def full(stream: Any) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    monkeypatch.setattr(rerun.RecordingStream, "flush", full)
+    with pytest.raises(InputError, match=r"a\.rrd: not written, is the disk full\? File-writer thread"):
+        write_view(tmp_path / "a.rrd", "a", ["world"], lambda stream: None)
+    assert not list(tmp_path.iterdir())
