@@ -23,7 +23,7 @@ import numpy as np
 
 from factors import ERROR_DIM, SolverSettings, marginal_factors, marginal_moments, nonlinear_graph_at, solve
 from factors.solver import Solution
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import FloatArray, checked_covariances
 from saga_fg.ego.batch import TOLERANCE
 from saga_fg.ego.estimate import JointEstimate, read_estimate
 from saga_fg.ego.graph import (
@@ -41,7 +41,7 @@ from saga_fg.ego.settings import JointSettings
 from saga_fg.ego.standing import SlowErrors, standing_probabilities
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
-from saga_fg.geometry import transform_points, yaw_transform
+from saga_fg.geometry import checked_transform, transform_points, yaw_transform
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.landmarks import (
     JointEstimate as LandmarkEstimate,
@@ -76,6 +76,8 @@ class OnlineEstimator:
     lag        s; the window begins at the last moment that is at least so old
     settings   of the graph; mapper: `gate` of telling landmarks apart, `confirm` of the observations for a sure one
     start      first pose (4, 4), by default the identity
+
+    Raises `InputError` for a lag that is none, and a first pose that is none.
     """
 
     def __init__(
@@ -90,7 +92,7 @@ class OnlineEstimator:
             raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._lag, self._settings, self._mapper = lag, settings or JointSettings(), mapper or MapperSettings()
         self._registration = Registration(tracker, self._settings.motion_noise)
-        self._start = np.eye(4) if start is None else start
+        self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._prior = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
         self._record: Keyed = []
@@ -112,13 +114,18 @@ class OnlineEstimator:
         """Take in the next frame, after the vehicle moved by a_T_b (4, 4) since the last one by its odometry.
 
         covariance: (6, 6) of that as in `Odometry`, if the device states one; observations: of landmarks, from the new
-        pose; of the first frame a_T_b is not asked for. Raises `InputError` for a frame that is not later than the
-        last one, or in world coordinates without a pose.
+        pose; of the first frame a_T_b is not asked for. Raises `InputError` for a motion that is missing or none, its
+        covariance likewise, for a frame that is not later than the last one, or in world coordinates without a pose.
         """
-        k = self._record[-1][0] + 1 if self._record else 0
-        increment = np.eye(4) if a_T_b is None else a_T_b
+        if not self._record:
+            k, increment, covariance = 0, np.eye(4), None
+        elif a_T_b is None:
+            raise InputError("a_T_b: expected the motion since the last frame")
+        else:
+            k, increment = self._record[-1][0] + 1, checked_transform("a_T_b", a_T_b)
+            covariance = None if covariance is None else checked_covariances("covariance", [covariance], 1, 6)[0]
         pose = self._predicted(frame.timestamp, increment)
-        moment = self._registration.add(frame, pose, increment, covariance if self._record else None)
+        moment = self._registration.add(frame, pose, increment, covariance)
         self._add(k, moment, pose)
         if not self._record[:-1]:
             self._prior = start_graph(k, pose, self._settings)

@@ -12,6 +12,7 @@ import numpy as np
 
 from factors import ResidualFactors, SpatialPose, Vector, edge_factors
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.errors import InputError
 from saga_fg.settings import require_positive, setting
 
 
@@ -40,7 +41,10 @@ class LaneEdgeLandmark:
 
     def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
         first, second = (observed.reshape(2, 3) @ world_T_pose[:3, :3].T + world_T_pose[:3, 3])[:, :2]
-        along = (second - first) / np.linalg.norm(second - first)
+        length = np.linalg.norm(second - first)
+        if length == 0.0:
+            raise InputError(f"observed {self.name}: expected two ends that are apart from above, got {observed}")
+        along = (second - first) / length
         normal = np.array([-along[1], along[0]])
         rho = float(normal @ (first + second) / 2)
         normal, rho = (normal, rho) if rho >= 0 else (-normal, -rho)

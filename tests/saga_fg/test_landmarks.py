@@ -204,6 +204,7 @@ def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
         (lambda: Observation(PoleLandmark(), [1, 2, np.nan], np.eye(2)), "observed pole"),
         (lambda: Observation(PoleLandmark(), [1, 2, 3], np.eye(3)), "covariance of a pole"),
         (lambda: Observation(PlaneLandmark(), [0, 0, 1, 2], -np.eye(3)), "positive definite"),
+        (lambda: LaneEdgeLandmark().initialise(np.eye(4), np.tile([3.0, 2.0, 0.0], 2)), "two ends that are apart"),
         (lambda: PointLandmark(dim=4), "dim: expected 2 or 3"),
         (lambda: PoleLandmark(density=0.0), "density"),
         (lambda: MapperSettings(gate=0.2), "gate"),
