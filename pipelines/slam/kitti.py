@@ -17,7 +17,6 @@ World coordinates are those of the recording (KITTI: x east, y north, z up, from
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -29,6 +28,7 @@ from data_tools.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.figures import write_figures
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.object_tracks import tracks, tracks_csv
@@ -46,13 +46,12 @@ _COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
 def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
     """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts."""
     truth = Trajectory(scans.timestamps, scans.world_T_ego)
-    residual = scan_to_map_residual(result.clouds, result.world_T_lidar)
     kinds = [landmark.kind.name for landmark in result.landmarks]
     return {
         "keyframes": len(result.keyframes),
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
         "loops": len(result.loops),
-        "scan_to_map_residual": residual if np.isfinite(residual) else None,
+        "scan_to_map_residual": scan_to_map_residual(result.clouds, result.world_T_lidar),
         **{
             name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
             for name in ("odometry", "online", "trajectory")
@@ -85,7 +84,7 @@ def write_lidar_slam(
         driven = () if objects is None else tuple(tracks(objects).values())
         figure = scan_map_from_above(points, paths, _poles(result.landmarks), _lines(result), driven)
         write_bytes(folder / "above.png", png(figure))
-        write_text(folder / "metrics.json", json.dumps(figures, indent=1) + "\n")
+        write_figures(folder / "metrics.json", figures)
     return figures
 
 
@@ -118,7 +117,7 @@ def _write_landmarks(folder: Path, result: LidarSlam) -> None:
         }
         for landmark in result.landmarks
     ]
-    write_text(folder / "landmarks.json", json.dumps(records, indent=1) + "\n")
+    write_figures(folder / "landmarks.json", records)
     start = float(result.world_T_lidar[0, 2, 3])
     drawn, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     for pole in _poles(result.landmarks):

@@ -8,17 +8,17 @@ above.png                          both from above
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar.ply import write_ply
 from data_tools.plots import paths_from_above, png
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
+from pipelines.figures import write_figures
 from saga_fg.arrays import FloatArray
 from saga_fg.landmarks import Landmark
 
@@ -68,9 +68,9 @@ def write_landmark_results(
     with atomic_directory(output) as folder:
         write_tum_poses(folder / "trajectory.tum", trajectory)
         write_kitti_poses(folder / "trajectory.kitti", trajectory)
-        write_text(folder / "landmarks.json", json.dumps(listed, indent=1) + "\n")
+        write_figures(folder / "landmarks.json", listed)
         write_ply(folder / "landmarks.ply", places)
-        write_text(folder / "figures.json", json.dumps(dict(figures), indent=1) + "\n")
+        write_figures(folder / "figures.json", dict(figures))
         write_bytes(folder / "above.png", png(picture))
 
 

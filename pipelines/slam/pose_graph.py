@@ -9,7 +9,6 @@ above.png         guess and optimum from above
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from data_tools.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.pose_graphs import write_g2o
+from pipelines.figures import write_figures
 from saga_fg.arrays import FloatArray
 from saga_fg.pose_graph import OptimisedPoses, PoseGraph
 
@@ -27,7 +27,7 @@ def write_pose_graph(output: Path, graph: PoseGraph, optimised: OptimisedPoses, 
     with atomic_directory(output) as folder:
         write_g2o(folder / "poses.g2o", graph.at(optimised.world_T_pose))
         _write_covariances(folder / "covariances.csv", graph, optimised.covariances())
-        write_text(folder / "errors.json", json.dumps({"best": optimised.start, **errors}, indent=1) + "\n")
+        write_figures(folder / "errors.json", {"best": optimised.start, **errors})
         paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
         write_bytes(folder / "above.png", png(paths_from_above(paths)))
 

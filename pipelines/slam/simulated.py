@@ -10,7 +10,6 @@ above.png                            the paths and the objects from above
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from data_tools.plots import paths_from_above, png
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import SurroundingSettings
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.figures import write_figures
 from pipelines.slam.joint import JointRun
 from pipelines.slam.object_tracks import tracks, tracks_csv
 
@@ -45,7 +45,7 @@ def write_joint(output: Path, run: JointRun) -> None:
         write_text(folder / "tracks.csv", tracks_csv(run.estimate))
         errors = {"odometry": asdict(odometry), "joint": asdict(joint)}
         errors |= {name: asdict(trajectory_errors(path, run.truth)) for name, path in online_paths(run).items()}
-        write_text(folder / "errors.json", json.dumps(errors, indent=1) + "\n")
+        write_figures(folder / "errors.json", errors)
         write_bytes(folder / "above.png", png(picture(run)))
 
 
