@@ -21,6 +21,6 @@ def located(where: str) -> Iterator[None]:
 def unknown(what: str, name: str, known: tuple[str, ...]) -> str:
     """One line on a name that is not among the `known` ones: the nearest of them, and the list if it is short."""
     nearest = get_close_matches(name, known, n=1, cutoff=0.6)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    hint = f"; did you mean {nearest[0]!r}? Expected" if nearest else ", expected"
     shown = ", ".join(known[:12]) + (f", ... ({len(known)} in all)" if len(known) > 12 else "")
-    return f"unknown {what} {name!r}{hint} expected one of: {shown or 'none here'}".replace("? expected", "? Expected")
+    return f"unknown {what} {name!r}{hint} one of: {shown or 'none here'}"
