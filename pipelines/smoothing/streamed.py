@@ -177,10 +177,11 @@ class _Run:
             self._stretch(self._begin, end)
             if last:
                 return
-            self._begin = end
             old = end - margin
             self._taken = [taken for taken in self._taken if taken.time >= old]
             self._moments = self._moments[self._moments >= old]
+            oldest = min([*self._moments[:1].tolist(), *(taken.time for taken in self._taken[:1])], default=end)
+            self._begin = end + max(0.0, (oldest - margin - end) // length) * length  # past stretches of nothing
 
     @property
     def _newest(self) -> float:
@@ -242,9 +243,7 @@ class _Run:
         """Sum up what the stretch says of its objects as wholes."""
         rows = np.flatnonzero((objects.object_of >= 0) & inside[evidence.moment])
         weight = size_weights(evidence.probability, evidence.distance)
-        rows = rows[np.argsort(objects.object_of[rows], kind="stable")]
-        ids, starts = np.unique(objects.object_of[rows], return_index=True)
-        for id_, mine in zip(ids.tolist(), np.split(rows, starts[1:]), strict=True):
+        for id_, mine in _by_id(objects.object_of, rows):
             if id_ in names:
                 seen = evidence.boxes.size[mine]
                 self._lifetimes.seen(names[id_], evidence.probability[mine], seen, weight[mine])
@@ -276,9 +275,7 @@ class _Run:
                 id_: self._turned(labelled, names[id_], id_, before) for id_ in np.unique(states.id[emitted]).tolist()
             }
             inside = np.flatnonzero((states.moment > before) & (states.moment <= at[-1]))
-            order = inside[np.argsort(states.id[inside], kind="stable")]
-            ids, starts = np.unique(states.id[order], return_index=True)
-            for id_, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+            for id_, rows in _by_id(states.id, inside):
                 if id_ in turned:
                     path, votes = float(headings.path[rows].sum()), float(headings.votes[rows].sum())
                     self._lifetimes.given_out(names[id_], turned[id_], float(headings.yaw[rows[-1]]), path, votes)
@@ -295,3 +292,10 @@ class _Run:
     def _turned(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:
         row = labelled.states.rows_of(np.array([before]), np.array([id_]))[0] if before >= 0 else -1
         return self._lifetimes.turned(name, float(labelled.headings.yaw[row]) if row >= 0 else np.nan)
+
+
+def _by_id(id_: IntArray, rows: IntArray) -> Iterator[tuple[int, IntArray]]:
+    """Each id among those of `rows` (m,), ascending, and its rows; id_ (R,)."""
+    rows = rows[np.argsort(id_[rows], kind="stable")]
+    ids, starts = np.unique(id_[rows], return_index=True)
+    yield from zip(ids.tolist(), np.split(rows, starts)[1:], strict=True)

@@ -69,6 +69,22 @@ def test_stretches_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
         assert mine.quality.tolist() == theirs.quality.tolist()
 
 
+@pytest.mark.parametrize("pause", ["frames without detections", "no frames", "no frames for years"])
+def test_stretches_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
+    later = 1e8 if pause == "no frames for years" else 100.0
+    rows = [f"{t},car,5,5,4,2,1.5,0,0.8" for t in (*np.arange(0, 4, 0.5), *np.arange(later, later + 4, 0.5))]
+    if pause == "frames without detections":
+        rows[8:8] = [f"{t},,,,,,,," for t in np.arange(4, later, 0.5)]
+    path = write(tmp_path / "yard.csv", rows)
+    (run,) = smooth_stream(
+        read_scenes_in_parts(path, 5), load_smooth_config("file"), tmp_path, stretches=StretchSettings(5.0, 6.0)
+    )
+    moments = [moment.tracks for _, part in run.spool.labels() for moment in part]
+    seen = [len(tracks) for tracks in moments if tracks.timestamp < 4 or tracks.timestamp >= later]
+    assert seen == [1] * 16
+    assert len(moments) == len(np.unique([row.split(",")[0] for row in rows]))
+
+
 def test_the_command_streams_several_recordings(tmp_path: Path) -> None:
     rows = [f"{name},{row}" for name in ("a", "b") for row in drive(6.0)]
     path = write(tmp_path / "two.csv", rows, f"scene,{HEADER}")
