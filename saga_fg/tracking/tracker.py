@@ -29,7 +29,7 @@ from saga_fg.track import Tracks
 from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.columns import TrackColumns
-from saga_fg.tracking.existence import after_hit, after_miss, reported_score
+from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.matching import associate
 from saga_fg.tracking.merging import duplicates
@@ -40,8 +40,8 @@ from saga_fg.tracking.roadside import Roadside, motion_of
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
 from saga_fg.tracking.standing import Standing
-from saga_fg.tracking.told_covariance import told_covariance
-from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
+from saga_fg.tracking.traffic_flow import TrafficFlow
+from saga_fg.tracking.views import boxes_of, local_origin, nodes_of, passages_of, reported_tracks, speed_deviation
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class Tracker:
         if self._time == -math.inf:
             self._time = timestamp
         if len(self._columns.id) == 0 and len(self.roadside) == 0:
-            self._origin = _origin(frame)
+            self._origin = local_origin(frame)
         delay = max(0.0, self._time - timestamp)
         self.assignment = Assignment.empty()
         if delay > self.max_delay:
@@ -133,7 +133,7 @@ class Tracker:
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self._columns.id) - len(born) :]])
         self.assignment = Assignment(ids, observed.row[rows])
         self._bury()
-        self._columns.ready |= self._speed_deviation() <= self.settings.report_speed_known
+        self._columns.ready |= speed_deviation(self._told()) <= self.settings.report_speed_known
         self._tell("deaths", frame, observed, matching)
         tracks = self._report(self._time)
         self._tell("report", frame, observed, matching)
@@ -220,7 +220,7 @@ class Tracker:
         if len(columns.id) == 0 or len(observed) == 0:
             return Matching.empty()
         position, P, cross = self._predicted_positions(delay)
-        predicted = self._boxes(np.arange(len(columns.id)), position, np.full_like(position, np.nan))
+        predicted = self._boxes(position, np.full_like(position, np.nan))
         expected = columns.existence * sensor.detection_chance(columns.label)
         area = self.settings.association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
         return associate(predicted, P, expected, observed, self.settings, area, cross)
@@ -251,7 +251,7 @@ class Tracker:
         if len(columns.id):
             now = self._told()
             speed = np.hypot(*now.velocity.T)
-            moves = (speed > MOVING) & (speed > 3 * self._speed_deviation())
+            moves = (speed > MOVING) & (speed > 3 * speed_deviation(now))
             self._box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
             columns.has_moved[t] |= moves[t]
 
@@ -283,7 +283,7 @@ class Tracker:
         p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
         if self.settings.existence.occlusion > 0 and observed.viewpoint is not None and missed.any():
             now = self._kinematics()
-            boxes = self._boxes(np.arange(len(columns.id)), now.position, now.velocity)
+            boxes = self._boxes(now.position, now.velocity)
             hidden = self.settings.existence.occlusion * covered(boxes, observed.viewpoint, ~missed)
             p_detect, visible = p_detect * (1 - hidden), visible & (hidden < HIDDEN)
         p, settings = observed.probability[matching.detection], self.settings.existence
@@ -307,29 +307,9 @@ class Tracker:
         """Where detected tracks pass, for those that are born after them."""
         if self.settings.flow.weight == 0:
             return
-        rows, now = matching.track, self._kinematics()
-        yaw = self._box.yaw[rows]
-        ahead = np.nan_to_num(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1))
-        speed = np.einsum("ni,ni->n", ahead, now.velocity[rows])
-        variance = np.einsum("ni,nij,nj->n", ahead, now.P_velocity[rows], ahead)
-        columns = self._columns
-        self._flow.pass_by(
-            Passages(
-                columns.id[rows],
-                columns.label[rows],
-                now.position[rows] + self._origin,
-                yaw,
-                speed,
-                variance,
-                self._standing.belief[rows],
-                np.full(len(rows), self._time),
-            )
-        )
-
-    def _speed_deviation(self) -> FloatArray:
-        """(n,) standard deviation of the velocity in a mean direction, m/s."""
-        P = self._told().P_velocity
-        return np.asarray(np.sqrt((P[:, 0, 0] + P[:, 1, 1]) / 2))
+        now, stands = self._kinematics(), self._standing.belief
+        passages = passages_of(self._columns, self._box, matching.track, now, stands, self._origin, self._time)
+        self._flow.pass_by(passages)
 
     def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
@@ -380,21 +360,9 @@ class Tracker:
             self._evidence.select(~dead)
 
     def _report(self, timestamp: float) -> Tracks:
-        columns, settings = self._columns, self.settings
-        coasting = np.maximum(self._time - columns.last_seen, 0.0)
-        shown = (
-            (columns.accepted | (settings.unconfirmed_share > 0))
-            & (columns.confirmed | (columns.existence >= settings.existence.report))
-            & (coasting <= settings.report_coasting)
-            & columns.ready
+        return reported_tracks(
+            timestamp, self._columns, self._box, self._told(), self._origin, self._time, self.settings
         )
-        rows = np.flatnonzero(shown)
-        position, velocity, P, P_velocity = (column[rows] for column in self._told())
-        boxes = self._boxes(rows, position, velocity)
-        P = told_covariance(P, boxes.yaw, columns.told[rows], columns.shared[rows])
-        score = reported_score(columns, coasting > 0, settings.existence)[rows]
-        score = np.where(columns.accepted[rows], score, settings.unconfirmed_share * score)
-        return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])
 
     # views on the state
 
@@ -417,11 +385,10 @@ class Tracker:
             self._time, sensor, columns, self._nodes(), P, self._origin, self.graph, observed, matching, born
         )
 
-    def _boxes(self, rows: IntArray, position: FloatArray, velocity: FloatArray) -> Boxes:
-        """Tracks `rows` (k,) at local positions (k, 2) with velocities (k, 2), in the world."""
-        box = self._box
-        centre = np.concatenate([position + self._origin, box.z[rows, None]], axis=1)
-        return Boxes(self._columns.label[rows], centre, box.size[rows], box.yaw[rows], velocity)
+    def _boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
+        """All tracks at local positions (n, 2) with velocities (n, 2), in the world."""
+        rows = np.arange(len(self._columns.id))
+        return boxes_of(self._columns, self._box, rows, position + self._origin, velocity)
 
     def _kinematics(self) -> Kinematics:
         return self._state.kinematics(self._columns.id, self._columns.label)
@@ -433,34 +400,10 @@ class Tracker:
 
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them: the tracks, then the nodes of the roadside."""
-        columns, box = self._columns, self._box
-        position, velocity, _, P_velocity = self._told()
-        heading = np.where(np.isfinite(box.yaw), box.yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
-        tracks = NodeTable(
-            columns.id,
-            columns.label,
-            self._state.types_of(columns.label),
-            position,
-            velocity,
-            heading,
-            np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
-            (P_velocity[:, 0, 0] + P_velocity[:, 1, 1]) / 2,
-            columns.has_moved,
-        )
+        types = self._state.types_of(self._columns.label)
+        tracks = nodes_of(self._columns, self._box, types, self._told())
         return self.roadside.beside(tracks, self._origin, self._state)
 
     def _of_class(self, name: str, label: StrArray) -> FloatArray:
         """(n,) a class setting for each label."""
         return class_values(self.settings.classes, name, label)
-
-
-def _origin(frame: Frame) -> FloatArray:
-    """The local origin of a scene, (2,): where the vehicle, else the first detection, is first.
-
-    Global coordinates reach 4e6 m and would eat the digits.
-    """
-    if frame.world_T_ego is not None:
-        return np.round(frame.world_T_ego[:2, 3])
-    if len(frame):
-        return np.round(frame.detections.boxes.position[0, :2])
-    return np.zeros(2)

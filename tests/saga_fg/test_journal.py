@@ -122,6 +122,22 @@ def test_the_effect_of_an_edge_is_the_prediction_with_less_that_without() -> Non
         np.testing.assert_allclose(np.concatenate([effect.position, effect.velocity]), change, atol=1e-12)
 
 
+def test_a_view_stays_as_it_was() -> None:
+    views: list[TrackerView] = []
+
+    class Keep:
+        def after(self, stage: str, view) -> None:
+            views.append(view())
+
+    tracker = Tracker(SETTINGS, observer=Keep())
+    for k in range(20):
+        tracker.step(frame(0.1 * k, 10.0 + k))
+    before = next(view for view in views if len(view.columns.id))
+    assert before.nodes.has_moved is not None
+    assert before.nodes.has_moved.tolist() == before.columns.has_moved.tolist() == [False]
+    assert views[-1].columns.has_moved.tolist() == [True]
+
+
 def test_an_observer_is_told_every_stage_in_turn() -> None:
     stages: list[str] = []
 
