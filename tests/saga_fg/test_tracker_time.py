@@ -66,7 +66,8 @@ def test_how_often_somebody_looks_does_not_change_where_things_are():
         a, b = few.tracks(3.0), many.tracks(3.0)
         assert a.id.tolist() == b.id.tolist()
         assert b.boxes.position == pytest.approx(a.boxes.position, abs=tolerance)
-        assert b.position_covariance == pytest.approx(a.position_covariance, rel=0.05, abs=1e-9)
+        # headings turn with velocities from step to step, which correlates x and y by a millionth of their variances
+        assert b.position_covariance == pytest.approx(a.position_covariance, rel=0.05, abs=1e-5)
 
 
 def test_two_sensors_at_the_same_instant():
