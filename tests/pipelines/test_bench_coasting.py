@@ -1,10 +1,17 @@
 """`saga-fg bench coasting` on simulated traffic."""
 
+import math
+
 import numpy as np
+from following_pairs import RATE, following_pairs
 from typer.testing import CliRunner
 
+from pipelines.bench import coasting_trajectories
 from pipelines.bench.coasting_trajectories import CoastingErrors, coasting_figures
 from pipelines.cli.main import app
+from saga_fg.edge_rules import Following
+from saga_fg.interactions import CarFollowing
+from saga_fg.learning import FittedInteractions
 
 
 def test_figures_are_those_of_the_errors_at_the_end_of_each_gap():
@@ -25,7 +32,28 @@ def test_figures_are_those_of_the_errors_at_the_end_of_each_gap():
     assert rows[1.0, "kf"].mean_change is None
 
 
-def test_the_command_writes_its_figures(tmp_path):
+def test_a_recording_is_judged_by_what_the_others_taught(monkeypatch):
+    """Drawn pairs, whose cars follow as the rule says that takes the place of what is learned."""
+    rule, taught_by = Following(CarFollowing(time_constant=math.inf), rate=RATE, gap_scale=100.0), []
+
+    def fit(sample, position_noise, acceleration_noise):
+        taught_by.append(set(sample.recording.tolist()))
+        return FittedInteractions((rule,), acceleration_noise, 0.0, 0.0)
+
+    monkeypatch.setattr(coasting_trajectories, "fit_interactions", fit)
+    recordings = {str(seed): following_pairs(pairs=2, moments=80, seed=seed) for seed in range(2)}
+    errors, learned = coasting_trajectories.coasting_errors(recordings, ("car",), ())
+    assert taught_by == [{1}, {0}], "no fold is tested on what it was fitted to"
+    assert len(learned) == 2
+    np.testing.assert_allclose(
+        errors.errors["hand-crafted"], errors.errors["kf"], atol=1e-6, err_msg="no rules: independent objects"
+    )
+    kf, ours = (errors.of(method, "car", 2.0) for method in ("kf", "learned"))
+    assert len(kf) > 20
+    assert ours.mean() < 0.9 * kf.mean()
+
+
+def test_the_command_refuses_what_it_cannot_judge_by(tmp_path):
     out = tmp_path / "coasting.json"
     result = CliRunner().invoke(app, ["bench", "coasting", "--data", "file=x.csv"])
     assert result.exit_code == 2
