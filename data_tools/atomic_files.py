@@ -50,20 +50,7 @@ def atomic_directory(path: str | Path) -> Iterator[Path]:
     A `path` that does not exist, or is empty, appears in one step. In one that has files already, each new file
     replaces its namesake in one step and other files stay. Raises `InputError` as `atomic_file` does.
     """
-    final = _final(path)
-    if final.exists() and not final.is_dir():
-        raise InputError(f"{path}: expected the name of a folder to write to, this is a file")
-    temporary = _temporary(final)
-    try:
-        temporary.mkdir()
-        if final.exists():  # writable as well? (the temporary folder lies beside it)
-            probe = _temporary(final / "probe")
-            probe.touch()
-            probe.unlink()
-    except OSError as error:
-        with suppress(OSError):
-            temporary.rmdir()
-        raise _not_writable(final, error) from error
+    final, temporary = _opened_folder(path)
     try:
         with _disk_full(final):
             yield temporary
@@ -90,6 +77,12 @@ def check_writable(path: str | Path) -> None:
     temporary.unlink()
 
 
+def check_writable_folder(path: str | Path) -> None:
+    """Raise the `InputError` that `atomic_directory` would raise: before long work, not after it."""
+    _, temporary = _opened_folder(path)
+    temporary.rmdir()
+
+
 def remove_leftovers(folder: str | Path, of: str | None = None) -> None:
     """Remove the temporary files of this module that killed processes have left in a folder; nobody may be writing.
 
@@ -113,6 +106,25 @@ def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:
     except OSError as error:
         raise _not_writable(final, error) from error
     return final, temporary, file
+
+
+def _opened_folder(path: str | Path) -> tuple[Path, Path]:
+    """The folder to write, and its temporary stand-in, which is empty."""
+    final = _final(path)
+    if final.exists() and not final.is_dir():
+        raise InputError(f"{path}: expected the name of a folder to write to, this is a file")
+    temporary = _temporary(final)
+    try:
+        temporary.mkdir()
+        if final.exists():  # writable as well? (the temporary folder lies beside it)
+            probe = _temporary(final / "probe")
+            probe.touch()
+            probe.unlink()
+    except OSError as error:
+        with suppress(OSError):
+            temporary.rmdir()
+        raise _not_writable(final, error) from error
+    return final, temporary
 
 
 def _final(path: str | Path) -> Path:

@@ -40,6 +40,7 @@ def g2o(
       saga-fg slam g2o MIT.g2o --output MIT --compare
       saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
     """
+    from data_tools.atomic_files import check_writable_folder
     from data_tools.pose_graphs import read_g2o
     from factors import Robust
     from pipelines.slam.pose_graph import write_pose_graph
@@ -51,6 +52,7 @@ def g2o(
         raise InputError("--compare: expected without --robust, GTSAM's optimisers are run without a loss")
     if not 0 < robust_scale < math.inf:
         raise InputError(f"--robust-scale {robust_scale:g}: expected a number > 0")
+    check_writable_folder(output)
     loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
     with working("optimising"):

@@ -54,7 +54,7 @@ def kitti(
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
-    from data_tools.atomic_files import atomic_directory
+    from data_tools.atomic_files import check_writable_folder
     from data_tools.kitti import KittiScans, KittiTracking
     from pipelines.config import load_config
     from pipelines.slam.kitti import write_lidar_slam
@@ -66,6 +66,7 @@ def kitti(
         raise InputError("--detections: expected with --objects only")
     if online and not objects:
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
+    check_writable_folder(output)
     frames, tracker = [], load_config("kitti", config)
     if objects:
         detector = detections or dataroot / "detections" / "pointrcnn"
@@ -73,10 +74,6 @@ def kitti(
     training = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
     blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
     recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
-    if not output.exists():
-        with atomic_directory(output):
-            pass  # a folder that cannot be written is said before the work, not after it
-        output.rmdir()
     with progress_bar() as progress:
         settings = LidarSlamSettings(landmarks=landmarks and not blind, loop_closures=not blind)
         result = lidar_slam(recorded, odometry, settings, progress)

@@ -25,10 +25,12 @@ def plaza(
     Example:
       saga-fg slam plaza Plaza2_DR.txt --output plaza2
     """
+    from data_tools.atomic_files import check_writable_folder
     from data_tools.plaza import read_plaza
     from pipelines.slam.landmark_results import LandmarkRecord, planar_trajectory, write_landmark_results
     from pipelines.slam.plaza import compared, map_beacons
 
+    check_writable_folder(output)
     drive = read_plaza(file)
     with working("solving"):
         beacons = map_beacons(drive)

@@ -34,6 +34,7 @@ def simulated(
     """
     from dataclasses import replace
 
+    from data_tools.atomic_files import check_writable_folder
     from data_tools.simulator import simulate_scene
     from data_tools.trajectories import trajectory_errors
     from pipelines.config import load_config
@@ -41,6 +42,7 @@ def simulated(
     from pipelines.slam.simulated import online_paths, street, write_joint
     from saga_fg.ego import JointSettings
 
+    check_writable_folder(output)
     scene = simulate_scene(replace(street(), duration=duration), seed)
     with working("estimating"):
         window = lag if online else None

@@ -34,6 +34,7 @@ def victoria_park(
     """
     import numpy as np
 
+    from data_tools.atomic_files import check_writable_folder
     from data_tools.metrics.grouping import pairwise_agreement
     from data_tools.victoria_park import read_victoria_park
     from pipelines.slam.landmark_results import planar_trajectory, records, write_landmark_results
@@ -42,6 +43,7 @@ def victoria_park(
     if odometry_scale is not None and not 0 < odometry_scale < np.inf:
         raise InputError(f"--odometry-scale {odometry_scale:g}: expected a number > 0")
     settings = ParkSettings() if odometry_scale is None else ParkSettings(odometry_scales=(odometry_scale,))
+    check_writable_folder(output)
     drive = read_victoria_park(file)
     with progress_bar(unit="poses") as progress:
         park = map_park(drive, settings, progress)

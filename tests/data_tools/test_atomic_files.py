@@ -8,6 +8,7 @@ from data_tools.atomic_files import (
     atomic_directory,
     atomic_file,
     check_writable,
+    check_writable_folder,
     remove_leftovers,
     write_bytes,
     write_text,
@@ -165,6 +166,18 @@ def test_a_path_is_checked_before_long_work(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "missing" / "new.json"):
         with pytest.raises(InputError, match=path.name):
             check_writable(path)
+
+
+def test_so_is_a_folder(tmp_path: Path) -> None:
+    check_writable_folder(tmp_path / "new")
+    (tmp_path / "there").mkdir()
+    check_writable_folder(tmp_path / "there")
+    (tmp_path / "file").touch()
+    assert names(tmp_path) == ["file", "there"]
+    assert names(tmp_path / "there") == []
+    for path in (tmp_path / "missing" / "new", tmp_path / "file"):
+        with pytest.raises(InputError, match=str(path)):
+            check_writable_folder(path)
 
 
 def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:
