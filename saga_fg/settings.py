@@ -23,6 +23,11 @@ def setting(default: Any, comment: str) -> Any:
     return field(default=default, metadata={"comment": comment})
 
 
+def required_setting(comment: str) -> Any:
+    """A dataclass field without a default, with a comment for people."""
+    return field(metadata={"comment": comment})
+
+
 def settings_group(factory: Callable[[], Any], comment: str) -> Any:
     """A dataclass field that holds further settings (a nested dataclass, a mapping, a tuple), made by `factory`."""
     return field(default_factory=factory, metadata={"comment": comment})

@@ -14,7 +14,7 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import require_positive, required_setting, setting
 
 Point = tuple[float, float]
 LIGHT, STOP_LINE, LANE = "traffic_light", "stop_line", "lane"
@@ -25,8 +25,8 @@ ROADSIDE = (LIGHT, STOP_LINE, LANE)  # classes of the nodes that a map brings
 class TrafficLight:
     """A traffic light that can be seen, known by its name."""
 
-    name: str
-    position: Point
+    name: str = required_setting("the light's own")
+    position: Point = required_setting("(x, y), m")
 
     def __post_init__(self) -> None:
         _require_name(self.name)
@@ -37,10 +37,10 @@ class TrafficLight:
 class StopLine:
     """Where a red light stops traffic; `left` and `right` are its ends as the drivers see them who come to it."""
 
-    name: str
-    left: Point
-    right: Point
-    light: str
+    name: str = required_setting("the line's own")
+    left: Point = required_setting("its left end (x, y), m")
+    right: Point = required_setting("its right end (x, y), m")
+    light: str = required_setting("name of the light that governs it")
 
     def __post_init__(self) -> None:
         _require_name(self.name)
@@ -64,9 +64,9 @@ class StopLine:
 class Lane:
     """A lane: its centre line in the direction of travel."""
 
-    name: str
-    centre: tuple[Point, ...]
-    width: float = setting(3.5, "m")
+    name: str = required_setting("the lane's own")
+    centre: tuple[Point, ...] = required_setting("points (x, y) of its centre line in the direction of travel, m")
+    width: float = setting(3.5, "width, m")
 
     def __post_init__(self) -> None:
         _require_name(self.name)
