@@ -21,7 +21,7 @@ Config = Annotated[
 Online = Annotated[
     bool, typer.Option("--online", help="Estimate online too, with a fixed-lag smoother, beside the full batch.")
 ]
-Lag = Annotated[float, typer.Option("--lag", min=0.0, help="Length of the window of --online, s.")]
+Lag = Annotated[float | None, typer.Option("--lag", min=0.0, help="Length of the window of --online, s.  [default: 3]")]
 
 
 def sensor_files(values: Sequence[str]) -> dict[str, Path]:
@@ -44,6 +44,13 @@ def sensor_locations(values: Sequence[str]) -> dict[str, str]:
             raise InputError(f"--detections {value}: the sensor {sensor} is given twice")
         files[sensor] = path
     return files
+
+
+def online_window(online: bool, lag: float | None) -> float | None:
+    """Length of the window, s, None without --online. Raises `InputError` where --lag would have no effect."""
+    if lag is not None and not online:
+        raise InputError(f"--lag {lag:g}: expected with --online only")
+    return (3.0 if lag is None else lag) if online else None
 
 
 def chosen_scenes(dataroot: Path, version: str, split: str | None, scenes: str | None) -> tuple[str, ...]:

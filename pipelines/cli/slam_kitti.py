@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Lag, Online, Verbose
+from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.cli.reporting import progress_bar, working
 from pipelines.cli.summary import counted
 
@@ -37,7 +37,7 @@ def kitti(
         ),
     ] = None,
     online: Online = False,
-    lag: Lag = 3.0,
+    lag: Lag = None,
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
     config: Config = None,
     verbose: Verbose = False,
@@ -66,6 +66,7 @@ def kitti(
         raise InputError("--detections: expected with --objects only")
     if online and not objects:
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
+    window = online_window(online, lag)
     check_writable_folder(output)
     frames, tracker = [], load_config("kitti", config)
     if objects:
@@ -79,7 +80,7 @@ def kitti(
         result = lidar_slam(recorded, odometry, settings, progress)
     if objects:
         with working("objects"):
-            together = with_objects(result, recorded, frames, tracker, settings, lag if online else None)
+            together = with_objects(result, recorded, frames, tracker, settings, window)
             figures = write_lidar_slam(output, together, recorded)
     else:
         figures = write_lidar_slam(output, result, recorded)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Config, Lag, Online, Verbose
+from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.cli.reporting import working
 
 
@@ -16,7 +16,7 @@ def simulated(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the scene and of the odometry's errors.")] = 0,
     duration: Annotated[float, typer.Option("--duration", min=2.0, help="Length of the drive, s.")] = 20.0,
     online: Online = False,
-    lag: Lag = 3.0,
+    lag: Lag = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -42,14 +42,14 @@ def simulated(
     from pipelines.slam.simulated import online_paths, street, write_joint
     from saga_fg.ego import JointSettings
 
+    window = online_window(online, lag)
     check_writable_folder(output)
     scene = simulate_scene(replace(street(), duration=duration), seed)
     with working("estimating"):
-        window = lag if online else None
         run = run_joint(scene, load_config("simulated", config), JointSettings(), "lidar", seed, lag=window)
         write_joint(output, run)
     odometry, joint = run.errors()
     typer.echo(f"{output}: {joint.poses} poses over {joint.path_length:.0f} m")
     typer.echo(f"ATE: odometry {odometry.ate:.3f} m, joint {joint.ate:.3f} m")
     for name, path in online_paths(run).items():
-        typer.echo(f"{name} (lag {lag:g} s): ATE {trajectory_errors(path, run.truth).ate:.3f} m")
+        typer.echo(f"{name} (lag {window:g} s): ATE {trajectory_errors(path, run.truth).ate:.3f} m")

@@ -48,6 +48,13 @@ def test_a_simulated_street(tmp_path: Path) -> None:
     assert (output / "above.png").stat().st_size > 1000
 
 
+def test_a_window_without_the_online_estimate_is_refused(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["slam", "simulated", "--lag", "2", "--output", str(tmp_path / "street")])
+    assert done.exit_code != 0
+    assert "--lag 2: expected with --online only" in done.output
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None:
     scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
     settings = JointSettings(rounds=1, keyframe_period=0.15)
