@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -80,9 +79,10 @@ def occlusion(
       saga-fg bench occlusion
       saga-fg bench occlusion --scenes 20 --seed 100 --json figures.json
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from pipelines.bench.occlusion import occlusion as run
     from pipelines.config import load_config
+    from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 
     fit_seeds, seeds = range(fit_seed, fit_seed + fit_scenes), range(seed, seed + scenes)
@@ -117,7 +117,7 @@ def occlusion(
             "hidden_rmse": {method: m.carried.rmse for method, m in result.hidden.items()},
             "hidden_change": asdict(result.hidden_change),
         }
-        write_text(json_file, json.dumps(figures, indent=1) + "\n")
+        write_figures(json_file, figures)
 
 
 @bench_app.command()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
@@ -36,11 +35,12 @@ def fusion(
       saga-fg bench fusion
       saga-fg bench fusion --scenes 4 --method kf --json figures.json
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from data_tools.simulator import SimulatorSettings
     from pipelines.bench.fusion import fusion as run
     from pipelines.config import load_config
     from pipelines.configuration import load_settings
+    from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)
@@ -66,4 +66,4 @@ def fusion(
     for name, share in result.survival.items():
         typer.echo(f"  {name}: {100 * share:.1f} %")
     if json_file is not None:
-        write_text(json_file, json.dumps(asdict(result), indent=1) + "\n")
+        write_figures(json_file, asdict(result))

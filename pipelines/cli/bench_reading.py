@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
@@ -34,9 +33,10 @@ def reading(
       saga-fg bench reading --scenes 20
       saga-fg bench reading
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from pipelines.bench.large_tables import TableSize, write_large_tables
     from pipelines.bench.reading import bench_reading
+    from pipelines.figures import write_figures
 
     size = TableSize(scenes=scenes, detections=detections)
     if json_file is not None:
@@ -52,4 +52,4 @@ def reading(
     typer.echo(f"read {counted(figures.scenes, 'scene')}, {read} in {figures.seconds:.0f} s of CPU time")
     typer.echo(f"peak memory {figures.peak:.0f} MB, of which {figures.start:.0f} MB before anything was read")
     if json_file is not None:
-        write_text(json_file, json.dumps({"rows": size.rows, **asdict(figures)}, indent=1) + "\n")
+        write_figures(json_file, {"rows": size.rows, **asdict(figures)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -34,8 +33,9 @@ def service(
       saga-fg bench service
       saga-fg bench service --frames 2000 --objects 10 --json figures.json
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from pipelines.bench.service import ServiceBenchSettings, bench_service
+    from pipelines.figures import write_figures
 
     settings = ServiceBenchSettings(frames=frames, objects=objects, malformed=malformed, late=late, seed=seed)
     if json_file is not None:
@@ -54,6 +54,6 @@ def service(
         f"p99.9 / median {latency['p99.9'] / latency['p50']:.2f}"
     )
     if json_file is not None:
-        write_text(json_file, json.dumps({**asdict(result), "nothing_lost": result.nothing_lost}, indent=1) + "\n")
+        write_figures(json_file, {**asdict(result), "nothing_lost": result.nothing_lost})
     if not result.nothing_lost:
         raise SagaError("frames were lost, doubled or wrongly refused")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -40,9 +39,10 @@ def slam(
     Example:
       saga-fg bench slam --dataroot data/kitti --sequence 0000
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from data_tools.kitti import KittiScans
     from pipelines.bench.slam import bench_slam
+    from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)
@@ -50,7 +50,7 @@ def slam(
         rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress)
     _print(rows, sequence)
     if json_file is not None:
-        write_text(json_file, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        write_figures(json_file, [asdict(row) for row in rows])
 
 
 def _print(rows: list[SlamRow], sequence: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -44,8 +43,9 @@ def streaming(
       saga-fg bench streaming --seconds 3600      # an hour
       saga-fg bench streaming --file --seconds 120 --compared 60
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.atomic_files import check_writable
     from pipelines.bench.streaming import StreamingBenchSettings, bench_streaming
+    from pipelines.figures import write_figures
 
     settings = StreamingBenchSettings(objects, seconds, rate, compared=compared, seed=seed)
     if json_file is not None:
@@ -66,12 +66,12 @@ def streaming(
         f"largest difference from the batch smoother in {compared:g} s: {result.largest_difference:.1e} m or m/s"
     )
     if json_file is not None:
-        write_text(json_file, json.dumps({"settings": asdict(settings), **asdict(result)}, indent=1) + "\n")
+        write_figures(json_file, {"settings": asdict(settings), **asdict(result)})
 
 
 def _file(settings: StreamingBenchSettings, json_file: Path | None) -> None:
-    from data_tools.atomic_files import write_text
     from pipelines.bench.streamed_files import bench_files
+    from pipelines.figures import write_figures
 
     with progress_bar() as progress:
         result = bench_files(settings, progress)
@@ -85,4 +85,4 @@ def _file(settings: StreamingBenchSettings, json_file: Path | None) -> None:
         f"{result.differing} of {result.compared} boxes in one of the two alone"
     )
     if json_file is not None:
-        write_text(json_file, json.dumps({"settings": asdict(settings), **asdict(result)}, indent=1) + "\n")
+        write_figures(json_file, {"settings": asdict(settings), **asdict(result)})
