@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from saga_fg.errors import InputError
-from saga_fg.settings import setting, settings_group
+from saga_fg.settings import require_between, setting, settings_group
 
 Range = tuple[float, float]
 
@@ -112,6 +112,9 @@ class CyclistSettings:
 
     def __post_init__(self) -> None:
         _require_positive(self, "speed", "change_time")
+        require_between(self, 0, math.inf, "spread")
+        if not 0 <= self.count[0] <= self.count[1]:
+            raise InputError(f"count: expected two growing numbers >= 0, got {self.count}")
 
 
 @dataclass(frozen=True)
@@ -127,8 +130,8 @@ class RoadworkSettings:
 
     def __post_init__(self) -> None:
         _require_positive(self, "taper", "row", "spacing", "notice")
-        if not 0 <= self.probability <= 1:
-            raise InputError(f"probability: expected a share in [0, 1], got {self.probability}")
+        require_between(self, 0, 1, "probability")
+        require_between(self, 0, math.inf, "early")
 
 
 @dataclass(frozen=True)
@@ -139,6 +142,9 @@ class LightSettings:
     mapped: bool = setting(False, "whether frames bring a map along, of lights, stop lines and lanes")
     map_noise: float = setting(0.2, "standard deviation of the places in the map, m")
     visible_range: float = setting(80.0, "the colour of a light can be seen from this far, m")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "amber_duration", "map_noise", "visible_range")
 
 
 @dataclass(frozen=True)
@@ -199,6 +205,8 @@ class SensorSettings:
         _require_positive(self, "rate", "max_range", "reach", "fading")
         if not 0 < self.field_of_view <= 2 * math.pi + 1e-9:
             raise InputError(f"field_of_view: expected an angle in (0, 2 pi] rad, got {self.field_of_view}")
+        if self.colour_accuracy is not None:
+            require_between(self, 0, 1, "colour_accuracy")
         if not 0 <= self.detection_probability <= 1:
             raise InputError(f"detection_probability: expected a share in [0, 1], got {self.detection_probability}")
         if not self.hidden_share < self.clear_share:

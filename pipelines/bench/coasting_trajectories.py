@@ -25,6 +25,7 @@ from pipelines.figures import FigureTable, cell
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.edge_rules import EdgeRule
+from saga_fg.errors import InputError
 from saga_fg.learning import (
     FittedInteractions,
     GapSample,
@@ -89,7 +90,10 @@ def coasting_errors(
     settings: GapSettings | None = None,
     progress: Progress | None = None,
 ) -> tuple[CoastingErrors, list[FittedInteractions]]:
-    """Fit and measure on some recordings of one kind, fold by fold; returns what each fold learned, too."""
+    """Fit and measure on some recordings of one kind, fold by fold; returns what each fold learned, too.
+
+    Raises `InputError` where the recordings of a fold have nothing to learn from.
+    """
     settings = settings or GapSettings()
     names = list(recordings)
     folds = min(folds, len(names))
@@ -100,6 +104,10 @@ def coasting_errors(
         training = [k for k in range(len(names)) if k % folds != fold]
         own = OwnMotion.most_likely([likelihoods[k] for k in training])
         sample = GapSample.pool([_sample(recordings[names[k]], own, classes, settings, k) for k in training])
+        if len(sample) == 0:
+            taught = ", ".join(names[k] for k in training)
+            wanted = f"some {' or '.join(classes)}, followed for {settings.followed:g} s"
+            raise InputError(f"recordings {taught}: expected {wanted}")
         fitted = fit_interactions(sample, own.position_noise, own.acceleration_noise)
         learned.append(fitted)
         for k in range(fold, len(names), folds):

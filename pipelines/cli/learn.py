@@ -75,6 +75,7 @@ def interactions(
     check_writable(output)
     chosen = names("--recordings", recordings) if recordings is not None else None
     source = TrajectorySource.parsed(data, chosen, detections)
+    apart(output, *source.files)
     found = source.trajectories()
     told = "tracks" if detections is not None or source.kind == "file" else "trajectories"
     origin = f"{told} of {counted(len(found), 'recording')}, {source.kind}: {', '.join(found)}"

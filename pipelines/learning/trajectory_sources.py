@@ -56,6 +56,12 @@ class TrajectorySource:
         """The kind of data whose configuration fits."""
         return FAMILIES.get(self.kind, "nuscenes")
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that are named to be read; the folders of data sets are not among them."""
+        table = (Path(self.place),) if self.kind == "file" else ()
+        return table if self.detections is None else (*table, self.detections)
+
     def trajectories(self) -> dict[str, Trajectories]:
         """By recording. Raises `InputError` for what cannot be read."""
         from pipelines.config import load_config

@@ -12,7 +12,13 @@ from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import SCENARIOS, ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in
-from data_tools.simulator.settings import CyclistSettings, RoadworkSettings, TrafficSettings
+from data_tools.simulator.settings import (
+    CyclistSettings,
+    LightSettings,
+    RoadworkSettings,
+    SensorSettings,
+    TrafficSettings,
+)
 from data_tools.simulator.world import World, build_world
 from saga_fg.errors import InputError
 from saga_fg.road import SIGHTINGS
@@ -160,10 +166,14 @@ def test_a_scene_is_the_same_for_the_same_seed(name: ScenarioName) -> None:
 
 
 def test_settings_out_of_range_are_refused() -> None:
-    for make in (
-        lambda: TrafficSettings(trailer_share=1.2),
-        lambda: RoadworkSettings(probability=-0.1),
-        lambda: CyclistSettings(speed=(0.0, 3.0)),
+    for name, make in (
+        ("trailer_share", lambda: TrafficSettings(trailer_share=1.2)),
+        ("probability", lambda: RoadworkSettings(probability=-0.1)),
+        ("early", lambda: RoadworkSettings(early=float("nan"))),
+        ("speed", lambda: CyclistSettings(speed=(0.0, 3.0))),
+        ("count", lambda: CyclistSettings(count=(5, 2))),
+        ("map_noise", lambda: LightSettings(map_noise=-1.0)),
+        ("colour_accuracy", lambda: SensorSettings(colour_accuracy=2.0)),
     ):
-        with pytest.raises(InputError):
+        with pytest.raises(InputError, match=f"^{name}: "):
             make()

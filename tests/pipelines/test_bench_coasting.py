@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 from following_pairs import RATE, following_pairs
 from typer.testing import CliRunner
 
@@ -10,6 +11,7 @@ from pipelines.bench import coasting_trajectories
 from pipelines.bench.coasting_trajectories import CoastingErrors, coasting_figures
 from pipelines.cli.main import app
 from saga_fg.edge_rules import Following
+from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing
 from saga_fg.learning import FittedInteractions
 
@@ -51,6 +53,12 @@ def test_a_recording_is_judged_by_what_the_others_taught(monkeypatch):
     kf, ours = (errors.of(method, "car", 2.0) for method in ("kf", "learned"))
     assert len(kf) > 20
     assert ours.mean() < 0.9 * kf.mean()
+
+
+def test_recordings_in_which_nobody_is_followed_are_named():
+    recordings = {name: following_pairs(pairs=1, moments=5) for name in ("first", "second")}
+    with pytest.raises(InputError, match="recordings second: expected some car, followed for 1 s"):
+        coasting_trajectories.coasting_errors(recordings, ("car",), ())
 
 
 def test_the_command_refuses_what_it_cannot_judge_by(tmp_path):

@@ -77,5 +77,14 @@ def test_what_no_trajectories_come_from_is_refused():
         TrajectorySource.parsed("somewhere")
     with pytest.raises(InputError, match="goes with --data kitti"):
         TrajectorySource.parsed("eth_ucy=data", detections="x")
-    with pytest.raises(InputError, match="expected a number of scenes"):
-        TrajectorySource.parsed("simulated=none").trajectories()
+    for place in ("none", "0", "\u00b2"):
+        with pytest.raises(InputError, match="expected a number of scenes"):
+            TrajectorySource.parsed(f"simulated={place}").trajectories()
+
+
+def test_the_detections_are_not_overwritten(detections):
+    before = detections.read_bytes()
+    result = run(app, ["learn", "interactions", "--data", f"file={detections}", "--output", str(detections)])
+    assert result.exit_code == 2
+    assert "expected another file than those that are read" in result.output
+    assert detections.read_bytes() == before
