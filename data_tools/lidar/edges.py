@@ -13,12 +13,13 @@ lies, and rings cross a curb at the same angle.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import require_between, require_positive, setting
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class EdgeSettings:
     bias: float = setting(0.1, "deviation of either end that its points have in common, m")
 
     def __post_init__(self) -> None:
-        require_positive(self, "width", "gap", "length", "points", "noise", "bias")
+        require_positive(self, "width", "gap", "length", "noise", "bias")
+        require_between(self, 3, math.inf, "points")
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,6 +137,8 @@ def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView
 
     load_rerun()
     if save is not None:
+        if save.suffix != ".rrd":  # which is no name of what is read, either
+            raise InputError(f"--save {save}: expected a file name that ends in .rrd")
         check_writable(save)
     with working("making the view"):
         scenes, driven = make(), read_slam_view(slam) if slam is not None else None

@@ -24,6 +24,7 @@ from data_tools.lidar.components import connected_from_above
 from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
 from data_tools.simulator.street import KERB, SENSOR_HEIGHT, street
 from saga_fg.boxes import Boxes
+from saga_fg.errors import InputError
 from saga_fg.geometry import transform_points, yaw_transform
 
 FINE = ScannerSettings(rings=48, columns=1000)
@@ -186,6 +187,8 @@ def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
         squares.append(off @ np.linalg.solve(edge.covariance, off) / 2)
     assert 0.5 < np.mean(squares) < 1.5
     assert straight_edges(np.empty((0, 3)), 2) == []
+    with pytest.raises(InputError, match="points"):
+        EdgeSettings(points=2)  # which every line fits
     assert straight_edges(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
 
 

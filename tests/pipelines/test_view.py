@@ -183,3 +183,12 @@ def test_a_file_that_cannot_be_written_to_its_end_leaves_nothing(
     with pytest.raises(InputError, match=r"a\.rrd: not written, is the disk full\? File-writer thread"):
         write_view(tmp_path / "a.rrd", "a", ["world"], lambda stream: None)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_view_takes_the_place_of_no_file_of_a_result(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
+    (tmp_path / "map.ply").write_text("points")
+    done = run("slam", tmp_path, "--save", tmp_path / "map.ply")
+    assert done.exit_code == 2
+    assert "map.ply: expected a file name that ends in .rrd" in done.stderr
+    assert (tmp_path / "map.ply").read_text() == "points"
