@@ -87,7 +87,7 @@ class LabelSpool:
         """The labels, stretch by stretch: a part of the scene without frames or poses, and one table a moment."""
         assert self._lasting is not None, "the recording is not over"
         for number in range(self._stretches):
-            with np.load(self._folder / f"{number:06d}.npz") as columns:
+            with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as columns:
                 yield self._complete(dict(columns), self._lasting)
 
     def _complete(self, column: Mapping[str, np.ndarray], lasting: _Lasting) -> tuple[Scene, tuple[Labels, ...]]:
