@@ -65,6 +65,11 @@ class DetectionFile:
             world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
             return Scene(name, times, world_T_ego, ("",) * len(times), self._frames(rows, moment, poses))
 
+    @property
+    def with_poses(self) -> bool:
+        """Whether the table says where the vehicle was."""
+        return self._rows.pose is not None
+
     def _poses(self, rows: IntArray, moment: IntArray, count: int) -> FloatArray | None:
         """world_T_ego (K, 4, 4) of the moments of a scene, None without pose columns."""
         if self._rows.pose is None:
@@ -119,9 +124,12 @@ def read_scenes_in_parts(
     the end, for names that did not come.
     """
     done: set[str] = set()
-    name, latest = "", -np.inf
+    name, latest, with_poses = "", -np.inf, None
     for table in read_raw_parts(Path(path), rows=rows):
         part = DetectionFile(table)
+        if with_poses not in (None, part.with_poses):
+            raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
+        with_poses = part.with_poses
         for scene in (part.scene(name) for name in part.scenes):
             if scene.name in done:
                 raise InputError(f"{path}: scene {scene.name}: expected its rows together, it goes on after {name}")

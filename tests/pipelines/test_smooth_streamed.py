@@ -112,6 +112,13 @@ def test_parts_hold_together_what_belongs_together(tmp_path: Path) -> None:
         list(read_scenes_in_parts(path, scenes=["c"]))
 
 
+def test_poses_are_given_in_all_parts_or_in_none(tmp_path: Path) -> None:
+    rows = ["0,car,5,0,1,2,0.1", "1,car,6,0,,,"]
+    path = write(tmp_path / "poses.csv", rows, "timestamp,label,x,y,ego_x,ego_y,ego_yaw")
+    with pytest.raises(InputError, match="line 3: ego_x, ego_y, ego_yaw: expected in all rows or in none"):
+        list(read_scenes_in_parts(path, 1))
+
+
 def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
     lifetimes = Lifetimes()
     for size, probability, looks in ((4.0, 0.5, 3), (4.2, 0.9, 2), (9.0, 0.1, 5)):
