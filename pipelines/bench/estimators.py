@@ -17,6 +17,7 @@ from pipelines.bench.contenders import Contender, Filter, GtsamWindow, Ours, Our
 from pipelines.bench.estimator_figures import Criterion, Row, Soak, criteria, exponents
 from pipelines.bench.flocks import Flock, Kind, flock
 from pipelines.bench.measuring import environment, one_thread, resident_memory, size_of, timed
+from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators import (
@@ -36,8 +37,6 @@ LAG = 5  # frames
 WARM_UP = 3  # frames that are not counted
 DENSE = INCREMENTAL = 300  # more nodes in one graph are hopeless for the textbook and for iSAM2
 _COVARIANCES = 50  # more nodes take GTSAM's smoother seconds to tell its covariances
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from data_tools.metrics import (
 from data_tools.simulator import SensorSettings, SimulatorSettings, simulate_scene
 from pipelines.bench.drawn_differences import FiguresOf, drawn_differences
 from pipelines.config import Method, TrackConfig
-from pipelines.tracking import track_scene
+from pipelines.tracking import Progress, track_scene
 from saga_fg.arrays import BoolArray
 from saga_fg.dataset import Scene
 from saga_fg.sensor import DEFAULT, NoiseModel, ScoreCalibration, Sensor, sensor_model
@@ -32,8 +32,6 @@ from saga_fg.track import Tracks
 
 DRAWS = 100  # of scenes, for the intervals
 BOTH, WITH_POOR, POOR = "both", "both and a poor one", "poor"
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,9 @@ from data_tools.metrics import Interval, paired_bootstrap
 from pipelines.config import TrackConfig
 from pipelines.slam.joint import run_joint
 from pipelines.slam.roadside import observe_poles
+from pipelines.tracking import Progress
 from saga_fg.dataset import Scene
 from saga_fg.ego import JointSettings
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

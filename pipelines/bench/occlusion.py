@@ -9,7 +9,7 @@ bootstraps over scenes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +18,11 @@ from data_tools.metrics import Interval, SceneMetrics, paired_bootstrap, scene_m
 from data_tools.sightings import sightings
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.config import Method, TrackConfig
-from pipelines.tracking import track_scene
+from pipelines.tracking import Progress, track_scene
 from saga_fg.dataset import Annotations
 from saga_fg.learning import Sightings, fit_acceleration_noise_by_class
 
 METHODS: tuple[Method, Method] = ("kf", "saga")
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

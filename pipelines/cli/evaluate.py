@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_files
+from pipelines.cli.options import (
+    Config,
+    SceneNames,
+    Split,
+    Tables,
+    TrackingResult,
+    Verbose,
+    Version,
+    chosen_scenes,
+    names,
+    sensor_files,
+)
 from pipelines.cli.reporting import ReportingGroup, progress_bar, working
 from pipelines.cli.tables import JsonFile, show_tables
 from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, LagOption, MethodOption, configured
@@ -57,13 +68,11 @@ def evaluate() -> None:
 
 @evaluate_app.command()
 def nuscenes(
-    result: Annotated[Path, typer.Argument(help="Tracking-result JSON, of any tracker.")],
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")],
-    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
-    split: Annotated[
-        str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
-    ] = None,
-    scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
+    result: TrackingResult,
+    dataroot: Tables,
+    version: Version = "v1.0-mini",
+    split: Split = None,
+    scenes: SceneNames = None,
     detections: Annotated[
         list[str] | None,
         typer.Option(

@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_files
+from pipelines.cli.options import (
+    Config,
+    SceneNames,
+    Split,
+    Tables,
+    Verbose,
+    Version,
+    apart,
+    chosen_scenes,
+    names,
+    sensor_files,
+)
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.summary import counted
 
@@ -25,7 +36,6 @@ Output = Annotated[Path, typer.Option("--output", "-o", help="YAML file to write
 Blind = Annotated[
     bool, typer.Option("--without-truth", help="Leave the annotations alone: the tracker says what belongs together.")
 ]
-Scenes = Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")]
 
 
 @learn_app.callback()
@@ -97,17 +107,15 @@ def noise() -> None:
 
 @noise_app.command()
 def nuscenes(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")],
+    dataroot: Tables,
     detections: Annotated[
         list[str],
         typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
     ],
     output: Output,
-    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
-    split: Annotated[
-        str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
-    ] = None,
-    scenes: Scenes = None,
+    version: Version = "v1.0-mini",
+    split: Split = None,
+    scenes: SceneNames = None,
     without_truth: Blind = False,
     config: Config = None,
     verbose: Verbose = False,
@@ -194,7 +202,7 @@ def simulated(
 def file(
     detections: Annotated[Path, typer.Argument(help="Table of detections: .csv, .ndjson, .jsonl or .npz.")],
     output: Output,
-    scenes: Scenes = None,
+    scenes: SceneNames = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:

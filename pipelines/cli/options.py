@@ -23,6 +23,15 @@ Online = Annotated[
 ]
 Lag = Annotated[float | None, typer.Option("--lag", min=0.0, help="Length of the window of --online, s.  [default: 3]")]
 
+# of every command that reads nuScenes
+TrackingResult = Annotated[Path, typer.Argument(help="Tracking-result JSON, of any tracker.")]
+Tables = Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")]
+Version = Annotated[str, typer.Option("--version", help="Name of the folder of tables.")]
+Split = Annotated[
+    str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
+]
+SceneNames = Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")]
+
 
 def sensor_files(values: Sequence[str]) -> dict[str, Path]:
     """`["lidar=a.json", "camera=b.json"]` as a mapping; a lone file without a name is the sensor "lidar"."""

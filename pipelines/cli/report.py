@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.options import Verbose, apart, chosen_scenes, names, sensor_files
+from pipelines.cli.options import (
+    SceneNames,
+    Split,
+    Tables,
+    TrackingResult,
+    Verbose,
+    Version,
+    apart,
+    chosen_scenes,
+    names,
+    sensor_files,
+)
 from pipelines.cli.reporting import ReportingGroup, working
 
 if TYPE_CHECKING:
@@ -26,14 +37,12 @@ def report() -> None:
 
 @report_app.command()
 def nuscenes(
-    result: Annotated[Path, typer.Argument(help="Tracking-result JSON, of any tracker.")],
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds the folder of tables.")],
+    result: TrackingResult,
+    dataroot: Tables,
     output: Page,
-    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
-    split: Annotated[
-        str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
-    ] = None,
-    scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
+    version: Version = "v1.0-mini",
+    split: Split = None,
+    scenes: SceneNames = None,
     detections: Annotated[
         list[str] | None,
         typer.Option("--detections", help="Detections the tracks were made of, to see them too.", metavar="NAME=FILE"),

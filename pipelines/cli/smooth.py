@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, chosen_scenes, names, sensor_locations
+from pipelines.cli.options import Config, SceneNames, Split, Verbose, Version, chosen_scenes, names, sensor_locations
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import counted
@@ -47,11 +47,9 @@ def nuscenes(
         typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
     ],
     output: Output,
-    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
-    split: Annotated[
-        str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
-    ] = None,
-    scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
+    version: Version = "v1.0-mini",
+    split: Split = None,
+    scenes: SceneNames = None,
     method: MethodOption = "saga",
     association: AssociationOption = None,
     interactions: InteractionsOption = None,

@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, apart, chosen_scenes, names, sensor_locations
+from pipelines.cli.options import (
+    Config,
+    SceneNames,
+    Split,
+    Verbose,
+    Version,
+    apart,
+    chosen_scenes,
+    names,
+    sensor_locations,
+)
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import Summary
@@ -38,11 +48,9 @@ def nuscenes(
         typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Tracking-result JSON to write.")],
-    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
-    split: Annotated[
-        str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
-    ] = None,
-    scenes: Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")] = None,
+    version: Version = "v1.0-mini",
+    split: Split = None,
+    scenes: SceneNames = None,
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,

@@ -6,13 +6,14 @@ together, by the settings that are there; what is learned so replaces these sett
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from data_tools.sightings import sightings
 from pipelines.config import TrackConfig
+from pipelines.tracking import Progress
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.errors import InputError
 from saga_fg.learning import (
@@ -33,8 +34,6 @@ from saga_fg.tracking.settings import settings_of
 
 ROUNDS = 2  # of following by what the round before learned
 FEWEST_TRAILS = 5  # a class with fewer has the noise of all trails together
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,17 +7,16 @@ on the beginning of the drive (`LandmarkMapper.log_evidence`); the identities in
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from data_tools.victoria_park import TreeSightings
+from pipelines.tracking import Progress
 from saga_fg.landmarks import LandmarkMap, LandmarkMapper, MapperSettings, Observation, PointLandmark
 from saga_fg.settings import require_between, setting, settings_group
 
 _START = 1e-6  # variance of the first pose, m^2 and rad^2
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

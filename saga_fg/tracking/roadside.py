@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.arrays import FloatArray, IntArray, StrArray, of_classes
 from saga_fg.association import assign, gate, mahalanobis
 from saga_fg.frame import Frame
 from saga_fg.interactions import NodeTable
@@ -91,10 +91,10 @@ class Roadside:
     def heed(self, frame: Frame, sensor: Sensor, origin: FloatArray, state: JointTrackState, delay: float) -> None:
         """Take in the lights that a frame shows, as it was `delay` s ago: their colours, and where they are."""
         lights = np.flatnonzero(self.label == LIGHT)
-        if len(lights) == 0 or not np.isin(frame.detections.boxes.label, SIGHTINGS).any():
+        if len(lights) == 0 or not of_classes(frame.detections.boxes.label, SIGHTINGS).any():
             return
         seen = sensor.in_world(frame)
-        seen = seen.select(np.isin(seen.boxes.label, SIGHTINGS))
+        seen = seen.select(of_classes(seen.boxes.label, SIGHTINGS))
         R = sensor.detection_covariance(seen, sensor.origin(frame))
         position, P = state.places(self.id[lights], self.label[lights])
         z = seen.boxes.position[:, :2] - origin
