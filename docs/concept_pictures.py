@@ -11,9 +11,9 @@ from matplotlib.patches import Ellipse, Rectangle
 
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.arrays import FloatArray
+from saga_fg.by_class import DEFAULT
 from saga_fg.edge_rules import EdgeRule, Following
 from saga_fg.interactions import SharedVelocity
-from saga_fg.sensor import DEFAULT
 from saga_fg.tracking import ClassSettings
 
 CARS, PERIOD, HIDDEN_FROM, BRAKING_FROM, END = 4, 0.1, 4.0, 4.2, 6.0  # s

@@ -10,12 +10,14 @@ from typing import Literal
 
 from pipelines.configuration import load_settings, read_settings
 from pipelines.tracking import OnlineTracker
+from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.node import ConstantVelocity
-from saga_fg.sensor import DEFAULT, Sensor
+from saga_fg.sensor import Sensor
 from saga_fg.settings import settings_group
 from saga_fg.tracking import (
     AssociationName,
+    ClassSettings,
     EstimatorName,
     GreedySettings,
     GreedyTracker,
@@ -23,7 +25,6 @@ from saga_fg.tracking import (
     Tracker,
     TrackerSettings,
 )
-from saga_fg.tracking.settings import settings_of
 
 Method = Literal["saga", "kf", "centerpoint"]
 Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]
@@ -57,7 +58,7 @@ class TrackConfig:
         classes = dict(self.tracker.classes)
         for label, q in noise.items():
             motion = ConstantVelocity(acceleration_noise=q)
-            classes[label] = replace(settings_of(classes, label), motion=motion)
+            classes[label] = replace(class_settings(classes, ClassSettings, label), motion=motion)
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
     def with_interactions(self, learned: LearnedInteractions) -> TrackConfig:

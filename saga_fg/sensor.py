@@ -15,19 +15,19 @@ The motion of the world never depends on which sensor speaks, so a new sensor is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, StrArray, distinct
+from saga_fg.by_class import DEFAULT, class_values
 from saga_fg.errors import InputError
 from saga_fg.frame import Detections, Frame
 from saga_fg.geometry import inverse_transform, wrap_angle, yaw_transform
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
-DEFAULT = "default"  # key of the settings for every class that has none of its own
 LEAST_PROBABILITY = 1e-3  # of a detection, and of its being none
 _LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
 
@@ -157,20 +157,19 @@ class Sensor:
 
     def calibrated(self, logit: FloatArray, label: StrArray) -> FloatArray:
         """The probabilities (N,) of scores with these logits (N,) before calibration."""
-        fallback = self.calibration.get(DEFAULT, ScoreCalibration())
-        slope = _by_class(label, lambda c: self.calibration.get(c, fallback).slope)
-        offset = _by_class(label, lambda c: self.calibration.get(c, fallback).offset)
+        slope, offset = class_values(self.calibration, ScoreCalibration, label, "slope", "offset")
         p = 1 / (1 + np.exp(-np.clip(offset + slope * logit, -50, 50)))
-        return np.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+        return np.asarray(np.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
 
     def detection_chance(self, label: StrArray) -> FloatArray:
         """(N,) chance that a visible object of each class in the field of view is detected."""
-        return _by_class(label, lambda c: self.class_detection.get(c, self.detection_probability))
+        occurring, index = distinct(label)
+        chance = [self.class_detection.get(c, self.detection_probability) for c in occurring]
+        return np.array(chance, dtype=np.float64)[index]
 
-    def deviations(self, label: StrArray, name: str) -> FloatArray:
-        """(N,) the noise parameter `name` of each class."""
-        fallback = self.noise.get(DEFAULT, NoiseModel())
-        return _by_class(label, lambda c: getattr(self.noise.get(c, fallback), name))
+    def deviations(self, label: StrArray, *names: str) -> FloatArray:
+        """(k, N) the noise parameters of these names, of the class of each label (N,)."""
+        return class_values(self.noise, NoiseModel, label, *names)
 
     def position_covariance(
         self, label: StrArray, position: FloatArray, probability: FloatArray, origin: FloatArray
@@ -180,12 +179,12 @@ class Sensor:
         Where each has an origin (N, 2) of its own that is the position itself, range and bearing add no noise.
         """
         offset = position - origin
-        square = (self.deviations(label, "position") ** 2)[:, None, None]
+        own, along, across, low_score = self.deviations(label, "position", "range_noise", "bearing_noise", "low_score")
         # along and across the line of sight u: (a r u)(a r u)^T + (b r n)(b r n)^T = b^2 r^2 I + (a^2 - b^2) r^2 u u^T
-        along, across = self.deviations(label, "range_noise") ** 2, self.deviations(label, "bearing_noise") ** 2
-        square = square + (across * np.einsum("ni,ni->n", offset, offset))[:, None, None]
-        R = square * np.eye(2) + (along - across)[:, None, None] * (offset[:, :, None] * offset[:, None, :])
-        return np.asarray(R * self._score_factor(label, probability)[:, None, None])
+        along, across, factor = along**2, across**2, _score_factor(low_score, probability)
+        isotropic = factor * (own**2 + across * np.einsum("ni,ni->n", offset, offset))
+        ray = (factor * (along - across))[:, None] * offset
+        return np.asarray(isotropic[:, None, None] * np.eye(2) + ray[:, :, None] * offset[:, None, :])
 
     def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
         """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
@@ -198,23 +197,22 @@ class Sensor:
 
     def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """R (N, 2, 2), (m/s)^2."""
-        variance = self.deviations(label, "velocity") ** 2 * self._score_factor(label, probability)
+        deviation, low_score = self.deviations(label, "velocity", "low_score")
+        variance = deviation**2 * _score_factor(low_score, probability)
         return np.asarray(variance[:, None, None] * np.eye(2))
 
     def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """(N,), (m/s)^2."""
-        return np.asarray(self.deviations(label, "range_rate") ** 2 * self._score_factor(label, probability))
+        deviation, low_score = self.deviations(label, "range_rate", "low_score")
+        return np.asarray(deviation**2 * _score_factor(low_score, probability))
 
     def told(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What is told of positions (N,): the factor on their deviations, and the shared error, m."""
-        factor, shared = (
-            self.deviations(label, name) * (1 + self.deviations(label, growth) * (1 - probability))
-            for name, growth in (("told_scale", "told_low_score"), ("shared_error", "shared_low_score"))
+        scale, shared, scale_growth, shared_growth = self.deviations(
+            label, "told_scale", "shared_error", "told_low_score", "shared_low_score"
         )
-        return factor, shared
-
-    def _score_factor(self, label: StrArray, probability: FloatArray) -> FloatArray:
-        return np.asarray((1 + self.deviations(label, "low_score") * (1 - probability)) ** 2)
+        doubt = 1 - probability
+        return scale * (1 + scale_growth * doubt), shared * (1 + shared_growth * doubt)
 
     def in_world(self, frame: Frame) -> Detections:
         """The detections of a frame of this sensor, in world coordinates."""
@@ -244,10 +242,9 @@ class Sensor:
         return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
 
 
-def _by_class(label: StrArray, value: Callable[[str], float]) -> FloatArray:
-    """(N,) the value of each row's class, asked for once a class."""
-    classes, index = distinct(label)
-    return np.array([value(c) for c in classes], dtype=np.float64)[index]
+def _score_factor(low_score: FloatArray, probability: FloatArray) -> FloatArray:
+    """(N,) what a score below 1 multiplies a variance by."""
+    return np.asarray((1 + low_score * (1 - probability)) ** 2)
 
 
 def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:

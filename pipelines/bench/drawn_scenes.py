@@ -15,13 +15,14 @@ import numpy as np
 from pipelines.config import TrackConfig
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import DEFAULT
 from saga_fg.dataset import Annotations, Scene
 from saga_fg.discretisation import discretise
 from saga_fg.edge_rules import Neighbours, build_graph
 from saga_fg.frame import Detections, Frame
 from saga_fg.interactions import NodeTable, SharedVelocity
 from saga_fg.node import ConstantVelocity, NodeType
-from saga_fg.sensor import DEFAULT, NoiseModel, Sensor
+from saga_fg.sensor import NoiseModel, Sensor
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, TrackerSettings
 from saga_fg.transition import Transition
 

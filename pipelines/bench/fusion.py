@@ -26,8 +26,9 @@ from pipelines.bench.drawn_differences import FiguresOf, drawn_differences
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.arrays import BoolArray
+from saga_fg.by_class import DEFAULT
 from saga_fg.dataset import Scene
-from saga_fg.sensor import DEFAULT, NoiseModel, ScoreCalibration, Sensor, sensor_model
+from saga_fg.sensor import NoiseModel, ScoreCalibration, Sensor, sensor_model
 from saga_fg.track import Tracks
 
 DRAWS = 100  # of scenes, for the intervals

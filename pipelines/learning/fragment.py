@@ -8,7 +8,8 @@ from typing import Any
 import yaml
 
 from pipelines.learning.noise import LearnedNoise
-from saga_fg.tracking.settings import settings_of
+from saga_fg.by_class import class_settings
+from saga_fg.tracking import ClassSettings
 
 LEARNED = ("noise", "calibration", "detection_probability", "class_detection", "field_of_view")
 DIGITS = 4
@@ -25,7 +26,12 @@ def learned_fragment(learned: LearnedNoise, origin: str) -> str:
         classes = learned.config.tracker.classes
         data["tracker"] = {
             "classes": {
-                label: {"motion": {"kind": "constant_velocity", **_rounded(asdict(settings_of(classes, label).motion))}}
+                label: {
+                    "motion": {
+                        "kind": "constant_velocity",
+                        **_rounded(asdict(class_settings(classes, ClassSettings, label).motion)),
+                    }
+                }
                 for label in learned.classes
             }
         }

@@ -14,6 +14,7 @@ import numpy as np
 from data_tools.sightings import sightings
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress
+from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.errors import InputError
 from saga_fg.learning import (
@@ -28,9 +29,8 @@ from saga_fg.learning import (
     sample_with_truth,
 )
 from saga_fg.node import ConstantVelocity
-from saga_fg.sensor import DEFAULT, NoiseModel, Sensor, sensor_model
-from saga_fg.tracking import Tracker
-from saga_fg.tracking.settings import settings_of
+from saga_fg.sensor import NoiseModel, Sensor, sensor_model
+from saga_fg.tracking import ClassSettings, Tracker
 
 ROUNDS = 2  # of following by what the round before learned
 FEWEST_TRAILS = 5  # a class with fewer has the noise of all trails together
@@ -116,7 +116,7 @@ def _trail_noise(
     noise: dict[str, dict[str, NoiseModel]] = {}
     process: dict[str, float] = {}
     for label, group in groups.items():
-        settings = settings_of(config.tracker.classes, label)
+        settings = class_settings(config.tracker.classes, ClassSettings, label)
         q = settings.motion.acceleration_noise if isinstance(settings.motion, ConstantVelocity) else 1.0
         of_sensors, process[label] = fit_trail_noise(group, config.sensors, label, q, settings.birth_speed)
         for name, model in of_sensors.items():
@@ -135,7 +135,7 @@ def _with_process_noise(
     of_class = {
         label: q
         for label, q in noise.items()
-        if isinstance(settings_of(config.tracker.classes, label).motion, ConstantVelocity)
+        if isinstance(class_settings(config.tracker.classes, ClassSettings, label).motion, ConstantVelocity)
     }
     counts = {name: len(sample) for name, sample in samples.items()}
     return LearnedNoise(config.with_acceleration_noise(of_class), counts, tuple(of_class))

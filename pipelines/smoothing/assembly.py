@@ -9,17 +9,18 @@ import numpy as np
 from pipelines.smoothing.rounds import SmoothedObjects
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import class_values
 from saga_fg.smoothing import (
     Evidence,
     Headings,
     LabelCounts,
     Labels,
     Lives,
+    OfflineClass,
     SmoothingSettings,
     StateTable,
     constant_sizes,
     lives_of_evidence,
-    offline_values,
     previous_rows,
     quality_of,
     scalar_readings,
@@ -87,11 +88,11 @@ def label_states(
     heights = scalar_readings(at, boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
     z, _ = smooth_walks(states, HEIGHT_DRIFT**2 * duration, heights)
     label = lives.label[owner]
-    turning = offline_values(settings.classes, "yaw_drift", label) ** 2 * duration
+    yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "lasting_error")
+    turning = yaw_drift**2 * duration
     turning = np.where(_stands(objects), 1e-6, turning)
-    moving = offline_values(settings.classes, "motion_heading", lives.label)
+    (moving,) = class_values(settings.classes, OfflineClass, lives.label, "motion_heading")
     headings = smooth_headings(states, lives, evidence, rows, at, turning, moving)
-    lasting = offline_values(settings.classes, "lasting_error", label)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
     position = np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1)

@@ -8,11 +8,12 @@ import numpy as np
 
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.arrays import IntArray
+from saga_fg.by_class import class_values
 from saga_fg.frame import Frame
 from saga_fg.sensor import Sensor
 from saga_fg.smoothing.attribution import attribute
 from saga_fg.smoothing.evidence import Evidence, measured_in_order
-from saga_fg.tracking.settings import ClassSettings, class_values
+from saga_fg.tracking.settings import ClassSettings
 
 UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
 
@@ -44,7 +45,7 @@ def track_evidence(
             evidence.boxes.position[rows, :2],
             noise,
             UPDATED_GATE,
-            class_values(classes, "max_distance", updated.boxes.label),
+            class_values(classes, ClassSettings, updated.boxes.label, "max_distance")[0],
         )
         track_of[rows.start + detections] = updated.id[objects]
         if progress is not None:

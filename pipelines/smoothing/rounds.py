@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.by_class import class_values
 from saga_fg.smoothing import (
     Evidence,
     Lives,
@@ -32,7 +33,7 @@ from saga_fg.smoothing import (
     standing_states,
 )
 from saga_fg.tracking import TrackerSettings
-from saga_fg.tracking.settings import class_values
+from saga_fg.tracking.settings import ClassSettings
 
 TAKES_PART = 0.5  # share of the score an object needs that a tracklet needs to become part of one
 MAX_CLAIM = 3.0  # largest distance between a state and a detection it claims, m
@@ -124,7 +125,7 @@ class _Rounds:
 
     def velocity_prior(self, lives: Lives) -> FloatArray:
         """(n, 2, 2) covariance of the velocity of something new."""
-        speed = class_values(self.tracker.classes, "birth_speed", lives.label)
+        (speed,) = class_values(self.tracker.classes, ClassSettings, lives.label, "birth_speed")
         return np.asarray(speed[:, None, None] ** 2 * np.eye(2))
 
     def alone(self, lives: Lives, object_of: IntArray, ahead: float) -> StateTable:

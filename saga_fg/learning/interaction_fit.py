@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.by_class import DEFAULT
 from saga_fg.edge_features import EdgeFeatures
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import VEHICLES, Following, Neighbours
@@ -24,7 +25,6 @@ from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, SharedCourse
 from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample
-from saga_fg.sensor import DEFAULT
 
 Rule = Following | Neighbours
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.by_class import DEFAULT
 from saga_fg.discretisation import discretise
 from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.estimators import JointKalmanFilter, Measurements
@@ -20,7 +21,6 @@ from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments
 from saga_fg.learning.independent_filter import BIRTH_SPEED, FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.node import ConstantVelocity, NodeType
-from saga_fg.sensor import DEFAULT
 
 _H = np.eye(2, 4)
 

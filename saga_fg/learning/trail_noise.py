@@ -21,11 +21,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.by_class import class_settings
 from saga_fg.geometry import wrap_angle
 from saga_fg.learning.measurement_noise import FEWEST, LEAST, PRIOR_WIDTH, robust_deviation
 from saga_fg.learning.process_noise import innovation_likelihood
 from saga_fg.learning.trails import Trail
-from saga_fg.sensor import DEFAULT, NoiseModel, Sensor, sensor_model
+from saga_fg.sensor import NoiseModel, Sensor, sensor_model
 
 POSITION = ("position", "range_noise", "bearing_noise")
 LONGEST = 40  # sightings filtered in one piece: longer trails are cut, and side by side take less time
@@ -63,13 +64,17 @@ def fit_trail_noise(
             if name in fitted:
                 at = 3 * fitted.index(name)
                 values = dict(zip(POSITION, np.exp(theta[at : at + 3]).tolist(), strict=True))
-                model = replace(model, noise={label: replace(_noise(model, label), **values)})
+                model = replace(model, noise={label: replace(class_settings(model.noise, NoiseModel, label), **values)})
             labels = np.full(int(rows.sum()), label)
             p = model.calibrated(logit[rows], labels)
             R[rows] = model.position_covariance(labels, position[rows], p, origin[rows])
         return R
 
-    start = [max(getattr(_noise(models[name], label), part), LEAST) for name in fitted for part in POSITION]
+    start = [
+        max(getattr(class_settings(models[name].noise, NoiseModel, label), part), LEAST)
+        for name in fitted
+        for part in POSITION
+    ]
     start_logs = np.log([*start, max(acceleration_noise, LEAST)])
 
     def cost(theta: FloatArray) -> float:
@@ -84,12 +89,8 @@ def fit_trail_noise(
     for k, name in enumerate(fitted):
         values = dict(zip(POSITION, np.exp(found[3 * k : 3 * k + 3]).tolist(), strict=True))
         others = _of_differences(trails, name, float(np.exp(found[-1])))
-        noise[name] = replace(_noise(models[name], label), **values, **others)
+        noise[name] = replace(class_settings(models[name].noise, NoiseModel, label), **values, **others)
     return noise, float(np.exp(found[-1]))
-
-
-def _noise(sensor: Sensor, label: str) -> NoiseModel:
-    return sensor.noise.get(label) or sensor.noise.get(DEFAULT) or NoiseModel()
 
 
 def _pieces(trails: Sequence[Trail]) -> list[tuple[Trail, IntArray]]:

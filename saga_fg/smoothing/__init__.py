@@ -16,7 +16,6 @@ from saga_fg.smoothing.settings import (
     QualitySettings,
     SmoothingSettings,
     StandingSettings,
-    offline_values,
 )
 from saga_fg.smoothing.sizes import constant_sizes, size_weights, weighted_medians
 from saga_fg.smoothing.standing import standing_states
@@ -51,7 +50,6 @@ __all__ = [
     "looks_in_view",
     "measured_in_order",
     "no_edges",
-    "offline_values",
     "previous_rows",
     "quality_of",
     "robust_weights",

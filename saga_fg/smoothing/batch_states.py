@@ -20,13 +20,14 @@ import numpy as np
 
 from factors import Robust
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.by_class import class_settings
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import BatchSmoother, Measurements, Smoothed, WindowedSmoother
 from saga_fg.interactions import VELOCITY
 from saga_fg.node import NodeType
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.settings import OfflineClass, StandingSettings, offline_class
+from saga_fg.smoothing.settings import OfflineClass, StandingSettings
 from saga_fg.smoothing.states import Lives, StateTable
 
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
@@ -154,7 +155,7 @@ def _node_types(lives: Lives, classes: Mapping[str, OfflineClass]) -> list[NodeT
     types: dict[float, NodeType] = {}
     result = []
     for label in lives.label.tolist():
-        motion = offline_class(classes, label).motion
+        motion = class_settings(classes, OfflineClass, label).motion
         result.append(types.setdefault(motion.acceleration_noise, NodeType("object", motion)))
     return result
 

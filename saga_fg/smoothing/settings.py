@@ -7,12 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
 from factors import Robust
-from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.by_class import DEFAULT
 from saga_fg.node import ConstantVelocity
-from saga_fg.sensor import DEFAULT
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 
@@ -114,15 +111,3 @@ class SmoothingSettings:
     def robust(self) -> Robust | None:
         """The loss of the detections."""
         return None if self.loss == "none" else Robust(self.loss, self.loss_scale)
-
-
-def offline_class(classes: Mapping[str, OfflineClass], label: str) -> OfflineClass:
-    """The settings of a class: its own, else those named default."""
-    return classes.get(label) or classes.get(DEFAULT) or OfflineClass()
-
-
-def offline_values(classes: Mapping[str, OfflineClass], name: str, label: StrArray) -> FloatArray:
-    """(n,) the setting `name` of each label's class."""
-    distinct, index = np.unique(label, return_inverse=True)
-    values = np.array([getattr(offline_class(classes, str(c)), name) for c in distinct], dtype=np.float64)
-    return values[index] if len(label) else np.empty(0)

@@ -15,9 +15,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from saga_fg.arrays import IntArray
+from saga_fg.by_class import class_values
 from saga_fg.smoothing.batch_states import Standing
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.settings import OfflineClass, StandingSettings, offline_values
+from saga_fg.smoothing.settings import OfflineClass, StandingSettings
 from saga_fg.smoothing.states import Lives, StateTable
 
 
@@ -33,8 +34,8 @@ def standing_states(
     order = np.lexsort((states.moment, states.id))
     ids, moments = states.id[order], states.moment[order]
     label = lives.label[lives.rows_of(ids)]
-    slow = np.hypot(*states.mean[order, 2:].T) <= offline_values(classes, "stand_speed", label)
-    max_drift = offline_values(classes, "stand_drift", label)
+    stand_speed, max_drift = class_values(classes, OfflineClass, label, "stand_speed", "stand_drift")
+    slow = np.hypot(*states.mean[order, 2:].T) <= stand_speed
     begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
     ends = np.flatnonzero(slow & np.concatenate([(ids[1:] != ids[:-1]) | ~slow[1:], [True]]))
     times = evidence.times

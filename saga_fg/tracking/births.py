@@ -8,9 +8,10 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import class_values
 from saga_fg.tracking.joint_state import Kinematics
 from saga_fg.tracking.observation import Observed
-from saga_fg.tracking.settings import ClassSettings, class_values
+from saga_fg.tracking.settings import ClassSettings
 from saga_fg.tracking.standing import after_evidence, log_density
 from saga_fg.tracking.traffic_flow import TrafficFlow
 
@@ -48,7 +49,7 @@ def _unmeasured_velocity(
     boxes: Boxes, classes: Mapping[str, ClassSettings], flow: TrafficFlow, standing: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Velocity (k, 2), its covariance (k, 2, 2) and the belief (k,) to stand, by class, heading and traffic."""
-    speed, drift = (class_values(classes, name, boxes.label) for name in ("birth_speed", "birth_drift"))
+    speed, drift = class_values(classes, ClassSettings, boxes.label, "birth_speed", "birth_drift")
     stands, mean, variance = flow.expected(boxes.label, boxes.position[:, :2], boxes.yaw, speed**2, standing)
     known = np.isfinite(boxes.yaw)
     ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))

@@ -14,8 +14,9 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import DEFAULT
 from saga_fg.frame import Frame
-from saga_fg.sensor import DEFAULT, Sensor, sensor_model
+from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
 from saga_fg.tracking.settings import GreedySettings
 

@@ -18,10 +18,11 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.association import gate, mahalanobis
+from saga_fg.by_class import class_settings
 from saga_fg.tracking.edge_effects import EdgeEffect, edge_effects
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.observer import Stage, TrackerView
-from saga_fg.tracking.settings import TrackerSettings, settings_of
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 
 Event = dict[str, Any]
 LISTED = 5  # candidates of an event
@@ -84,7 +85,7 @@ class Journal:
         """The detections of the class that come into question for a track, the nearest first."""
         assert self._predicted is not None
         label = str(self._predicted.columns.label[row])
-        settings = settings_of(self._settings.classes, label)
+        settings = class_settings(self._settings.classes, ClassSettings, label)
         rows = np.flatnonzero(observed.boxes.label == label)
         measured = observed.boxes.position[rows, :2]
         d2, _ = mahalanobis(place[None], self._predicted.P[row][None], measured, observed.R[rows, :2, :2])
@@ -132,8 +133,8 @@ class Journal:
                 "detection": int(now.observed.row[detection]),
                 "position": _numbers(measured),
                 "probability": float(now.observed.probability[detection]),
-                "least_probability": settings_of(self._settings.classes, event["label"]).birth_score,
-                "gate": gate(settings_of(self._settings.classes, event["label"]).gate),
+                "least_probability": class_settings(self._settings.classes, ClassSettings, event["label"]).birth_score,
+                "gate": gate(class_settings(self._settings.classes, ClassSettings, event["label"]).gate),
                 "nearest_tracks": [
                     {"track": int(old.columns.id[k]), "distance2": float(d2[same == k, 0][0])} for k in nearest.tolist()
                 ],
@@ -145,7 +146,7 @@ class Journal:
         assert last is not None
         for row in np.flatnonzero(~np.isin(last.columns.id, now.columns.id)).tolist():
             event = self._event("ended", last, int(last.columns.id[row]), row)
-            of_class = settings_of(settings.classes, event["label"])
+            of_class = class_settings(settings.classes, ClassSettings, event["label"])
             unseen = float(last.timestamp - last.columns.last_seen[row])
             out_of_view = float(last.timestamp - last.columns.last_in_view[row])
             existence = float(last.columns.existence[row])

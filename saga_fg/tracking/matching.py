@@ -30,11 +30,12 @@ import numpy as np
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, distinct
 from saga_fg.association import Matching, assign, assign_greedily, gate, mahalanobis
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import class_settings
 from saga_fg.overlap import giou_3d
 from saga_fg.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.observation import Observed
-from saga_fg.tracking.settings import AssociationSettings, TrackerSettings, settings_of
+from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 
 LEAST_CLUTTER = 0.05  # false detections to be reckoned with, however sure the detector is
 
@@ -94,7 +95,7 @@ def _costs(
         if label not in seen:
             continue
         t, d = np.flatnonzero(of_track == classes.index(label)), np.flatnonzero(of_detection == seen.index(label))
-        of_class = settings_of(settings.classes, label)
+        of_class = class_settings(settings.classes, ClassSettings, label)
         position, measured = predicted.position[t, :2], observed.boxes.position[d, :2]
         d2, log_det = mahalanobis(position, P[t], measured, observed.R[d, :2, :2])
         apart = np.hypot(*np.moveaxis(measured[None] - position[:, None], -1, 0))

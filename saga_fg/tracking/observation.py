@@ -9,10 +9,11 @@ import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import class_values
 from saga_fg.frame import Frame
 from saga_fg.road.signal import SIGHTINGS
 from saga_fg.sensor import Sensor
-from saga_fg.tracking.settings import ClassSettings, class_values
+from saga_fg.tracking.settings import ClassSettings
 from saga_fg.tracking.suppression import of_one_class, strongest
 
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
@@ -47,26 +48,26 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
     objects = ~of_classes(label, SIGHTINGS)  # the colours of lights are not objects of their own
-    keep = np.flatnonzero(objects & (probability >= class_values(classes, "min_score", label)))
-    limits = (
-        class_values(classes, name, label[keep]) for name in ("duplicate_distance", "shadow_distance", "shadow_ratio")
-    )
-    keep = keep[strongest(detections.boxes.select(keep), probability[keep], *limits)]
-    overlap = class_values(classes, "class_overlap", label[keep])
+    keep = np.flatnonzero(objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0]))
+    names = ("duplicate_distance", "shadow_distance", "shadow_ratio", "class_overlap")
+    *limits, overlap = class_values(classes, ClassSettings, label[keep], *names)
+    one_each = strongest(detections.boxes.select(keep), probability[keep], *limits)
+    keep, overlap = keep[one_each], overlap[one_each]
     keep = keep[of_one_class(detections.boxes.select(keep), probability[keep], overlap)]
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
     boxes = detections.boxes
     R = np.zeros((len(boxes), 4, 4))
     R[:, :2, :2] = sensor.detection_covariance(detections, viewpoint)
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
-    yaw_noise = np.where(np.isfinite(boxes.yaw), sensor.deviations(boxes.label, "yaw"), UNKNOWN_YAW_NOISE)
+    yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
+    yaw_noise = np.where(np.isfinite(boxes.yaw), yaw_noise, UNKNOWN_YAW_NOISE)
     with_velocity = np.isfinite(boxes.velocity[:, 0] + boxes.velocity[:, 1]) & sensor.use_velocity
     return Observed(
         boxes,
         probability,
         R,
         with_velocity,
-        sensor.deviations(boxes.label, "height"),
+        z_noise,
         yaw_noise,
         keep,
         np.where(sensor.use_velocity, detections.range_rate, np.nan),

@@ -15,6 +15,7 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray, of_classes
 from saga_fg.association import assign, gate, mahalanobis
+from saga_fg.by_class import class_settings
 from saga_fg.frame import Frame
 from saga_fg.interactions import NodeTable
 from saga_fg.node import Motion, RandomWalk
@@ -22,14 +23,14 @@ from saga_fg.road.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, RoadMap
 from saga_fg.road.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
 from saga_fg.sensor import Sensor
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics
-from saga_fg.tracking.settings import TrackerSettings, settings_of
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
     """Own motion of a class: nodes of the roadside stand still unless the settings name their class."""
     if label in ROADSIDE and label not in settings.classes:
         return RandomWalk()
-    return settings_of(settings.classes, label).motion
+    return class_settings(settings.classes, ClassSettings, label).motion
 
 
 GATE = 0.999  # share of true sightings of a light that may be its own

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-import numpy as np
-
-from saga_fg.arrays import FloatArray, StrArray, distinct
+from saga_fg.by_class import DEFAULT
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
@@ -19,7 +17,6 @@ from saga_fg.road import RoadMap, SignalSettings
 from saga_fg.road.cones import ConeEdge
 from saga_fg.road.lane_keeping import InLane
 from saga_fg.road.stopping import RedLight
-from saga_fg.sensor import DEFAULT
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
@@ -60,17 +57,6 @@ class ClassSettings:
         require_positive(self, "max_distance", "max_coasting", infinite=True)
         if self.gate == 1:
             raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
-
-
-def settings_of(classes: Mapping[str, ClassSettings], label: str) -> ClassSettings:
-    """The settings of a class: its own, else those named default."""
-    return classes.get(label) or classes.get(DEFAULT) or ClassSettings()
-
-
-def class_values(classes: Mapping[str, ClassSettings], name: str, label: StrArray) -> FloatArray:
-    """(n,) the setting `name` of each label's class."""
-    names, index = distinct(label)
-    return np.array([getattr(settings_of(classes, c), name) for c in names], dtype=np.float64)[index]
 
 
 @dataclass(frozen=True)

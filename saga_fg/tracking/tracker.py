@@ -18,6 +18,7 @@ import numpy as np
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.association import Assignment, Matching
 from saga_fg.boxes import Boxes
+from saga_fg.by_class import class_settings, class_values
 from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
@@ -38,7 +39,7 @@ from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.occlusion import HIDDEN, covered
 from saga_fg.tracking.roadside import Roadside, motion_of
 from saga_fg.tracking.sensor_evidence import SensorEvidence
-from saga_fg.tracking.settings import ClassSettings, TrackerSettings, class_values, settings_of
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.standing import Standing
 from saga_fg.tracking.traffic_flow import TrafficFlow
 from saga_fg.tracking.views import boxes_of, local_origin, nodes_of, passages_of, reported_tracks, speed_deviation
@@ -181,7 +182,7 @@ class Tracker:
 
     def class_settings(self, label: str) -> ClassSettings:
         """The settings of a class."""
-        return settings_of(self.settings.classes, label)
+        return class_settings(self.settings.classes, ClassSettings, label)
 
     @property
     def max_delay(self) -> float:
@@ -203,7 +204,7 @@ class Tracker:
                 self._state.predict(self.graph, dt / steps)
                 self._box.turn_with(before, self._kinematics().velocity)
                 self.roadside.predict(dt / steps)
-            self._box.predict(dt, self._of_class("yaw_drift", self._columns.label))
+            self._box.predict(dt, self._of_class(self._columns.label, "yaw_drift")[0])
         self._time = timestamp
 
     def _standing_noise(self, dt: float) -> FloatArray | None:
@@ -318,7 +319,7 @@ class Tracker:
         """
         free = np.ones(len(observed), dtype=bool)
         free[matching.detection] = False
-        born = np.flatnonzero(free & (observed.probability >= self._of_class("birth_score", observed.boxes.label)))
+        born = np.flatnonzero(free & (observed.probability >= self._of_class(observed.boxes.label, "birth_score")[0]))
         if len(born) == 0:
             return born
         boxes, p = observed.boxes.select(born), observed.probability[born]
@@ -347,10 +348,10 @@ class Tracker:
         """Tracks not seen for too long, or no longer believed, are marginalised."""
         columns = self._columns
         coasting = self._time - columns.last_seen
-        dead = coasting > self._of_class("max_coasting", columns.label)
+        max_coasting, merging = self._of_class(columns.label, "max_coasting", "merge_distance")
+        dead = coasting > max_coasting
         dead |= self._time - columns.last_in_view > self.settings.max_out_of_view
         dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
-        merging = self._of_class("merge_distance", columns.label)
         if (merging > 0).any():
             dead |= duplicates(self._kinematics().position, columns.label, coasting <= 0, merging)
         if dead.any():
@@ -404,6 +405,6 @@ class Tracker:
         tracks = nodes_of(self._columns, self._box, types, self._told())
         return self.roadside.beside(tracks, self._origin, self._state)
 
-    def _of_class(self, name: str, label: StrArray) -> FloatArray:
-        """(n,) a class setting for each label."""
-        return class_values(self.settings.classes, name, label)
+    def _of_class(self, label: StrArray, *names: str) -> FloatArray:
+        """(k, n) class settings for each label."""
+        return class_values(self.settings.classes, ClassSettings, label, *names)

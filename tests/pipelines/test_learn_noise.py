@@ -17,8 +17,9 @@ from pipelines.cli.main import app
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
 from saga_fg import ConstantVelocity
+from saga_fg.by_class import DEFAULT
 from saga_fg.learning import sample_with_truth
-from saga_fg.sensor import DEFAULT, NoiseModel, Sensor
+from saga_fg.sensor import NoiseModel, Sensor
 
 WORLD = SimulatorSettings(duration=8.0)
 WORST = 1.35  # factor between what was learned and the truth, at ranges where traffic is

@@ -64,9 +64,9 @@ def test_deviations_grow_as_the_score_falls():
 
 def test_each_class_has_its_noise_and_the_default_serves_all_others():
     sensor = Sensor(noise={"car": NoiseModel(position=1.0), "default": NoiseModel(position=2.0)})
-    assert sensor.deviations(labels("bus", "car", "bus"), "position").tolist() == [2.0, 1.0, 2.0]
-    assert Sensor(noise={"car": NoiseModel()}).deviations(labels("bus"), "position").tolist() == [0.3]
-    assert sensor.deviations(labels(), "position").shape == (0,)
+    assert sensor.deviations(labels("bus", "car", "bus"), "position").tolist() == [[2.0, 1.0, 2.0]]
+    assert Sensor(noise={"car": NoiseModel()}).deviations(labels("bus"), "position").tolist() == [[0.3]]
+    assert sensor.deviations(labels(), "position", "yaw").shape == (2, 0)
     none = np.empty((0, 2))
     assert sensor.position_covariance(labels(), none, np.empty(0), np.zeros(2)).shape == (0, 2, 2)
     assert sensor.velocity_covariance(labels(), np.empty(0)).shape == (0, 2, 2)
