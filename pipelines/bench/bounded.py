@@ -1,8 +1,6 @@
 """What the bound of `BoundedKalmanFilter` costs in accuracy and saves in time, against the exact filter.
 
-A flock in the plane, every node listening to its four nearest neighbours, which are chosen anew at every frame; data
-are drawn from the model. `mixing` is the share of its velocity that a node takes over from its neighbours in a frame:
-0.2 is weak, 0.35 moderate, 0.5 strong coupling.
+On the connected flock of `pipelines.bench.flocks`.
 """
 
 from __future__ import annotations
@@ -10,19 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from pipelines.bench.flocks import CAR, DT, MISSED, NOISE, Flock, Frame
+from pipelines.bench.flocks import NEIGHBOURS, Flock, Frame, flock
 from pipelines.bench.measuring import one_thread, timed
-from saga_fg import Edges, SceneGraph
 from saga_fg.arrays import FloatArray
-from saga_fg.discretisation import discretise
-from saga_fg.estimators import BoundedKalmanFilter, Estimator, JointKalmanFilter, Measurements
+from saga_fg.estimators import BoundedKalmanFilter, Estimator, JointKalmanFilter
 from saga_fg.settings import require_between, setting
-
-NEIGHBOURS = 4
-SPACING = 10.0  # m
-SPEED = 2.0  # with which the flock mixes, m/s
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,8 @@ class BoundedRow:
 
 def bench_bounded(settings: BoundedBenchSettings) -> tuple[BoundedRow, ...]:
     """A row for each bound; the exact filter and the bounded ones take turns frame by frame."""
-    scene = planar_flock(settings)
+    frames = settings.warm_up + settings.frames
+    scene = flock("connected", settings.nodes, frames, settings.seed, settings.mixing)
     exact = _Taken(JointKalmanFilter(), scene)
     bounded = {hops: _Taken(BoundedKalmanFilter(hops=hops), scene) for hops in settings.hops}
     with one_thread():
@@ -125,33 +117,3 @@ def _row(hops: int, taken: _Taken, exact: _Taken) -> BoundedRow:
         float(np.abs(taken.likelihoods).max()),
         float(np.mean([len(cluster) for cluster in taken.estimator.clusters])),
     )
-
-
-def planar_flock(settings: BoundedBenchSettings) -> Flock:
-    """The flock; who interacts follows from points that drift whatever the truth does, as edges are inputs."""
-    rng = np.random.default_rng(settings.seed)
-    n = settings.nodes
-    points = rng.uniform(0, SPACING * np.sqrt(n), (n, 2))
-    drift = SPEED * rng.normal(size=(n, 2))
-    P = np.diag([0.25, 0.25, 1.0, 1.0])
-    truth = np.concatenate([points, drift], axis=1)
-    means = truth + rng.normal(size=(n, 4)) * np.sqrt(np.diag(P))
-    total = -np.log(1 - settings.mixing) / DT
-    target = np.repeat(np.arange(n), NEIGHBOURS)
-    A = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (len(target), 1, 1))
-    record = []
-    for _ in range(settings.warm_up + settings.frames):
-        points = points + drift * DT
-        _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
-        source = np.asarray(nearest)[:, 1:].ravel()
-        rate = rng.uniform(0.5, 1.5, len(target)) * total / NEIGHBOURS
-        edges = Edges("shared velocity", target, source, rate, -A, A, np.zeros((len(target), 4)))
-        transition = discretise(SceneGraph.of(np.arange(n), CAR, [edges]), DT)
-        truth = (transition.F_matrix @ truth.ravel() + transition.b).reshape(n, 4)
-        for blocks in transition.Q:
-            root = np.linalg.cholesky(blocks.values)
-            truth[blocks.target] += (root @ rng.normal(size=(len(blocks.target), 4, 1)))[:, :, 0]
-        seen = np.flatnonzero(rng.random(n) >= MISSED)
-        z = truth[seen, :2] + NOISE * rng.normal(size=(len(seen), 2))
-        record.append(Frame(transition, Measurements(seen, z, np.eye(2, 4), NOISE**2 * np.eye(2)), truth))
-    return Flock("connected", np.arange(n), means, np.tile(P, (n, 1, 1)), tuple(record))

@@ -66,7 +66,7 @@ def flock(kind: Kind, n: int, frames: int, seed: int, mixing: float = 0.35) -> F
     points, drift = rng.uniform(0, SPACING * np.sqrt(n), (n, 2)), SPEED * rng.normal(size=(n, 2))
     truth = np.concatenate([points, drift], axis=1)
     means = truth + rng.normal(size=(n, 4)) * np.sqrt(np.diag(P))
-    order = rng.permutation(n)  # groups are not told one after the other
+    order = rng.permutation(n) if kind == "components" else np.arange(n)  # groups are not told one after the other
     record = []
     for _ in range(frames):
         points = points + drift * DT

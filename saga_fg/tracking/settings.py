@@ -18,6 +18,7 @@ from saga_fg.road.cones import ConeEdge
 from saga_fg.road.lane_keeping import InLane
 from saga_fg.road.stopping import RedLight
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+from saga_fg.stability import require_stable
 
 EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
 AssociationName = Literal["hungarian", "greedy", "graph"]
@@ -139,7 +140,10 @@ class StandingSettings:
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """Everything the tracker can be told; `edges` empty is the classical filter of independent objects."""
+    """Everything the tracker can be told; `edges` empty is the classical filter of independent objects.
+
+    Raises `InputError` for edge rules that make the dynamics, or a step of up to a second, unstable.
+    """
 
     classes: Mapping[str, ClassSettings] = field(
         default_factory=lambda: {DEFAULT: ClassSettings()},
@@ -183,6 +187,7 @@ class TrackerSettings:
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))
+        require_stable(self.edges, self.max_step)
 
 
 @dataclass(frozen=True)

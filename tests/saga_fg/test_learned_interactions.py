@@ -98,7 +98,8 @@ def test_dynamics_that_run_away_are_refused():
     st.floats(0.5, 1e3) | st.just(math.inf),
 )
 def test_shipped_interactions_are_stable_at_every_rate(rate, interaction, tau):
-    LearnedInteractions(edges=(Neighbours(interaction, rate=rate), Following(CarFollowing(tau), rate=rate)))
+    for rule in (Neighbours(interaction, rate=rate), Following(CarFollowing(tau), rate=rate)):
+        LearnedInteractions(edges=(rule,))
 
 
 @given(st.integers(0, 1000))
