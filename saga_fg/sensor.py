@@ -183,8 +183,8 @@ class Sensor:
         # along and across the line of sight u: (a r u)(a r u)^T + (b r n)(b r n)^T = b^2 r^2 I + (a^2 - b^2) r^2 u u^T
         along, across, factor = along**2, across**2, _score_factor(low_score, probability)
         isotropic = factor * (own**2 + across * np.einsum("ni,ni->n", offset, offset))
-        ray = (factor * (along - across))[:, None] * offset
-        return np.asarray(isotropic[:, None, None] * np.eye(2) + ray[:, :, None] * offset[:, None, :])
+        rays = (factor * (along - across))[:, None, None] * (offset[:, :, None] * offset[:, None, :])
+        return np.asarray(isotropic[:, None, None] * np.eye(2) + rays)
 
     def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
         """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
