@@ -20,6 +20,7 @@ from saga_fg.estimators.layout import Layout
 
 _FEW = 4  # components of a size that are not worth a batched operation of their own
 _PACK = 64  # states that such components together may have
+_PAIRS = 200  # from which on a graph of pairs is worth building
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +136,7 @@ class Partition:
         across = a != b
         if not across.any():
             return self
-        pairs = scipy.sparse.coo_array((np.ones(int(across.sum())), (a[across], b[across])), (self.count, self.count))
-        return Partition(self.layout, connected_components(pairs, directed=False)[1].astype(np.int64)[self.label])
+        return Partition(self.layout, _united(self.count, a[across], b[across])[self.label])
 
     @cached_property
     def packed(self) -> Partition:
@@ -162,6 +162,23 @@ class Partition:
     def restricted(self, layout: Layout, rows: IntArray) -> Partition:
         """Of the nodes at `rows` alone, which are those of `layout`."""
         return Partition(layout, _without_gaps(self.label[rows]))
+
+
+def _united(count: int, a: IntArray, b: IntArray) -> IntArray:
+    """(count,) number of the set that each of `count` elements is in when a[k] and b[k] are in one, without gaps."""
+    if len(a) > _PAIRS:
+        pairs = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), (count, count))
+        return np.asarray(connected_components(pairs, directed=False)[1], dtype=np.int64)
+    root = list(range(count))
+    for one, other in zip(a.tolist(), b.tolist(), strict=True):
+        while root[one] != one:
+            one = root[one]
+        while root[other] != other:
+            other = root[other]
+        root[max(one, other)] = min(one, other)
+    for k, parent in enumerate(root):  # a parent comes before its children
+        root[k] = root[parent]
+    return _without_gaps(np.array(root, dtype=np.int64))
 
 
 def _without_gaps(label: IntArray) -> IntArray:
