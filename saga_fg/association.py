@@ -8,7 +8,6 @@ one of least total cost, where an unmatched track or detection costs as much as 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Self
@@ -31,11 +30,6 @@ class Matching:
     @classmethod
     def empty(cls) -> Self:
         return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[Matching]) -> Self:
-        """All pairs of `parts`, in order; at least one part."""
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,24 +74,40 @@ def assign(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray)
     Leaving a pair out costs `unmatched` (a number, one per track (n, 1), or one per pair); only pairs cheaper than that
     are matched.
     """
-    if not possible.any():
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    gain = np.where(possible, np.minimum(cost - unmatched, 0.0), 0.0)
-    rows, columns = linear_sum_assignment(gain)
-    matched = gain[rows, columns] < 0
-    return rows[matched].astype(np.int64), columns[matched].astype(np.int64)
+    rows, columns = possible.nonzero()
+    chosen = least_total(rows, columns, (cost - unmatched)[rows, columns])
+    return rows[chosen], columns[chosen]
 
 
-def assign_greedily(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray) -> tuple[IntArray, IntArray]:
-    """As `assign`, but the cheapest pair first, which takes its track and its detection from all others."""
-    gain = np.where(possible, np.minimum(cost - unmatched, 0.0), 0.0)
-    rows, columns = np.nonzero(gain < 0)
-    order = np.argsort(gain[rows, columns], kind="stable")
-    taken_row, taken_column = np.zeros(len(gain), dtype=bool), np.zeros(gain.shape[1], dtype=bool)
+def least_total(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
+    """Which of K candidates, pairs (row, column), make the assignment of least total gain; ascending.
+
+    gain (K,): what a candidate costs less than leaving both alone. Candidates without a rival need no assignment.
+    """
+    paying = (gain < 0).nonzero()[0]
+    row, column, gain = row[paying], column[paying], gain[paying]
+    alone = (np.bincount(row)[row] == 1) & (np.bincount(column)[column] == 1)
+    rival = (~alone).nonzero()[0]
+    if len(rival) == 0:
+        return paying
+    rows, r = np.unique(row[rival], return_inverse=True)
+    columns, c = np.unique(column[rival], return_inverse=True)
+    dense, number = np.zeros((len(rows), len(columns))), np.full((len(rows), len(columns)), -1)
+    dense[r, c], number[r, c] = gain[rival], rival
+    chosen = number[linear_sum_assignment(dense)]
+    alone[chosen[chosen >= 0]] = True
+    return np.asarray(paying[alone])
+
+
+def cheapest_first(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
+    """As `least_total`, but the cheapest candidate first, which takes its row and its column from all others."""
+    paying = (gain < 0).nonzero()[0]
+    taken_rows: set[int] = set()
+    taken_columns: set[int] = set()
     chosen = []
-    for k in order.tolist():
-        if not (taken_row[rows[k]] or taken_column[columns[k]]):
-            taken_row[rows[k]] = taken_column[columns[k]] = True
+    for k in paying[gain[paying].argsort(kind="stable")].tolist():
+        if row[k] not in taken_rows and column[k] not in taken_columns:
+            taken_rows.add(int(row[k]))
+            taken_columns.add(int(column[k]))
             chosen.append(k)
-    kept = np.sort(np.array(chosen, dtype=np.int64))
-    return rows[kept], columns[kept]
+    return np.sort(np.array(chosen, dtype=np.int64))

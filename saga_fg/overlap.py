@@ -75,6 +75,11 @@ def paired_iou_3d(a: Boxes, b: Boxes) -> FloatArray:
     return np.asarray(common / (_area(a) * a.size[:, 2] + _area(b) * b.size[:, 2] - common))
 
 
+def paired_giou_3d(a: Boxes, b: Boxes) -> FloatArray:
+    """(N,) generalised IoU of the volumes of a[n] and b[n]; -1 where a size or heading is unknown."""
+    return _paired_giou(a, b, spatial=True)
+
+
 def touching_pairs(a: Boxes, b: Boxes) -> tuple[IntArray, IntArray]:
     """Rows of `a` and of `b` of the pairs whose circumscribed circles meet: all that can overlap."""
     radius_a, radius_b = (np.hypot(x.size[:, 0], x.size[:, 1]) / 2 for x in (a, b))
@@ -121,11 +126,17 @@ def _share_inside(start: FloatArray, edge: FloatArray, half: FloatArray) -> Floa
 
 
 def _giou(a: Boxes, b: Boxes, reach: float, spatial: bool) -> FloatArray:
-    known = [np.isfinite(x.size).all(axis=1) & np.isfinite(x.yaw) for x in (a, b)]
     result = np.full((len(a), len(b)), -1.0)
-    rows, columns = np.nonzero((_square_distances(a, b) <= reach**2) & known[0][:, None] & known[1][None, :])
-    a, b = a.select(rows), b.select(columns)
-    common = np.zeros(len(rows))
+    rows, columns = np.nonzero(_square_distances(a, b) <= reach**2)
+    result[rows, columns] = _paired_giou(a.select(rows), b.select(columns), spatial)
+    return result
+
+
+def _paired_giou(a: Boxes, b: Boxes, spatial: bool) -> FloatArray:
+    known = np.isfinite(a.size + b.size).all(axis=1) & np.isfinite(a.yaw + b.yaw)
+    result = np.full(len(a), -1.0)
+    a, b = a.select(known), b.select(known)
+    common = np.zeros(len(a))
     near = np.flatnonzero(_may_touch(a, b))
     common[near] = paired_intersection(a.select(near), b.select(near))
     hull, area_a, area_b = paired_hull(a, b), _area(a), _area(b)
@@ -134,7 +145,7 @@ def _giou(a: Boxes, b: Boxes, reach: float, spatial: bool) -> FloatArray:
         hull = hull * _spanned_height(a, b)
         area_a, area_b = area_a * a.size[:, 2], area_b * b.size[:, 2]
     union = area_a + area_b - common
-    result[rows, columns] = common / union - (hull - union) / hull
+    result[known] = common / union - (hull - union) / hull
     return result
 
 

@@ -27,7 +27,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.association import assign
+from saga_fg.association import least_total
 
 LARGEST_FRONTIER = 60_000  # candidates times partial decisions that are followed at a time
 _EXACT = 1e-9  # costs closer than this are the same
@@ -204,9 +204,5 @@ def _search(track: IntArray, detection: IntArray, gain: FloatArray, C: FloatArra
 
 def _incumbent(track: IntArray, detection: IntArray, gain: FloatArray, C: FloatArray) -> tuple[float, IntArray]:
     """What the assignment of least g costs, and that assignment."""
-    dense = np.zeros((int(track.max()) + 1, int(detection.max()) + 1))
-    dense[track, detection] = gain
-    number = np.zeros(dense.shape, dtype=np.int64)
-    number[track, detection] = np.arange(len(track))
-    chosen = number[assign(dense, dense < 0, 0.0)]
-    return float(gain[chosen].sum() + C[np.ix_(chosen, chosen)].sum() / 2), np.sort(chosen)
+    chosen = least_total(track, detection, gain)
+    return float(gain[chosen].sum() + C[np.ix_(chosen, chosen)].sum() / 2), chosen

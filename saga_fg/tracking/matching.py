@@ -1,4 +1,4 @@
-r"""Which detection of a frame belongs to which track, class by class.
+r"""Which detection of a frame belongs to which track, within the classes.
 
     cost_ij      = d_ij^2 + log det S_ij - w GIoU_ij
     unmatched_ij = a 2 log( p_D r_i / (1 - p_D r_i) ) + b 2 log( p_j / (1 - p_j) ) - 2 log( 2 pi lambda )
@@ -11,9 +11,10 @@ below 1 say that they are no more than indications. lambda is how many false det
 as many as the frame's own scores admit, so that it fits any detector. A track that nobody believes in can't take a
 strong detection from afar, least of all among many weak ones, and of two detections the stronger one is preferred.
 
-The assignment is the one of least total cost (`hungarian`), is made cheapest pair first (`greedy`), or registers the
-graph observed to the graph predicted (`graph`): to the costs above come those of `saga_fg.pairwise_costs` between the
-pairs, of all classes, whose tracks the filter knows to be displaced alike.
+Candidates are the pairs of one class inside its gate. The assignment is the one of least total cost (`hungarian`), is
+made cheapest pair first (`greedy`), or registers the graph observed to the graph predicted (`graph`): to the costs
+above come those of `saga_fg.pairwise_costs` between the pairs, of all classes, whose tracks the filter knows to be
+displaced alike.
 
 Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
 Generalized Intersection over Union, CVPR 2019.
@@ -22,16 +23,15 @@ Generalized Intersection over Union, CVPR 2019.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, distinct
-from saga_fg.association import Matching, assign, assign_greedily, gate, mahalanobis
+from saga_fg.arrays import FloatArray, IntArray, distinct
+from saga_fg.association import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
 from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_settings
-from saga_fg.overlap import giou_3d
+from saga_fg.by_class import class_values
+from saga_fg.overlap import paired_giou_3d
 from saga_fg.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.observation import Observed
@@ -40,15 +40,19 @@ from saga_fg.tracking.settings import AssociationSettings, ClassSettings, Tracke
 LEAST_CLUTTER = 0.05  # false detections to be reckoned with, however sure the detector is
 
 
-class _ClassCosts(NamedTuple):
-    """Of one class: rows of its tracks (n,) and detections (m,), and for each pair (n, m) the squared distance, the
-    cost less that of leaving both alone, and whether it is inside the gate."""
+class Candidates(NamedTuple):
+    """K pairs that may be matched: rows of tracks and detections, the innovation (K, 2), m, and its covariance
+    (K, 2, 2), its squared distance, and what the pair costs less than leaving both alone, negative if it pays."""
 
     track: IntArray
     detection: IntArray
+    innovation: FloatArray
+    S: FloatArray
     d2: FloatArray
     gain: FloatArray
-    possible: BoolArray
+
+    def select(self, rows: IntArray) -> Candidates:
+        return Candidates._make(column[rows] for column in self)
 
 
 def associate(
@@ -68,86 +72,73 @@ def associate(
     clutter_area  of the module, m^2, of the sensor that speaks
     cross      covariances of the positions of tracks with each other, which the method `graph` needs
     """
-    costs = list(_costs(predicted, P, expected, observed, settings, clutter_area))
-    if not costs:
-        return Matching.empty()
+    found = candidates(predicted, P, expected, observed, settings, clutter_area)
     if settings.association.method == "graph" and cross is not None:
-        return _registered(costs, predicted, P, observed, cross, settings.association.pair_weight)
-    match = assign_greedily if settings.association.method == "greedy" else assign
-    pairs = []
-    for each in costs:
-        row, column = match(each.gain, each.possible, 0.0)
-        pairs.append(Matching(each.track[row], each.detection[column], each.d2[row, column]))
-    return Matching.concatenate(pairs)
+        pairs = pair_costs(found.track, found.detection, found.innovation, found.S, cross)
+        pairs = pairs._replace(cost=settings.association.pair_weight * pairs.cost)
+        chosen = QuadraticMatching(found.track, found.detection, found.gain, pairs).solve()
+    else:
+        choose = cheapest_first if settings.association.method == "greedy" else least_total
+        chosen = choose(found.track, found.detection, found.gain)
+    return Matching(found.track[chosen], found.detection[chosen], found.d2[chosen])
 
 
-def _costs(
+def candidates(
     predicted: Boxes,
     P: FloatArray,
     expected: FloatArray,
     observed: Observed,
     settings: TrackerSettings,
     clutter_area: float,
-) -> Iterator[_ClassCosts]:
-    """Class by class, of those that are both predicted and observed."""
+) -> Candidates:
+    """The pairs of one class that are inside its gate; the arguments are those of `associate`."""
     (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(observed.boxes.label)
-    for label in classes:
-        if label not in seen:
-            continue
-        t, d = np.flatnonzero(of_track == classes.index(label)), np.flatnonzero(of_detection == seen.index(label))
-        of_class = class_settings(settings.classes, ClassSettings, label)
-        position, measured = predicted.position[t, :2], observed.boxes.position[d, :2]
-        d2, log_det = mahalanobis(position, P[t], measured, observed.R[d, :2, :2])
-        apart = np.hypot(*np.moveaxis(measured[None] - position[:, None], -1, 0))
-        possible = (d2 < gate(of_class.gate)) & (apart < of_class.max_distance)
-        cost = d2 + log_det
-        if of_class.overlap_weight > 0:
-            overlap = giou_3d(predicted.select(t), observed.boxes.select(d), of_class.max_distance)
-            cost = cost - of_class.overlap_weight * overlap
-        unmatched = _unmatched(expected[t], observed.probability[d], settings.association, clutter_area)
-        if unmatched is None:
-            unmatched = cost.max(initial=0.0) + 1.0
-        yield _ClassCosts(t, d, d2, cost - unmatched, possible)
-
-
-def _registered(
-    costs: list[_ClassCosts],
-    predicted: Boxes,
-    P: FloatArray,
-    observed: Observed,
-    cross: CrossCovariances,
-    weight: float,
-) -> Matching:
-    """The matching of all classes together of least unary and pairwise cost."""
-    at = [np.nonzero(each.possible) for each in costs]
-    track, detection, d2, gain = (
-        np.concatenate(parts)
-        for parts in zip(
-            *(
-                (each.track[row], each.detection[column], each.d2[row, column], each.gain[row, column])
-                for each, (row, column) in zip(costs, at, strict=True)
-            ),
-            strict=True,
-        )
+    same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
+    shares, reach, overlap_weight = class_values(
+        settings.classes, ClassSettings, predicted.label, "gate", "max_distance", "overlap_weight"
     )
-    innovation = observed.boxes.position[detection, :2] - predicted.position[track, :2]
-    S = P[track] + observed.R[detection, :2, :2]
-    pairs = pair_costs(track, detection, innovation, S, cross)
-    pairs = pairs._replace(cost=weight * pairs.cost)
-    chosen = QuadraticMatching(track, detection, gain, pairs).solve()
-    return Matching(track[chosen], detection[chosen], d2[chosen])
+    x, y = (observed.boxes.position[:, k] - predicted.position[:, k, None] for k in (0, 1))
+    near = same[of_track[:, None], of_detection] & (x * x + y * y < (reach**2)[:, None])
+    t, d = near.nonzero()
+    innovation, S = np.stack([x[near], y[near]], axis=-1), P[t] + observed.R[d, :2, :2]
+    d2, log_det = mahalanobis_of_pairs(innovation, S)
+    gates = {share: gate(share) for share in set(shares.tolist())}
+    inside = (d2 < np.array([gates[share] for share in shares.tolist()])[t]).nonzero()[0]
+    found = Candidates(t, d, innovation, S, d2, d2 + log_det).select(inside)
+    return found._replace(
+        gain=found.gain
+        - _overlap(found, predicted, observed.boxes, overlap_weight)
+        - _unmatched(found, expected, observed.probability, of_detection, settings.association, clutter_area)
+    )
+
+
+def _overlap(found: Candidates, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:
+    """(K,) what the overlap of the boxes counts; weight (n,) of each track's class."""
+    if not weight.any():
+        return np.zeros(len(found.track))
+    return weight[found.track] * paired_giou_3d(predicted.select(found.track), detected.select(found.detection))
 
 
 def _unmatched(
-    expected: FloatArray, probability: FloatArray, settings: AssociationSettings, clutter_area: float
-) -> FloatArray | None:
-    """(n, m) of the module; None where clutter is spread over an infinite area."""
+    found: Candidates,
+    expected: FloatArray,
+    probability: FloatArray,
+    of_detection: IntArray,
+    settings: AssociationSettings,
+    clutter_area: float,
+) -> FloatArray:
+    """(K,) of the module; where clutter is spread over an infinite area, so much that as many as can be are matched.
+
+    of_detection (m,): the number of each detection's class
+    """
     if clutter_area == math.inf:
-        return None
-    density = max(float((1 - probability).sum()), LEAST_CLUTTER) / clutter_area
+        dearest = found.gain.max(initial=0.0)
+        return np.full(len(found.gain), dearest + 1 + len(found.gain) * (dearest - found.gain.min(initial=dearest)))
+    false = np.maximum(np.bincount(of_detection, weights=1 - probability), LEAST_CLUTTER)
     of_track = settings.existence_weight * _log_odds(expected)
-    of_detection = settings.score_weight * _log_odds(probability)
-    return 2 * (of_track[:, None] + of_detection - math.log(2 * math.pi * density))
+    by_score = settings.score_weight * _log_odds(probability)
+    by_density = np.log(2 * math.pi * false / clutter_area)[of_detection]
+    return np.asarray(2 * (of_track[found.track] + (by_score - by_density)[found.detection]))
 
 
 def _log_odds(probability: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, TrackerSettings
-from saga_fg.association import assign_greedily
+from saga_fg.association import cheapest_first, least_total
 from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.matching import associate
@@ -155,10 +155,9 @@ def test_without_anything_in_common_the_graph_matches_as_hungarian(changed):
 
 
 def test_greedy_assignment_in_the_order_of_cost():
-    cost = np.array([[1.0, 2.0], [1.5, 9.0]])
-    rows, columns = assign_greedily(cost, np.ones((2, 2), dtype=bool), 5.0)
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0)]
-    rows, columns = assign_greedily(cost, np.ones((2, 2), dtype=bool), 10.0)
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0), (1, 1)]
-    nothing = assign_greedily(np.zeros((0, 3)), np.zeros((0, 3), dtype=bool), 5.0)
-    assert [len(n) for n in nothing] == [0, 0]
+    row, column = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    cost = np.array([1.0, 2.0, 1.5, 9.0])
+    assert cheapest_first(row, column, cost - 5.0).tolist() == [0]
+    assert cheapest_first(row, column, cost - 10.0).tolist() == [0, 3]
+    assert least_total(row, column, cost - 10.0).tolist() == [1, 2]
+    assert len(cheapest_first(row[:0], column[:0], cost[:0])) == 0
