@@ -108,10 +108,13 @@ class BoxFilter:
         self._turn(along < -MOVING)
         self.votes = np.where(np.abs(along) > MOVING, MOST_VOTES, self.votes)
 
-    def turn_with(self, before: FloatArray, after: FloatArray) -> None:
-        """Turn the headings of what is clearly in motion as its velocity (n, 2) turns in a prediction."""
+    def turn_with(self, before: FloatArray, after: FloatArray, hidden: BoolArray) -> None:
+        """Turn the headings of what is clearly in motion as its velocity (n, 2) turns in a prediction.
+
+        Only of what is `hidden` (n,): headings that are measured tell more than the course of the neighbours does.
+        """
         cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-        moving = np.hypot(*before.T) > MOVING
+        moving = hidden & (np.hypot(*before.T) > MOVING)
         turn = np.where(moving, np.arctan2(cross, (before * after).sum(axis=1)), 0.0)
         self.yaw = wrap_angle(self.yaw + turn)
 

@@ -196,13 +196,14 @@ class Tracker:
         dt = timestamp - self._time
         if dt > 0 and len(self._columns.id) + len(self.roadside):
             steps = max(1, math.ceil(dt / self.settings.max_step - 1e-9))
+            hidden = self._columns.last_seen < self._time
             for _ in range(steps):
                 noise = self._standing_noise(dt / steps)
                 nodes, explained = self._nodes(), self.settings.explained_noise
                 self.graph = build_graph(nodes, self.rules, explained_noise=explained, noise_scale=noise)
                 before = self._kinematics().velocity
                 self._state.predict(self.graph, dt / steps)
-                self._box.turn_with(before, self._kinematics().velocity)
+                self._box.turn_with(before, self._kinematics().velocity, hidden)
                 self.roadside.predict(dt / steps)
             self._box.predict(dt, self._of_class(self._columns.label, "yaw_drift")[0])
         self._time = timestamp

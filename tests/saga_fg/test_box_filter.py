@@ -103,6 +103,14 @@ def test_headings_face_a_clear_motion():
         assert box.yaw[0] == pytest.approx(yaw)
 
 
+def test_only_hidden_headings_turn_with_the_predicted_course():
+    box = born(yaw=0.1).extended(born(yaw=0.1)).extended(born(yaw=0.1))
+    before = np.array([[5.0, 0.0], [5.0, 0.0], [0.5, 0.0]])  # the last one all but stands
+    after = np.stack([before[:, 0] * np.cos(0.2), before[:, 0] * np.sin(0.2)], axis=-1)
+    box.turn_with(before, after, np.array([True, False, True]))
+    assert box.yaw == pytest.approx([0.3, 0.1, 0.1])
+
+
 def test_the_heading_drifts():
     box = born(yaw_noise=0.3)
     box.predict(2.0, np.array([0.5]))

@@ -68,6 +68,25 @@ def random_traffic(rng, n=15):
     return table(rng.uniform(-25, 25, (n, 2)), rng.normal(0, 0.5, n), rng.uniform(0, 15, n))
 
 
+# what neighbours have to tell
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0, 3.0])
+def test_an_edge_counts_as_its_source_would_as_a_measurement_of_the_target(spread):
+    nodes = table([[0.0, 0.0], [3.0, 0.0]], 0.0)
+    plain = Neighbours()
+    for s_i, s_j in ((0.1, 0.1), (9.0, 0.1), (0.1, 9.0)):
+        known = replace(nodes, velocity_variance=np.array([s_i, s_j]))
+        rate, full = edges(replace(plain, spread=spread).pairs(known)), edges(plain.pairs(known))
+        assert rate[0][1] == pytest.approx(full[0][1] * s_i / (s_i + s_j + spread**2))
+        assert rate[1][0] == pytest.approx(full[1][0] * s_j / (s_i + s_j + spread**2))
+
+
+def test_of_two_certain_nodes_neither_learns():
+    nodes = replace(table([[0.0, 0.0], [3.0, 0.0]], 0.0), velocity_variance=np.zeros(2))
+    assert Neighbours(spread=0.0).pairs(nodes).rate.tolist() == [0.0, 0.0]
+
+
 # following
 
 
