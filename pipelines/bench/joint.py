@@ -7,7 +7,7 @@ Intervals are paired bootstraps over recordings, the seeds of one recording take
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -51,20 +51,23 @@ class JointBench:
 
 
 def bench_joint(
-    scenes: Iterable[Scene],
-    count: int,
+    scenes: Sequence[Scene],
     config: TrackConfig,
     seeds: Sequence[int],
     settings: JointSettings | None = None,
     sensor: str = "lidar",
     poles: bool = False,
     progress: Progress | None = None,
+    so_far: Callable[[JointBench], None] | None = None,
 ) -> JointBench:
-    """Run every one of `count` scenes with every seed; with `poles` once more, with those beside the road."""
+    """Run all scenes with the first seed, then with the next; with `poles` once more, with those beside the road.
+
+    so_far: told after every run what the runs up to it say
+    """
     settings = settings or JointSettings()
     rows: list[JointRow] = []
-    for scene in scenes:
-        for seed in seeds:
+    for seed in seeds:
+        for scene in scenes:
             run = run_joint(scene, config, settings, sensor, seed)
             odometry, joint = run.errors()
             with_poles = float("nan")
@@ -85,7 +88,13 @@ def bench_joint(
                 )
             )
             if progress is not None:
-                progress(scene.name, len(rows), count * len(seeds))
+                progress(scene.name, len(rows), len(scenes) * len(seeds))
+            if so_far is not None:
+                so_far(_judged(rows, poles))
+    return _judged(rows, poles)
+
+
+def _judged(rows: Sequence[JointRow], poles: bool) -> JointBench:
     change = _change(rows, lambda row: row.joint_ate, lambda row: row.decoupled_ate)
     landmarks = _change(rows, lambda row: row.landmarks_ate, lambda row: row.joint_ate) if poles else None
     return JointBench(tuple(rows), change, landmarks)

@@ -10,11 +10,12 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.reporting import progress_bar
+from pipelines.cli.reporting import error_console, progress_bar
 from pipelines.cli.tables import JsonFile
 
 if TYPE_CHECKING:
     from data_tools.metrics import Interval
+    from pipelines.bench.joint import JointBench
 
 
 def joint(
@@ -57,16 +58,25 @@ def joint(
         raise InputError("--poles: expected with simulated streets only, recordings have no made-up poles")
     if json_file is not None:
         check_writable(json_file)
-    with progress_bar() as progress:
-        if dataroot is None:
-            many = (simulate_scene(street(), seed) for seed in range(first, first + scenes))
-            settings = load_config("simulated", config)
-            result = bench_joint(many, scenes, settings, range(seeds), poles=poles, progress=progress)
-        else:
-            kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","))
-            recorded = map(kitti.scene, kitti.scenes)
-            settings = load_config("kitti", config)
-            result = bench_joint(recorded, len(kitti.scenes), settings, range(seeds), progress=progress)
+    if dataroot is None:
+        many = [simulate_scene(street(), seed) for seed in range(first, first + scenes)]
+        settings = load_config("simulated", config)
+    else:
+        kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","))
+        many = [kitti.scene(name) for name in kitti.scenes]
+        settings = load_config("kitti", config)
+
+    def so_far(result: JointBench) -> None:
+        row = result.rows[-1]
+        errors = f"ATE {row.decoupled_ate:.3f} m decoupled, {row.joint_ate:.3f} m joint"
+        change = _percent("joint against decoupled", result.change)
+        line = f"{len(result.rows)}/{len(many) * seeds} {row.scene}, seed {row.seed}: {errors}; so far {change}"
+        error_console().print(line, markup=False, highlight=False, soft_wrap=True)
+        if json_file is not None:
+            write_figures(json_file, result)
+
+    with progress_bar(unit="runs") as progress:
+        result = bench_joint(many, settings, range(seeds), poles=poles, progress=progress, so_far=so_far)
     columns = ("recording", "draws", "path, m", "ATE, m: decoupled", "joint", "m per 10 m: decoupled", "joint")
     table = Table(*columns, title="error of the vehicle's path, medians over draws", title_justify="left")
     for name in dict.fromkeys(row.scene for row in result.rows):
@@ -84,8 +94,6 @@ def joint(
     if result.landmarks is not None:
         better = sum(row.landmarks_ate < row.joint_ate for row in result.rows)
         typer.echo(f"{_percent('with poles against without', result.landmarks)}, lower in {better} runs")
-    if json_file is not None:
-        write_figures(json_file, result)
 
 
 def _percent(what: str, change: Interval) -> str:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from data_tools.simulator import simulate_scene
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
-from pipelines.bench.joint import bench_joint
+from pipelines.bench.joint import JointBench, bench_joint
 from pipelines.cli.main import app
 from pipelines.config import load_config
 from pipelines.slam.joint import keyframes, run_joint
@@ -59,7 +59,9 @@ def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None
     scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
     settings = JointSettings(rounds=1, keyframe_period=0.15)
     config = load_config("simulated")
-    result = bench_joint(scenes, 2, config, [0], settings, poles=True)
+    told: list[JointBench] = []
+    result = bench_joint(scenes, config, [0], settings, poles=True, so_far=told.append)
+    assert [len(part.rows) for part in told] == [1, 2] and told[-1] == result
     assert [row.scene for row in result.rows] == ["street 1", "street 2"]
     for scene, row in zip(scenes, result.rows, strict=True):
         odometry, joint = run_joint(scene, config, settings, "lidar", 0).errors()
