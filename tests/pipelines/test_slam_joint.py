@@ -61,7 +61,8 @@ def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None
     config = load_config("simulated")
     told: list[JointBench] = []
     result = bench_joint(scenes, config, [0], settings, poles=True, so_far=told.append)
-    assert [len(part.rows) for part in told] == [1, 2] and told[-1] == result
+    assert [len(part.rows) for part in told] == [1, 2]
+    assert told[-1] == result
     assert [row.scene for row in result.rows] == ["street 1", "street 2"]
     for scene, row in zip(scenes, result.rows, strict=True):
         odometry, joint = run_joint(scene, config, settings, "lidar", 0).errors()
