@@ -9,7 +9,7 @@ from factors.absolute import attitude_factor, position_factor
 from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
 from factors.calibrated_range import calibrated_range_factors
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
-from factors.edge import edge_factors
+from factors.edge import HesseLine, edge_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
     check_dimensions,
@@ -42,6 +42,7 @@ __all__ = [
     "ERROR_DIM",
     "Components",
     "FactorError",
+    "HesseLine",
     "Linearisable",
     "MeasurementModel",
     "NonlinearInteraction",

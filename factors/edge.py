@@ -9,8 +9,9 @@ they lie says nothing. The residuals are how far off the line they are in the wo
 
     r_i = n . (R z_i + t) - rho
 
-(E the first two axes), which needs no wrapping and is as good far from the origin as near it. With the pose moved to
-(R Exp(w), t + R v),
+(E the first two axes), which needs no wrapping and is as good far from the origin as near it. (theta, rho),
+(theta + 2 pi, rho) and (theta + pi, -rho) are one line; `HesseLine` goes from one line to another by the smallest
+turn. With the pose moved to (R Exp(w), t + R v),
 
     dr_i/dw = -n^T E R [z_i]x    dr_i/dv = n^T E R    dr_i/dtheta = n' . (R z_i + t)    dr_i/drho = -1
 """
@@ -20,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -27,7 +29,34 @@ from factors.robust import Robust
 from factors.rotations import cross_matrix
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
-from factors.variables import SpatialPose
+from factors.variables import SpatialPose, Vector
+
+
+@dataclass(frozen=True)
+class HesseLine:
+    """A line in the plane as a vector (theta, rho), rad and m; delta = (turn within a quarter, m)."""
+
+    @property
+    def dim(self) -> int:
+        return 2
+
+    def read(self, values: gtsam.Values, key: int) -> FloatArray:
+        return Vector(2).read(values, key)
+
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        return state + delta
+
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        turn = (other[0] - state[0] + np.pi) % (2 * np.pi) - np.pi
+        if abs(turn) <= np.pi / 2:
+            return np.array([turn, other[1] - state[1]])
+        return np.array([turn - np.copysign(np.pi, turn), -other[1] - state[1]])
+
+    def size(self, state: FloatArray) -> FloatArray:
+        return np.array([1.0, abs(state[1])])
+
+    def array(self, state: FloatArray) -> FloatArray:
+        return state
 
 
 def edge_factors(

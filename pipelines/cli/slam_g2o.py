@@ -21,6 +21,9 @@ def g2o(
     compare: Annotated[
         bool, typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt and iSAM2 (QR) on the graph too.")
     ] = False,
+    isam2_batch: Annotated[
+        int, typer.Option("--isam2-batch", min=1, help="Poses that iSAM2 is given with each update.")
+    ] = 10,
     robust: Annotated[
         Loss | None,
         typer.Option("--robust", help="Loss over the measurements that do not join successive poses: false loops."),
@@ -61,7 +64,8 @@ def g2o(
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):
-            errors |= {"GTSAM Levenberg-Marquardt": levenberg_marquardt(graph), "GTSAM iSAM2 (QR)": isam2(graph)}
+            errors["GTSAM Levenberg-Marquardt"] = levenberg_marquardt(graph)
+            errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
     write_pose_graph(output, graph, optimised, errors)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
     typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (guess in the file {guess:.6g})")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import ResidualFactors, SpatialPose, Vector, edge_factors
+from factors import HesseLine, ResidualFactors, SpatialPose, edge_factors
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.settings import require_positive, setting
@@ -33,8 +33,8 @@ class LaneEdgeLandmark:
         return SpatialPose()
 
     @property
-    def variable(self) -> Vector:
-        return Vector(2)
+    def variable(self) -> HesseLine:
+        return HesseLine()
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
         return [edge_factors(rows, observed.reshape(-1, 2, 3), covariances)]

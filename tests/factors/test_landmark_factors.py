@@ -6,6 +6,7 @@ import pytest
 
 from factors import (
     FactorError,
+    HesseLine,
     OrientedPlane,
     PlanarPose,
     Robust,
@@ -185,6 +186,16 @@ def test_a_perfect_measurement_costs_nothing(seed):
         on_plane_factor(2, 3, wall.normal().point3() @ place + wall.distance(), 1.0, 3).error(values),
     ]
     np.testing.assert_allclose(errors, 0, atol=1e-18)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_lines_are_compared_whatever_they_are_written_as(seed):
+    rng = np.random.default_rng(seed)
+    kind, line = HesseLine(), np.array([rng.uniform(-9, 9), rng.normal(0, 5)])
+    step = np.array([rng.uniform(-1.5, 1.5), rng.normal()])
+    theta, rho = kind.retract(line, step)
+    for same in ((theta, rho), (theta - 2 * np.pi, rho), (theta + np.pi, -rho), (theta - 3 * np.pi, -rho)):
+        np.testing.assert_allclose(kind.local(line, np.array(same)), step, atol=1e-12)
 
 
 def test_the_offset_of_a_straight_lane_is_a_distance():
