@@ -1,7 +1,8 @@
 """Lanes as curves: a boundary seen from the vehicle, and objects that keep to a centre line.
 
 A lane curve is a landmark c = (c_0, ..., c_k) in a level frame of its own, world_T_curve = (R_c, t_c), which is fixed
-and has its x axis along the road:
+and has its x axis along the road (or in one for each factor: with c_0 alone, how far a line that bends lies aside of
+where a map has it, seen at each foot):
 
     y = f(x) = c_0 + c_1 x + ... + c_k x^k
 
@@ -47,12 +48,12 @@ def lane_boundary_factors(
     """Return n factors of points on a lane curve, seen from the vehicle.
 
     rows: (n, 2) keys of the pose (`gtsam.Pose3`) and the curve (a vector of `coefficients`); z: (n, 3), m, in the
-    pose's frame; variances: (n,), or one for all, m^2, across the curve; world_T_curve: (4, 4); offsets: (n,), or one
-    for all, m to the left of the curve. Raises `FactorError`.
+    pose's frame; variances: (n,), or one for all, m^2, across the curve; world_T_curve: (n, 4, 4), or one (4, 4) for
+    all; offsets: (n,), or one for all, m to the left of the curve. Raises `FactorError`.
     """
     measured = checked("z", z, (None, 3)).copy()
     n = len(measured)
-    curve = _Curve(_frame(world_T_curve), _checked_count(coefficients), _column("offsets", offsets, n))
+    curve = _Curve(_frames(world_T_curve, n), _checked_count(coefficients), _column("offsets", offsets, n))
     function = _Boundary(measured, curve)
     return ResidualFactors(
         rows=np.asarray(rows),
@@ -83,7 +84,7 @@ def lane_keeping_factors(
     """
     n = len(np.asarray(rows))
     checked_components("position", position, state_dim, least=2)
-    curve = _Curve(_frame(world_T_curve), _checked_count(coefficients), _column("offsets", offsets, n))
+    curve = _Curve(_frames(world_T_curve, n), _checked_count(coefficients), _column("offsets", offsets, n))
     function = _Keeping(curve, state_dim, tuple(position))
     return ResidualFactors(
         rows=np.asarray(rows),
@@ -98,15 +99,15 @@ def lane_keeping_factors(
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """frame: world_T_curve; count: coefficients; offsets (n,)."""
+    """frames: world_T_curve (n, 4, 4); count: coefficients; offsets (n,)."""
 
-    frame: FloatArray
+    frames: FloatArray
     count: int
     offsets: FloatArray
 
     def inside(self, world: FloatArray) -> FloatArray:
         """World points (n, 3) in the frame of the curve."""
-        return np.asarray((world - self.frame[:3, 3]) @ self.frame[:3, :3])
+        return np.asarray(np.einsum("ni,nij->nj", world - self.frames[:, :3, 3], self.frames[:, :3, :3]))
 
     def residual(self, xy: FloatArray, c: FloatArray) -> FloatArray:
         """r (n, 1) of points (n, 2) in the frame of the curve."""
@@ -141,7 +142,7 @@ class _Boundary:
 
     def jacobians(self, pose: FloatArray, c: FloatArray) -> Sequence[FloatArray]:
         by_xy, by_c = self.curve.derivatives(self._inside(pose), c)
-        turned = self.curve.frame[:3, :3].T @ pose[:, :3, :3]
+        turned = self.curve.frames[:, :3, :3].swapaxes(1, 2) @ pose[:, :3, :3]
         by_tangent = np.concatenate([-turned @ cross_matrix(self.z), turned], axis=2)[:, :2]
         return [by_xy[:, None, :] @ by_tangent, by_c[:, None, :]]
 
@@ -162,7 +163,7 @@ class _Keeping:
     def jacobians(self, state: FloatArray, c: FloatArray) -> Sequence[FloatArray]:
         by_xy, by_c = self.curve.derivatives(self._inside(state), c)
         J_state = np.zeros((len(state), 1, self.state_dim))
-        J_state[:, 0, list(self.position)] = by_xy @ self.curve.frame[:2, :2].T
+        J_state[:, 0, list(self.position)] = np.einsum("nj,nij->ni", by_xy, self.curve.frames[:, :2, :2])
         return [J_state, by_c[:, None, :]]
 
     def _inside(self, state: FloatArray) -> FloatArray:
@@ -171,12 +172,13 @@ class _Keeping:
         return self.curve.inside(world)[:, :2]
 
 
-def _frame(world_T_curve: ArrayLike) -> FloatArray:
-    T = checked("world_T_curve", world_T_curve, (4, 4)).copy()
-    pose("world_T_curve", T)
-    if abs(T[2, 2] - 1) > 1e-9:
-        raise FactorError("world_T_curve: expected a level frame, turned about the vertical alone")
-    return T
+def _frames(world_T_curve: ArrayLike, n: int) -> FloatArray:
+    T = checked("world_T_curve", world_T_curve, (n, 4, 4) if np.ndim(world_T_curve) == 3 else (4, 4)).copy()
+    for one in T.reshape(-1, 4, 4):
+        pose("world_T_curve", one)
+        if abs(one[2, 2] - 1) > 1e-9:
+            raise FactorError("world_T_curve: expected a level frame, turned about the vertical alone")
+    return np.broadcast_to(T, (n, 4, 4))
 
 
 def _checked_count(coefficients: int) -> int:

@@ -19,16 +19,17 @@ import numpy as np
 from data_tools.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.settings import SurroundingSettings
+from data_tools.simulator.settings import LightSettings, SurroundingSettings
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.figures import write_figures
 from pipelines.slam.joint import JointRun
 from pipelines.slam.object_tracks import tracks, tracks_csv
 
 
-def street() -> SimulatorSettings:
-    """Simulated scenes with cars parked on both sides of the road."""
-    return SimulatorSettings(surroundings=SurroundingSettings(parking_probability=1.0))
+def street(parked: bool = True, mapped: bool = False) -> SimulatorSettings:
+    """Simulated scenes with cars parked on both sides of the road, or on none; mapped: frames bring the lanes along."""
+    surroundings = SurroundingSettings(parking_probability=1.0 if parked else 0.0)
+    return SimulatorSettings(surroundings=surroundings, lights=LightSettings(mapped=mapped))
 
 
 def write_joint(output: Path, run: JointRun) -> None:

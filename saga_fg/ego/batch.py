@@ -17,6 +17,7 @@ from saga_fg.arrays import FloatArray
 from saga_fg.ego.estimate import JointEstimate, read_estimate
 from saga_fg.ego.graph import Keyed, error_key, linear_graph, nonlinear_factors, object_key, pose_key, start_graph
 from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_part
+from saga_fg.ego.lanes import KnownLane, keepings, known_lanes, lane_factors, lane_key, lane_priors
 from saga_fg.ego.odometry import Odometry
 from saga_fg.ego.record import register
 from saga_fg.ego.settings import JointSettings
@@ -56,14 +57,16 @@ def estimate_jointly(
     slow = SlowErrors.at_start(settings)
     estimate = None
     for _ in range(settings.rounds):
-        moments = register(frames, path, odometry, new_tracker(), settings.motion_noise)
+        tracker = new_tracker()
+        lanes = known_lanes([tracker.settings.road_map, *(frame.road_map for frame in frames)])
+        moments = register(frames, path, odometry, tracker, settings.motion_noise)
         standing = standing_probabilities(moments, path, slow, settings)
         if isinstance(landmarks, LandmarkPart):
             seen = landmarks
         else:
             seen = landmark_part(landmarks, path, settings.landmark_reach)
         first = [None] if estimate is None else []
-        estimate = _solved(list(enumerate(moments)), path, [*first, standing], seen, settings)
+        estimate = _solved(list(enumerate(moments)), path, [*first, standing], seen, lanes, settings)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate
@@ -83,10 +86,11 @@ def _solved(
     path: FloatArray,
     standing: Sequence[Sequence[FloatArray] | None],
     landmarks: LandmarkPart,
+    lanes: Sequence[KnownLane],
     settings: JointSettings,
 ) -> JointEstimate:
     """One solution after the other, each from the one before: all objects moving, which needs no good start (None), or
-    with those that stand.
+    with those that stand; at last with vehicles drawn to the lanes they are on by the solution before.
     """
     graph = start_graph(0, path[0], settings)
     graph.push_back(linear_graph(record))
@@ -97,6 +101,22 @@ def _solved(
     for probabilities in standing:
         factors = [*nonlinear_factors(record, settings, probabilities), *landmarks.factors]
         solution = solve(graph, factors, values, solver)
+        values = solution.values
+    if settings.lanes is None or not lanes:
+        return read_estimate(record, solution)
+    graph.push_back(lane_priors(lanes))
+    for lane in lanes:
+        values.insert(lane_key(lane.number), np.zeros(1))
+    for _ in range(settings.lanes.rounds):
+        estimate = read_estimate(record, solution)
+        poses = zip(estimate.world_T_ego, estimate.pose_covariances, strict=True)
+        stands = standing[-1] or [np.zeros(len(moment.objects.id)) for _, moment in record]
+        kept = [
+            one
+            for (k, moment), objects, stand, pose in zip(record, estimate.objects, stands, poses, strict=True)
+            for one in keepings(k, objects, moment.seen.id, stand, pose, lanes, settings.lanes)
+        ]
+        solution = solve(graph, [*factors, *lane_factors(record, kept, settings.lanes)], values, solver)
         values = solution.values
     return read_estimate(record, solution)
 

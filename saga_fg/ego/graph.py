@@ -119,7 +119,7 @@ def _births(k: int, moment: EgoMoment, rows: np.ndarray[tuple[int], np.dtype[np.
     """
     born = moment.objects.select(rows)
     factors = []
-    for node_type, mine in _by_type(born.types):
+    for node_type, mine in by_type(born.types):
         rest = [c for c in node_type.components if c not in POSITION]
         H = node_type.selector(rest)
         deviation = np.ones((len(mine), len(rest)))
@@ -146,7 +146,7 @@ def _detections(record: Keyed, settings: JointSettings) -> list[Linearisable]:
     collected: dict[NodeType, _Rows] = {}
     for k, moment in record:
         types = dict(zip(moment.objects.id.tolist(), moment.objects.types, strict=True))
-        for node_type, mine in _by_type(tuple(types[name] for name in moment.seen.id.tolist())):
+        for node_type, mine in by_type(tuple(types[name] for name in moment.seen.id.tolist())):
             rows = collected.setdefault(node_type, _Rows([], [], []))
             rows.keys += [[pose_key(k), object_key(k, int(name))] for name in moment.seen.id[mine]]
             rows.z.append(moment.seen.z[mine])
@@ -177,7 +177,7 @@ def _standing(record: Keyed, standing: Sequence[FloatArray], settings: JointSett
         dt = now.time - before.time
         types = tuple(now.objects.types[row] for row in here[likely].tolist())
         variances = np.array([settings.standing_drift**2 * dt] * 2 + [settings.standing_speed**2] * 2)
-        for node_type, mine in _by_type(types):
+        for node_type, mine in by_type(types):
             rows = collected.setdefault(node_type, _Rows([], [], []))
             rows.keys += [[object_key(j, name), object_key(k, name)] for name in names[likely][mine].tolist()]
             rows.R.append(variances / p[likely][mine, None])
@@ -221,7 +221,7 @@ def _robust(settings: JointSettings) -> Robust | None:
     return None if np.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
 
 
-def _by_type(types: Sequence[NodeType]) -> list[tuple[NodeType, np.ndarray[tuple[int], np.dtype[np.int64]]]]:
+def by_type(types: Sequence[NodeType]) -> list[tuple[NodeType, np.ndarray[tuple[int], np.dtype[np.int64]]]]:
     """Rows of equal node type, with the type."""
     rows: dict[NodeType, list[int]] = {}
     for row, node_type in enumerate(types):

@@ -5,9 +5,27 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from saga_fg.edge_rules import VEHICLES
 from saga_fg.ego.odometry import OdometryNoise
 from saga_fg.errors import InputError
 from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+
+@dataclass(frozen=True)
+class LaneSettings:
+    """How vehicles are drawn to the centre lines of the map's lanes."""
+
+    spread: float = setting(0.3, "how far from the centre line drivers keep, standard deviation, m")
+    memory: float = setting(5.0, "time over which a driver keeps his distance from the line, s")
+    drift: float = setting(0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go")
+    elsewhere: float = setting(0.1, "vehicles that drive along no lane, as a share of those in one")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    rounds: int = setting(3, "how often vehicles are assigned to lanes anew, along the path found with the last lanes")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "spread", "memory", "elsewhere")
+        require_positive(self, "drift", infinite=True)
+        require_between(self, 1, 100, "rounds")
 
 
 @dataclass(frozen=True)
@@ -18,17 +36,23 @@ class JointSettings:
     start_noise: float = setting(1e-3, "standard deviation of the first pose, m and rad")
     standing_window: float = setting(3.0, "time over which an object is judged to stand or to move, s")
     moving_speed: float = setting(5.0, "deviation of a velocity component of objects that move, m/s")
+    walking_speed: float = setting(1.0, "the same of pedestrians, m/s")
     standing_drift: float = setting(0.05, "how far an object that stands may wander, m after one second")
     standing_speed: float = setting(0.1, "standard deviation of the velocity of an object that stands, m/s")
     motion_noise: float = setting(1000.0, "factor on the noise of the objects' motion: traffic brakes and turns as one")
     outlier_scale: float = setting(3.0, "detections farther off than this count less (Cauchy), standard deviations")
     landmark_reach: float = setting(2.5, "a landmark seen farther than this from where it was last is another one, m")
+    lanes: LaneSettings | None = settings_group(
+        lambda: None, "attraction of moving vehicles to the lanes of a map, where there is one; null: none"
+    )
     keyframe_period: float = setting(0.15, "frames that follow a keyframe within this time are passed over, s")
     rounds: int = setting(2, "how often objects are associated anew along the path estimated so far")
     max_iterations: int = setting(30, "linearisations at most, in each round")
 
     def __post_init__(self) -> None:
-        require_positive(self, "start_noise", "standing_window", "moving_speed", "standing_drift", "standing_speed")
+        require_positive(
+            self, "start_noise", "standing_window", "moving_speed", "walking_speed", "standing_drift", "standing_speed"
+        )
         require_positive(self, "motion_noise", "landmark_reach")
         require_positive(self, "outlier_scale", infinite=True)
         require_between(self, 0, math.inf, "keyframe_period")

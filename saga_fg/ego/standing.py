@@ -7,13 +7,13 @@ has D ~ N(0, S): noise of the detections and of the odometry over the T seconds 
     S = R (1/n_1 + 1/n_2) + shift + (scale^2 + course^2) s^2 + range^2 (turn + (bias T)^2)
 
 where shift and turn are the variances that the increments in between add up to in translation and in heading; scale,
-bias and course the odometry's deviations as known so far. One that moves has D ~ N(0, S + (moving_speed T)^2). By
-Bayes, with even odds before,
+bias and course the odometry's deviations as known so far. One that moves has D ~ N(0, S + (u T)^2), with the speed u
+usual for its class: `walking_speed` for pedestrians, `moving_speed` for all others. By Bayes, with even odds before,
 
-    P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (moving_speed T)^2))
+    P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (u T)^2))
 
-The odds weigh the time by themselves: where T is short, S and S + (moving_speed T)^2 are nearly the same, and P about
-one half.
+The odds weigh the time by themselves: where T is short, S and S + (u T)^2 are nearly the same, and P about one half. So
+they do the speed: who walks far away is not taken for a car that stands.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class SlowErrors:
 
 @dataclass(frozen=True, eq=False)
 class _Sightings:
-    """All detections, by object and time: object, moment, time (N,), place (N, 2), variance, range (N,).
+    """All detections, by object and time: object, moment, time (N,), place (N, 2), variance, range, speed u (N,).
 
     drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first moment on
     """
@@ -55,6 +55,7 @@ class _Sightings:
     place: FloatArray
     variance: FloatArray
     range: FloatArray
+    speed: FloatArray
     drift: FloatArray
 
 
@@ -116,7 +117,7 @@ def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings) 
         + (slow.scale**2 + slow.course**2) * s**2
         + half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
     )
-    M = S + (settings.moving_speed * T) ** 2
+    M = S + (seen.speed * T) ** 2
     d2 = (D**2).sum(axis=1)
     odds = np.log(M / S) - d2 / 2 * (1 / S - 1 / M)  # log, two dimensions
     p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
@@ -130,6 +131,12 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
     place = [transform_points(pose, moment.seen.z)[:, :2] for moment, pose in zip(record, path, strict=True)]
     variance = np.concatenate([np.trace(moment.seen.R, axis1=1, axis2=2) / 2 for moment in record])
     distance = np.concatenate([np.hypot(moment.seen.z[:, 0], moment.seen.z[:, 1]) for moment in record])
+    walks = np.concatenate(
+        [
+            np.array(moment.objects.label)[np.isin(moment.objects.id, moment.seen.id)] == "pedestrian"
+            for moment in record
+        ]
+    )
     driven = np.array([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in record])
     P = motion_covariances(record, settings)
     drift = np.zeros((len(record), 3))
@@ -144,5 +151,6 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
         np.concatenate(place)[order],
         variance[order],
         distance[order],
+        np.where(walks, settings.walking_speed, settings.moving_speed)[order],
         drift[moments][order],
     )

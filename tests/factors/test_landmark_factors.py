@@ -101,6 +101,12 @@ def edge(rng, keys, covariance):
     return factor, [some_pose(rng), np.array([rng.uniform(-3, 3), rng.normal(0, 5)])]
 
 
+def keeping_bend(rng, keys, covariance):
+    curve = gtsam.Pose3(gtsam.Rot3.Yaw(rng.uniform(-3, 3)), rng.normal(0, 5, 3)).matrix()
+    factor = lane_keeping_factors([keys], 0.3, [curve], 1, state_dim=4)
+    return factor, [rng.normal(0, 5, 4), rng.normal(0, 1, 1)]
+
+
 def standing(rng, keys, covariance):
     return on_plane_factor(*keys, 0.8, 0.01, state_dim=6, position=(4, 0, 2)), [rng.normal(0, 5, 6), some_plane(rng)]
 
@@ -109,7 +115,7 @@ CASES = {
     "point in the plane": point(2), "point in space": point(3), "plane": plane, "range in the plane": distance(True),
     "range in space": distance(False), "bearing in the plane": bearing(True), "bearing in space": bearing(False),
     "position": satellite, "attitude": attitude, "lane boundary": boundary, "lane keeping": keeping,
-    "on a plane": standing, "straight edge": edge,
+    "lane keeping, seen at each foot": keeping_bend, "on a plane": standing, "straight edge": edge,
 }  # fmt: skip
 
 
@@ -228,6 +234,7 @@ def test_the_offset_of_a_straight_lane_is_a_distance():
             "level",
         ),
         (lambda: lane_keeping_factors([[1, 2]], 1.0, CURVE, 3, state_dim=1), "position"),
+        (lambda: lane_keeping_factors([[1, 2]], 1.0, [CURVE, CURVE], 3, state_dim=4), "world_T_curve"),
         (lambda: on_plane_factor(1, 2, np.inf, 1.0, 3), "height"),
     ],
 )  # fmt: skip

@@ -5,7 +5,7 @@ import pytest
 from ego_drive import drive, new_tracker
 from scipy.stats import chi2
 
-from saga_fg import Frame, InputError
+from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.ego import JointSettings, Odometry, OdometryNoise, estimate_jointly
 from saga_fg.ego.record import register
 from saga_fg.ego.standing import SlowErrors, standing_probabilities
@@ -90,6 +90,23 @@ def test_what_stands_is_told_from_what_drives():
         car = int(np.argmin(np.linalg.norm(cars[middle] - place, axis=1)))
         probability = p[middle][np.searchsorted(record[middle].objects.id, name)]
         assert (probability > 0.5) == (car < 4)
+
+
+def test_who_walks_far_away_does_not_stand():
+    """Where the odometry is poor, a second of walking at 40 m is within its errors; it says nothing of cars."""
+    t = 0.2 * np.arange(20)
+    poses = np.stack([yaw_transform(10.0 * s) for s in t])
+    frames = []
+    for time, pose in zip(t, poses, strict=True):
+        boxes = Boxes.of(["pedestrian", "car"], [[40.0, 8.0 - 1.3 * time, 1.0], [40.0, -8.0, 1.0]])
+        ahead = boxes.transformed(inverse_transform(pose))
+        frames.append(Frame(time, "lidar", Detections(ahead, np.full(2, 0.9)), np.eye(4), "ego"))
+    record = register(frames, poses, Odometry.of(t, poses), new_tracker())
+    p = standing_probabilities(record, poses, SlowErrors.at_start(JointSettings(POOR)), JointSettings(POOR))
+    middle = record[len(record) // 2]
+    says = dict(zip(middle.objects.label, p[len(record) // 2], strict=True))
+    assert says["car"] > 0.9
+    assert says["pedestrian"] < 0.5
 
 
 def test_nothing_is_said_of_an_object_seen_once():
