@@ -8,23 +8,28 @@ Intervals are paired bootstraps over recordings, the seeds of one recording take
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+
+import numpy as np
 
 from data_tools.metrics import Interval, paired_bootstrap
 from pipelines.config import TrackConfig
-from pipelines.slam.joint import run_joint
+from pipelines.slam.joint import JointRun, run_joint
 from pipelines.slam.roadside import observe_poles
 from pipelines.tracking import Progress
 from saga_fg.dataset import Scene
-from saga_fg.ego import JointSettings
+from saga_fg.ego import JointSettings, LaneSettings
 
 
 @dataclass(frozen=True)
 class JointRow:
     """One recording and seed: ATE (m) and relative error (m per 10 m) of each path, and poses in them.
 
-    landmarks_ate: with poles as well; NaN where there are none
+    landmarks_ate        with poles as well; NaN where there are none
+    joint_in_map         RMS distance from the truth as the path is, not moved to lie nearest to it, m
+    lanes_in_map         the same with vehicles drawn to the lanes of a map; NaN where there is none
+    lanes_ate            and the ATE
     """
 
     scene: str
@@ -36,18 +41,24 @@ class JointRow:
     decoupled_relative: float
     joint_relative: float
     landmarks_ate: float
+    joint_in_map: float
+    lanes_in_map: float
+    lanes_ate: float
 
 
 @dataclass(frozen=True)
 class JointBench:
     """All rows, and relative changes of the pooled ATE: -0.2 says that it is 20 % lower.
 
-    change: of joint against decoupled; landmarks: of joint with poles against joint without, None without poles
+    change     of joint against decoupled
+    landmarks  of joint with poles against joint without; None without poles
+    lanes      of joint with lanes against joint without, of the error in the map; None without lanes
     """
 
     rows: tuple[JointRow, ...]
     change: Interval
     landmarks: Interval | None
+    lanes: Interval | None
 
 
 def bench_joint(
@@ -57,10 +68,12 @@ def bench_joint(
     settings: JointSettings | None = None,
     sensor: str = "lidar",
     poles: bool = False,
+    lanes: bool = False,
     progress: Progress | None = None,
     so_far: Callable[[JointBench], None] | None = None,
 ) -> JointBench:
-    """Run all scenes with the first seed, then with the next; with `poles` once more, with those beside the road.
+    """Run all scenes with the first seed, then with the next; with `poles` once more, with those beside the road, and
+    with `lanes` once more, with vehicles drawn to the lanes of the maps that the scenes bring along.
 
     so_far: told after every run what the runs up to it say
     """
@@ -74,6 +87,9 @@ def bench_joint(
             if poles:
                 see = partial(observe_poles, seed=seed)
                 with_poles = run_joint(scene, config, settings, sensor, seed, see).errors()[1].ate
+            on_lanes = None
+            if lanes:
+                on_lanes = run_joint(scene, config, replace(settings, lanes=LaneSettings()), sensor, seed)
             rows.append(
                 JointRow(
                     scene.name,
@@ -85,19 +101,28 @@ def bench_joint(
                     odometry.relative_translation,
                     joint.relative_translation,
                     with_poles,
+                    _in_map(run),
+                    float("nan") if on_lanes is None else _in_map(on_lanes),
+                    float("nan") if on_lanes is None else on_lanes.errors()[1].ate,
                 )
             )
             if progress is not None:
                 progress(scene.name, len(rows), len(scenes) * len(seeds))
             if so_far is not None:
-                so_far(_judged(rows, poles))
-    return _judged(rows, poles)
+                so_far(_judged(rows, poles, lanes))
+    return _judged(rows, poles, lanes)
 
 
-def _judged(rows: Sequence[JointRow], poles: bool) -> JointBench:
+def _in_map(run: JointRun) -> float:
+    off = run.joint.positions - run.truth.positions
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def _judged(rows: Sequence[JointRow], poles: bool, lanes: bool) -> JointBench:
     change = _change(rows, lambda row: row.joint_ate, lambda row: row.decoupled_ate)
     landmarks = _change(rows, lambda row: row.landmarks_ate, lambda row: row.joint_ate) if poles else None
-    return JointBench(tuple(rows), change, landmarks)
+    in_lanes = _change(rows, lambda row: row.lanes_in_map, lambda row: row.joint_in_map) if lanes else None
+    return JointBench(tuple(rows), change, landmarks, in_lanes)
 
 
 def _change(rows: Sequence[JointRow], a: Callable[[JointRow], float], b: Callable[[JointRow], float]) -> Interval:

@@ -30,6 +30,12 @@ def joint(
     first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Draws of the odometry's errors per recording.")] = 1,
     poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
+    lanes: Annotated[
+        bool, typer.Option("--lanes", help="Simulated: once more with vehicles drawn to the lanes of a map.")
+    ] = False,
+    parked: Annotated[
+        bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
+    ] = True,
     json_file: JsonFile = None,
     config: Config = None,
     verbose: Verbose = False,
@@ -41,6 +47,7 @@ def joint(
     \b
     Examples:
       saga-fg bench joint --scenes 10 --poles
+      saga-fg bench joint --scenes 10 --lanes --no-parked
       saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
     """
     from data_tools.atomic_files import check_writable
@@ -54,12 +61,12 @@ def joint(
 
     if (dataroot is None) != (detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
-    if poles and dataroot is not None:
-        raise InputError("--poles: expected with simulated streets only, recordings have no made-up poles")
+    if dataroot is not None and (poles or lanes or not parked):
+        raise InputError("--poles, --lanes and --no-parked: expected with simulated streets only")
     if json_file is not None:
         check_writable(json_file)
     if dataroot is None:
-        many = [simulate_scene(street(), seed) for seed in range(first, first + scenes)]
+        many = [simulate_scene(street(parked, mapped=lanes), seed) for seed in range(first, first + scenes)]
         settings = load_config("simulated", config)
     else:
         kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","))
@@ -69,14 +76,14 @@ def joint(
     def so_far(result: JointBench) -> None:
         row = result.rows[-1]
         errors = f"ATE {row.decoupled_ate:.3f} m decoupled, {row.joint_ate:.3f} m joint"
-        change = _percent("joint against decoupled", result.change)
+        change = _percent("ATE, joint against decoupled", result.change)
         line = f"{len(result.rows)}/{len(many) * seeds} {row.scene}, seed {row.seed}: {errors}; so far {change}"
         error_console().print(line, markup=False, highlight=False, soft_wrap=True)
         if json_file is not None:
             write_figures(json_file, result)
 
     with progress_bar(unit="runs") as progress:
-        result = bench_joint(many, settings, range(seeds), poles=poles, progress=progress, so_far=so_far)
+        result = bench_joint(many, settings, range(seeds), poles=poles, lanes=lanes, progress=progress, so_far=so_far)
     columns = ("recording", "draws", "path, m", "ATE, m: decoupled", "joint", "m per 10 m: decoupled", "joint")
     table = Table(*columns, title="error of the vehicle's path, medians over draws", title_justify="left")
     for name in dict.fromkeys(row.scene for row in result.rows):
@@ -90,12 +97,18 @@ def joint(
         table.add_row(name, str(len(mine)), f"{mine[0].path_length:.0f}", *(f"{x:.3f}" for x in figures))
     Console(width=max(Console().width, 100)).print(table)
     better = sum(row.joint_ate < row.decoupled_ate for row in result.rows)
-    typer.echo(f"{_percent('joint against decoupled', result.change)}, lower in {better} of {len(result.rows)} runs")
+    typer.echo(
+        f"{_percent('ATE, joint against decoupled', result.change)}, lower in {better} of {len(result.rows)} runs"
+    )
     if result.landmarks is not None:
         better = sum(row.landmarks_ate < row.joint_ate for row in result.rows)
-        typer.echo(f"{_percent('with poles against without', result.landmarks)}, lower in {better} runs")
+        typer.echo(f"{_percent('ATE, with poles against without', result.landmarks)}, lower in {better} runs")
+    if result.lanes is not None:
+        better = sum(row.lanes_in_map < row.joint_in_map for row in result.rows)
+        change = _percent("error in the map, with lanes against without", result.lanes)
+        typer.echo(f"{change}, lower in {better} runs")
 
 
 def _percent(what: str, change: Interval) -> str:
     figures = f"{100 * change.estimate:+.1f} % ({100 * change.confidence:.0f} % interval"
-    return f"ATE, {what}: {figures} {100 * change.low:+.1f} to {100 * change.high:+.1f} %)"
+    return f"{what}: {figures} {100 * change.low:+.1f} to {100 * change.high:+.1f} %)"

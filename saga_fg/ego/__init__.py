@@ -4,15 +4,17 @@ from saga_fg.ego.batch import estimate_jointly
 from saga_fg.ego.estimate import JointEstimate, ObjectStates
 from saga_fg.ego.graph import pose_key
 from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_key
+from saga_fg.ego.lanes import lane_key
 from saga_fg.ego.odometry import Odometry, OdometryNoise
 from saga_fg.ego.online import OnlineEstimator, OnlineStep
 from saga_fg.ego.online_estimate import OnlineEstimate, estimate_online
-from saga_fg.ego.settings import JointSettings
+from saga_fg.ego.settings import JointSettings, LaneSettings
 
 __all__ = [
     "JointEstimate",
     "JointSettings",
     "LandmarkPart",
+    "LaneSettings",
     "ObjectStates",
     "Observations",
     "Odometry",
@@ -23,5 +25,6 @@ __all__ = [
     "estimate_jointly",
     "estimate_online",
     "landmark_key",
+    "lane_key",
     "pose_key",
 ]
