@@ -20,16 +20,17 @@ from pipelines.bench.streaming import PLATOON, StreamingBenchSettings, traffic
 from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
 from saga_fg.smoothing import Labels
 
-ROADS, APART = 400, 30.0  # side by side, m apart: platoons do not meet
+ROADS, APART = 400, 1000.0  # side by side, m apart: platoons do not meet
 PART = 30.0  # s that are read at a time, after which memory is looked at
 
 
 @dataclass(frozen=True)
 class FileRow:
-    """When so much was recorded (s): resident memory (MB), and CPU time so far (s)."""
+    """When so much was recorded (s): resident memory and the most so far (MB), and CPU time so far (s)."""
 
     recorded: float
     memory: float
+    peak: float
     cpu: float
 
 
@@ -37,12 +38,14 @@ class FileRow:
 class FileBench:
     """What was measured: rows over the recording; peak memory of the process (MB); CPU time over recorded time; boxes.
 
+    growth              peak memory over that of a recording of a quarter of the length
     largest_difference  of any position from what is made of the whole recording at once, m, on a short one
     differing           boxes that only one of the two has there, of `compared`
     """
 
     rows: tuple[FileRow, ...]
     peak: float
+    growth: float
     ratio: float
     boxes: int
     largest_difference: float
@@ -61,7 +64,7 @@ def bench_files(settings: StreamingBenchSettings, progress: Callable[[str, int, 
         begin = time.thread_time()
 
         def look(name: str, done: int, _: int) -> None:
-            rows.append(FileRow(done / settings.rate, resident_memory(), time.thread_time() - begin))
+            rows.append(FileRow(done / settings.rate, resident_memory(), _peak(), time.thread_time() - begin))
             if progress is not None:
                 progress(name, done, frames)
 
@@ -71,10 +74,17 @@ def bench_files(settings: StreamingBenchSettings, progress: Callable[[str, int, 
             lambda spools: smooth_stream(read_scenes_in_parts(table, rows_read), config, spools, progress=look),
         )
         cpu = time.thread_time() - begin
-        rows.append(FileRow(settings.seconds, resident_memory(), cpu))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        rows.append(FileRow(settings.seconds, resident_memory(), _peak(), cpu))
         difference, differing, compared = _against_batch(Path(folder), settings)
-    return FileBench(tuple(rows), peak, cpu / settings.seconds, done.counts.boxes, difference, differing, compared)
+    peak = rows[-1].peak
+    growth = peak / next(row.peak for row in rows if row.recorded >= settings.seconds / 4)
+    boxes = done.counts.boxes
+    return FileBench(tuple(rows), peak, growth, cpu / settings.seconds, boxes, difference, differing, compared)
+
+
+def _peak() -> float:
+    """Most memory that the process ever held, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 def write_traffic(path: Path, settings: StreamingBenchSettings) -> None:

@@ -17,6 +17,8 @@ from pipelines.cli.tables import JsonFile
 if TYPE_CHECKING:
     from pipelines.bench.streaming import StreamingBenchSettings
 
+LIMIT = 4000.0  # MB, that an hour of 200 objects at 10 Hz is to stay under
+
 
 def streaming(
     objects: Annotated[int, typer.Option("--objects", min=5, help="Objects at any time.")] = 200,
@@ -75,11 +77,20 @@ def _file(settings: StreamingBenchSettings, json_file: Path | None) -> None:
 
     with progress_bar() as progress:
         result = bench_files(settings, progress)
-    table = Table("read, s", "memory, MB", "CPU, s", title=f"{settings.objects} objects at {settings.rate:g} Hz")
+    table = Table(
+        "read, s",
+        "memory, MB",
+        "most so far, MB",
+        "CPU, s",
+        title=f"{settings.objects} objects at {settings.rate:g} Hz",
+    )
     for row in result.rows:
-        table.add_row(f"{row.recorded:.0f}", f"{row.memory:.0f}", f"{row.cpu:.1f}")
+        table.add_row(f"{row.recorded:.0f}", f"{row.memory:.0f}", f"{row.peak:.0f}", f"{row.cpu:.1f}")
     Console().print(table)
-    typer.echo(f"{result.boxes} boxes; peak memory {result.peak:.0f} MB; {result.ratio:.3f} s of CPU time a second")
+    typer.echo(
+        f"peak memory {result.peak:.0f} MB, {result.peak / LIMIT:.0%} of {LIMIT / 1000:g} GB and {result.growth:.2f} "
+        f"times that of the first quarter; {result.boxes} boxes; {result.ratio:.3f} s of CPU time a second"
+    )
     typer.echo(
         f"largest difference from the whole at once in {settings.compared:g} s: {result.largest_difference:.1e} m; "
         f"{result.differing} of {result.compared} boxes in one of the two alone"

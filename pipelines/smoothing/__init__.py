@@ -4,7 +4,8 @@ from pipelines.smoothing.config import SmoothConfig, load_smooth_config
 from pipelines.smoothing.output import write_kitti_run, write_labels, write_nuscenes_run, write_streamed_labels
 from pipelines.smoothing.rounds import smooth_known_objects
 from pipelines.smoothing.scene import SmoothedScene, smooth_dataset, smooth_scene
-from pipelines.smoothing.streamed import StreamedScene, StretchSettings, smooth_stream
+from pipelines.smoothing.streamed import StreamedScene, smooth_stream
+from pipelines.smoothing.stretches import StretchSettings
 
 __all__ = [
     "SmoothConfig",

@@ -1,12 +1,12 @@
 """A recording smoothed as it is read, in memory that does not grow with its length.
 
-    frames -> tracker, frame by frame -> stretches [a, b) smoothed within [a - margin, b + margin] -> labels, on disk
+    frames -> tracker, frame by frame -> stretches, smoothed one by one with margins -> labels, on disk
 
 The tracker sees the recording once, from one end to the other. All rounds of smoothing (`pipelines.smoothing.rounds`)
-are made anew for every stretch, with a margin to both sides beyond which nothing can be felt; what is given out are the
-moments of the stretch alone. What is said of an object as a whole (size, score, front, identity) is gathered over the
-stretches and put in at the end (`pipelines.smoothing.lifetimes`), when the labels are read back from disk. Memory is
-that of a stretch with its margins, and a few numbers for every object that ever was.
+are made anew for every stretch (`pipelines.smoothing.stretches`). What is said of an object as a whole (size, score,
+front) is gathered over the stretches and put in at the end (`pipelines.smoothing.lifetimes`), when the labels are read
+back from disk; who it is, is kept from one to the next (`pipelines.smoothing.identities`). Memory is that of a stretch
+with its margins, and a few numbers for every object that ever was.
 
 A recording no longer than a stretch and a margin is one stretch: exactly what `smooth_scene` makes of it. Where it is
 longer, stands are those that a stretch with its margins sees, and weak objects are dropped by their score in it.
@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -26,15 +27,16 @@ from threadpoolctl import threadpool_limits
 from pipelines.config import Method
 from pipelines.smoothing.assembly import LabelledStates, dropped_boxes, label_states, source_counts
 from pipelines.smoothing.config import SmoothConfig
+from pipelines.smoothing.identities import Identities
 from pipelines.smoothing.label_spool import LabelSpool
 from pipelines.smoothing.lifetimes import Lifetimes
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import SmoothedObjects, smooth_objects
+from pipelines.smoothing.stretches import Backlog, StretchSettings, TrackedFrame
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.dataset import Scene
 from saga_fg.frame import Frame
-from saga_fg.settings import require_positive, setting
 from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
@@ -43,17 +45,6 @@ from saga_fg.smoothing import (
     measured_in_order,
     size_weights,
 )
-
-
-@dataclass(frozen=True)
-class StretchSettings:
-    """How a long recording is cut."""
-
-    length: float = setting(30.0, "of a stretch, s")
-    margin: float = setting(20.0, "that is smoothed with it at either end, s")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "length", "margin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +79,19 @@ def smooth_stream(
 
 
 @dataclass(frozen=True, eq=False)
-class _Taken:
-    """A frame, its time of measurement (s), and the tracks (n,) of its usable detections, -1 for none."""
+class _Stretch:
+    """The span [begin, end), s, smoothed with its margins."""
 
-    time: float
-    frame: Frame
-    track_of: IntArray
+    begin: float
+    end: float
+    evidence: Evidence
+    objects: SmoothedObjects
+    labelled: LabelledStates
+
+    @cached_property
+    def inside(self) -> BoolArray:
+        """(K,) which moments of the evidence are in the stretch itself."""
+        return (self.evidence.times >= self.begin) & (self.evidence.times < self.end)
 
 
 @dataclass
@@ -104,6 +102,11 @@ class _Sums:
     looks: int = 0
     first_look: float = np.inf
     last_look: float = -np.inf
+
+    @property
+    def rate(self) -> float:
+        """Looks a second."""
+        return (self.looks - 1) / (self.last_look - self.first_look) if self.last_look > self.first_look else 1.0
 
 
 class _Run:
@@ -118,11 +121,9 @@ class _Run:
         offsets = [0.0, *(sensor.time_offset for sensor in config.sensors.values())]
         self._early = min(offsets)  # a frame's measurement may be this much before its timestamp
         self._coming: list[Frame] = []
-        self._taken: list[_Taken] = []
-        self._moments = np.empty(0)
-        self._begin = -np.inf
+        self._backlog = Backlog(stretches)
+        self._identities = Identities()
         self._lifetimes = Lifetimes()
-        self._owner: dict[int, tuple[int, float]] = {}  # tracklet -> its object, and when it was last given out
         self._sums = _Sums()
 
     def over(self, parts: Iterable[Scene], progress: Progress | None) -> StreamedScene:
@@ -132,9 +133,9 @@ class _Run:
             begin = time.perf_counter()
             with threadpool_limits(limits=1, user_api="blas"):  # as for whole scenes
                 self._coming += part.frames
-                self._moments = np.concatenate([self._moments, part.timestamps])
+                self._backlog.want(part.timestamps)
                 self._track(float(part.timestamps[-1]) + self._early)
-                self._smooth(self._taken[-1].time if self._taken else -np.inf)
+                self._smooth(self._backlog.tracked)
             frames += len(part.frames)
             cpu += time.perf_counter() - begin
             if progress is not None:
@@ -144,10 +145,8 @@ class _Run:
             self._track(np.inf)
             self._smooth(np.inf)
             self._lifetimes.retire(np.empty(0, dtype=np.int64))
-        sums = self._sums
-        rate = (sums.looks - 1) / (sums.last_look - sums.first_look) if sums.last_look > sums.first_look else 1.0
-        self._spool.finish(self._lifetimes, self._config.smoothing.prior_time * rate)
-        counts = replace(sums.counts, objects=len(self._lifetimes.ids))
+        self._spool.finish(self._lifetimes, self._config.smoothing.prior_time * self._sums.rate)
+        counts = replace(self._sums.counts, objects=len(self._lifetimes.ids), joined=self._identities.joined)
         return StreamedScene(self._name, counts, frames, cpu + time.perf_counter() - begin, self._spool)
 
     def _track(self, until: float) -> None:
@@ -162,85 +161,35 @@ class _Run:
         evidence = gather_evidence(frames, np.empty(0), sensors, classes)
         track_of = track_evidence(self._name, frames, self._tracker, evidence, sensors, classes)
         rows = evidence.rows_of_look()
-        self._taken += [_Taken(at, f, track_of[mine]) for (at, f), mine in zip(ready, rows, strict=True)]
+        self._backlog.extend([TrackedFrame(at, f, track_of[mine]) for (at, f), mine in zip(ready, rows, strict=True)])
 
     def _smooth(self, until: float) -> None:
         """All stretches that are complete, with their margins, before a time; infinite: all that is left."""
-        length, margin = self._stretches.length, self._stretches.margin
-        if self._begin == -np.inf and (self._taken or len(self._moments)):
-            self._begin = min([*self._moments[:1].tolist(), *(taken.time for taken in self._taken[:1])])
-        while self._begin + length + margin < until:
-            last = until == np.inf and self._begin + length + margin >= self._newest
-            end = np.inf if last else self._begin + length
-            if not len(self._moments):
-                return
-            self._stretch(self._begin, end)
-            if last:
-                return
-            old = end - margin
-            self._taken = [taken for taken in self._taken if taken.time >= old]
-            self._moments = self._moments[self._moments >= old]
-            oldest = min([*self._moments[:1].tolist(), *(taken.time for taken in self._taken[:1])], default=end)
-            self._begin = end + max(0.0, (oldest - margin - end) // length) * length  # past stretches of nothing
+        for begin, end in self._backlog.stretches(until):
+            tracked, wanted = self._backlog.around(begin, end)
+            frames = [each.frame for each in tracked]
+            evidence = gather_evidence(frames, wanted, self._config.sensors, self._tracking.tracker.classes)
+            if len(evidence.times):
+                track_of = np.concatenate([np.empty(0, dtype=np.int64), *(each.track_of for each in tracked)])
+                objects = smooth_objects(evidence, track_of, self._config.smoothing, self._tracking.tracker)
+                labelled = label_states(evidence, objects, wanted, self._config.smoothing)
+                mine = wanted[(wanted >= begin) & (wanted < end)]
+                self._take_in(_Stretch(begin, end, evidence, objects, labelled), mine)
 
-    @property
-    def _newest(self) -> float:
-        return max([*self._moments[-1:].tolist(), *(taken.time for taken in self._taken[-1:])], default=-np.inf)
+    def _take_in(self, stretch: _Stretch, wanted: FloatArray) -> None:
+        """Gather what a stretch says of its objects, and give out its labels at the times `wanted`, s."""
+        evidence, objects, states = stretch.evidence, stretch.objects, stretch.labelled.states
+        here = np.unique(states.id[stretch.inside[states.moment]])
+        times, span = evidence.times[evidence.moment], (stretch.begin, stretch.end)
+        names = self._identities.name(here, objects.object_of, objects.track_of, times, span)
+        self._gather(stretch, names)
+        self._give_out(stretch, names, wanted)
+        self._lifetimes.retire(np.array(list(names.values()), dtype=np.int64))
+        self._identities.forget(stretch.begin - 2 * (self._stretches.length + self._stretches.margin))
 
-    def _stretch(self, begin: float, end: float) -> None:
-        """Smooth around [begin, end) and give out what is in it."""
-        config, margin = self._config, self._stretches.margin
-        within = [taken for taken in self._taken if begin - margin <= taken.time < end + margin]
-        wanted = self._moments[(self._moments >= begin - margin) & (self._moments < end + margin)]
-        frames = [taken.frame for taken in within]
-        evidence = gather_evidence(frames, wanted, config.sensors, self._tracking.tracker.classes)
-        track_of = np.concatenate([np.empty(0, dtype=np.int64), *(taken.track_of for taken in within)])
-        if not len(evidence.times):
-            return
-        objects = smooth_objects(evidence, track_of, config.smoothing, self._tracking.tracker)
-        labelled = label_states(evidence, objects, wanted, config.smoothing)
-        inside = (evidence.times >= begin) & (evidence.times < end)
-        names = self._names(evidence, objects, labelled, inside)
-        self._gather(evidence, objects, labelled, names, inside)
-        mine = wanted[(wanted >= begin) & (wanted < end)]
-        self._give_out(evidence, objects, labelled, names, mine)
-        kept = end - 2 * (self._stretches.length + margin)
-        self._owner = {track: owner for track, owner in self._owner.items() if owner[1] >= kept}
-
-    def _names(
-        self, evidence: Evidence, objects: SmoothedObjects, labelled: LabelledStates, inside: BoolArray
-    ) -> dict[int, int]:
-        """The lasting ids of the objects that are there in the stretch: those that their tracklets have already."""
-        here = np.unique(labelled.states.id[inside[labelled.states.moment]])
-        times = evidence.times[evidence.moment]
-        end = evidence.times[inside][-1] if inside.any() else -np.inf
-        names: dict[int, int] = {}
-        rows = np.flatnonzero((objects.object_of >= 0) & (objects.track_of >= 0))
-        rows = rows[np.isin(objects.object_of[rows], here)]
-        pairs = np.unique(np.stack([objects.object_of[rows], objects.track_of[rows]], axis=1), axis=0)
-        tracklets, begins = np.unique(objects.track_of[rows], return_index=True)  # detections are in order of time
-        first = dict(zip(tracklets.tolist(), times[rows[begins]].tolist(), strict=True))
-        for id_ in here.tolist():
-            tracks = sorted((int(t) for t in pairs[pairs[:, 0] == id_, 1]), key=lambda t: first[t])
-            known = [self._owner[t][0] for t in tracks if t in self._owner]
-            name = next((k for k in known if k not in names.values()), id_)
-            names[id_] = name if name not in names.values() else id_
-            for k, track in enumerate(tracks):
-                if k == 0 or first[track] <= end:
-                    if track != names[id_] and track not in self._owner:
-                        self._sums.counts = LabelCounts.sum([self._sums.counts, LabelCounts(joined=1)])
-                    self._owner[track] = (names[id_], end)
-        return names
-
-    def _gather(
-        self,
-        evidence: Evidence,
-        objects: SmoothedObjects,
-        labelled: LabelledStates,
-        names: Mapping[int, int],
-        inside: BoolArray,
-    ) -> None:
+    def _gather(self, stretch: _Stretch, names: Mapping[int, int]) -> None:
         """Sum up what the stretch says of its objects as wholes."""
+        evidence, objects, inside = stretch.evidence, stretch.objects, stretch.inside
         rows = np.flatnonzero((objects.object_of >= 0) & inside[evidence.moment])
         weight = size_weights(evidence.probability, evidence.distance)
         for id_, mine in _by_id(objects.object_of, rows):
@@ -248,7 +197,7 @@ class _Run:
                 seen = evidence.boxes.size[mine]
                 self._lifetimes.seen(names[id_], evidence.probability[mine], seen, weight[mine])
         looks = tuple(look for look in evidence.looks if inside[look.moment])
-        count = looks_in_view(replace(evidence, looks=looks), objects.lives, labelled.states)
+        count = looks_in_view(replace(evidence, looks=looks), objects.lives, stretch.labelled.states)
         for id_, looked in zip(objects.lives.id.tolist(), count.tolist(), strict=True):
             if id_ in names:
                 self._lifetimes.looked(names[id_], looked)
@@ -257,15 +206,9 @@ class _Run:
         sums.looks += len(looks)
         sums.first_look, sums.last_look = min([sums.first_look, *times]), max([sums.last_look, *times])
 
-    def _give_out(
-        self,
-        evidence: Evidence,
-        objects: SmoothedObjects,
-        labelled: LabelledStates,
-        names: Mapping[int, int],
-        wanted: FloatArray,
-    ) -> None:
+    def _give_out(self, stretch: _Stretch, names: Mapping[int, int], wanted: FloatArray) -> None:
         """Spool the labels of the moments `wanted`, s, and remember which way they look."""
+        evidence, objects, labelled = stretch.evidence, stretch.objects, stretch.labelled
         states, headings = labelled.states, labelled.headings
         at = np.searchsorted(evidence.times, wanted)
         emitted = np.flatnonzero(np.isin(states.moment, at))
@@ -287,7 +230,6 @@ class _Run:
             dropped_objects=sum(int(each.sum()) for each in begun),
         )
         self._sums.counts = LabelCounts.sum([self._sums.counts, new])
-        self._lifetimes.retire(np.array([names[id_] for id_ in names], dtype=np.int64))
 
     def _turned(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:
         row = labelled.states.rows_of(np.array([before]), np.array([id_]))[0] if before >= 0 else -1

@@ -17,7 +17,10 @@ from there to T (its transition to x_T, as corrections leave it), with a covaria
 the recursion of N from M = P_T^-1 instead of 0 and without the terms B^T B.
 
 Components: what is uncorrelated when it is filtered may be joined by a later interaction, and is then correlated
-given the future. Covariances are therefore smoothed over components joined through all moments.
+given the future. So joint covariances are smoothed over components joined through all moments. The marginals of single
+nodes need no more of N than its blocks over the components of P, for P N P has no others on its diagonal, and those of
+a moment follow from those of the next: F does not leave the components that it leads to. (Where a component has been
+taken apart in between, the rest of its N acts through what had decayed to `BlockGaussian.decoupled`'s last digit.)
 """
 
 from __future__ import annotations
@@ -125,9 +128,9 @@ class MarginalCovariances:
         raise InputError("joint covariance: only those of single nodes were kept; ask for joint covariances")
 
 
-def smoothed_covariances(passes: Sequence[Pass]) -> Iterator[SmoothedCovariance]:
-    """Smoothed covariance of every moment, from the last to the first."""
-    return _swept(passes, future_known=False)
+def smoothed_covariances(passes: Sequence[Pass], joint: bool) -> Iterator[SmoothedCovariance]:
+    """Smoothed covariance of every moment, from the last to the first; those of single nodes alone if not `joint`."""
+    return _swept(passes, joined_partitions(passes) if joint else _own_partitions(passes), future_known=False)
 
 
 def future_influence(passes: Sequence[Pass]) -> Iterator[FloatArray]:
@@ -135,16 +138,20 @@ def future_influence(passes: Sequence[Pass]) -> Iterator[FloatArray]:
 
     Nothing that is measured after the last moment can be expected to move a smoothed mean by more.
     """
-    for reduced in _swept(passes, future_known=True):
+    for reduced in _swept(passes, _own_partitions(passes), future_known=True):
         variance: FloatArray = np.empty(reduced.partition.layout.size)
         for places, P, M in zip(reduced.partition.groups, reduced.P, reduced.N, strict=True):
             variance[places] = ((P @ M) * P).sum(axis=2)
         yield np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _swept(passes: Sequence[Pass], future_known: bool) -> Iterator[SmoothedCovariance]:
-    """N of every moment from the last to the first, or M with `future_known`."""
-    partitions = joined_partitions(passes)
+def _own_partitions(passes: Sequence[Pass]) -> list[Partition]:
+    """The components of every moment as they are filtered."""
+    return [state.filtered.partition for state in passes]
+
+
+def _swept(passes: Sequence[Pass], partitions: Sequence[Partition], future_known: bool) -> Iterator[SmoothedCovariance]:
+    """N of every moment from the last to the first, or M with `future_known`, over the partition of each."""
     after: BlockDiagonal | None = None  # N of the next moment, before it saw anything, over the nodes carried there
     after_partition: Partition | None = None
     for k in range(len(passes) - 1, -1, -1):

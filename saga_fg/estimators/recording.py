@@ -226,11 +226,12 @@ class Recording:
         """Smoothed covariance of every moment, joint ones or only those of single nodes, which take less memory."""
         self.solve()
         if self._covariances is None and joint:
-            self._covariances = list(smoothed_covariances(self._passes))[::-1]
+            self._covariances = list(smoothed_covariances(self._passes, joint=True))[::-1]
         if self._covariances is not None:
             return self._covariances
         if self._marginals is None:
-            self._marginals = [MarginalCovariances.of(whole) for whole in smoothed_covariances(self._passes)][::-1]
+            wholes = smoothed_covariances(self._passes, joint=False)
+            self._marginals = [MarginalCovariances.of(whole) for whole in wholes][::-1]
         return self._marginals
 
     def graph(self, means: Sequence[FloatArray] | None = None) -> FactorGraph:

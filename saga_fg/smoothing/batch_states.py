@@ -78,7 +78,7 @@ def smooth_states(
     start = _first_positions(evidence, object_of, lives)
     smoother: BatchSmoother | WindowedSmoother
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
-    smoother = WindowedSmoother() if long else BatchSmoother(likelihoods=False)
+    smoother = WindowedSmoother() if long else BatchSmoother(likelihoods=False, order="time")
     parts: list[tuple[int, IntArray, FloatArray, FloatArray]] = []
 
     def keep(moments: Sequence[Smoothed]) -> None:

@@ -15,8 +15,10 @@ from pipelines.bench.streamed_files import bench_files
 from pipelines.bench.streaming import StreamingBenchSettings
 from pipelines.cli import app
 from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream
+from pipelines.smoothing.identities import Identities
 from pipelines.smoothing.lifetimes import Lifetimes
-from saga_fg import InputError
+from pipelines.smoothing.stretches import Backlog, TrackedFrame
+from saga_fg import Detections, Frame, InputError
 
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"
 
@@ -119,6 +121,51 @@ def test_poses_are_given_in_all_parts_or_in_none(tmp_path: Path) -> None:
         list(read_scenes_in_parts(path, 1))
 
 
+def backlog(detections: int, seconds: int, settings: StretchSettings) -> Backlog:
+    """A frame a second with so many detections each."""
+    backlog, nothing = Backlog(settings), Frame(0.0, "lidar", Detections.empty())
+    times = np.arange(float(seconds))
+    backlog.want(times)
+    backlog.extend([TrackedFrame(time, nothing, np.full(detections, -1)) for time in times.tolist()])
+    return backlog
+
+
+@pytest.mark.parametrize(("detections", "ends"), [(1, [20, 40]), (10, [9, 18, 27, 36]), (1000, [5, 10, 15])])
+def test_crowds_are_cut_into_shorter_stretches(detections: int, ends: list[int]) -> None:
+    settings = StretchSettings(length=20.0, margin=5.0, detections=100, shortest=5.0)
+    known = backlog(detections, 60, settings)
+    spans = []
+    for begin, end in known.stretches(until=59.0):
+        frames, wanted = known.around(begin, end)
+        assert [frame.time for frame in frames] == wanted.tolist()
+        assert wanted[0] == max(0.0, begin - 5.0)
+        assert wanted[-1] == end + 4.0
+        spans.append((begin, end))
+    assert [end for _, end in spans][: len(ends)] == ends
+    assert [begin for begin, _ in spans[1:]] == [end for _, end in spans[:-1]]
+    (last,) = list(known.stretches(until=np.inf))[-1:]
+    assert last[1] == np.inf
+
+
+def test_an_object_keeps_its_name_from_stretch_to_stretch() -> None:
+    identities = Identities()
+    track_of = np.array([1, 1, 2, 2, 3])
+    times = np.array([0.0, 1.0, 2.0, 9.0, 9.5])
+    one_and_two = np.array([1, 1, 1, 1, 3])
+    names = identities.name(np.array([1, 3]), one_and_two, track_of, times, (0.0, 10.0))
+    assert names == {1: 1, 3: 3}
+    assert identities.joined == 1
+    late = slice(3, None)  # the next stretch sees the second tracklet alone
+    names = identities.name(np.array([2, 3]), track_of[late], track_of[late], times[late], (10.0, 20.0))
+    assert names == {2: 1, 3: 3}
+    other = np.array([-1, -1, 0, 0, 3])  # or takes it for the end of another, which begins at the edge of what it sees
+    again = identities.name(np.array([0, 3]), other, np.array([1, 1, 0, 2, 3]), times, (10.0, 20.0))
+    assert again == {0: 1, 3: 3}
+    identities.forget(before=20.0)
+    names = identities.name(np.array([2]), track_of[2:4], track_of[2:4], times[2:4], (30.0, 40.0))
+    assert names == {2: 2}
+
+
 def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
     lifetimes = Lifetimes()
     for size, probability, looks in ((4.0, 0.5, 3), (4.2, 0.9, 2), (9.0, 0.1, 5)):
@@ -155,3 +202,5 @@ def test_the_bench_counts_and_compares() -> None:
     assert result.largest_difference < 1e-3
     assert result.differing <= result.compared / 50
     assert result.rows[-1].recorded == 12.0
+    assert result.peak == max(row.peak for row in result.rows)
+    assert result.growth == pytest.approx(result.peak / result.rows[0].peak)

@@ -9,7 +9,7 @@ from estimator_scenario import EXACT, Textbook, covariance_error, mean_error, pa
 from random_graphs import BUS, CAR, CONE, POLE
 
 from factors import NonlinearInteraction, RangeBearing, Robust
-from saga_fg import InputError, SceneGraph
+from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import (
     BatchSmoother,
@@ -44,6 +44,25 @@ def test_every_state_is_the_textbooks(likelihoods, kinds, seed):
             own = part(reference, places, [node])
             assert mean_error(alone.mean([node])[0], own) < EXACT
             assert covariance_error(alone.covariance([node])[0], own.covariance) < EXACT
+
+
+def test_marginals_of_nodes_that_part_and_meet_again():
+    """A component falls apart when its correlations have decayed; what comes later still tells of before."""
+    smoother, nodes = BatchSmoother(likelihoods=False, order="time"), [1, 2, 3]
+    truth = np.array([[0.0, 0, 10, 0], [12.0, 0, 10, 0], [25.0, 0, 10, 0]])
+    smoother.add(nodes, truth, np.tile(np.diag([1.0, 1.0, 4.0, 4.0]), (3, 1, 1)))
+    S = np.diag([0.0, 0.0, 1.0, 1.0])[None]
+    for k in range(160):
+        pair = {0: (0, 1), 7: (1, 2)}.get(k // 20)  # 1 follows 2, later 2 follows 3
+        zeros = np.zeros((1, 4))
+        edges = [] if pair is None else [Edges("with", [pair[0]], [pair[1]], [0.5], -S, S, zeros)]
+        smoother.predict(discretise(SceneGraph.of(nodes, CAR, edges), 0.5))
+        truth[:, :2] += 0.5 * truth[:, 2:]
+        seen = np.arange(3) if k >= 20 else np.array([0, 2])
+        smoother.update(Measurements(np.array(nodes)[seen], truth[seen, :2], np.eye(2, 4), 0.01 * np.eye(2)))
+    marginal, joint = smoother.smoothed(), smoother.smoothed(joint=True)
+    for alone, together in zip(marginal, joint, strict=True):
+        np.testing.assert_allclose(alone.covariance(nodes), together.covariance(nodes), rtol=1e-9, atol=1e-12)
 
 
 def test_a_smoother_that_waits_says_the_same_and_no_likelihoods():

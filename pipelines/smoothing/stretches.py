@@ -1,0 +1,108 @@
+"""Where a recording is cut that is smoothed as it goes by: into stretches, which follow each other without a gap.
+
+    [a, b) is smoothed within [a - margin, b + margin]        b = a + length, earlier where more than enough is seen
+
+What is given out are the moments of the stretch alone; beyond the margins nothing can be felt. Memory and work follow
+the detections that a stretch holds with its margins, so that crowds are cut into shorter ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.frame import Frame
+from saga_fg.settings import require_between, require_positive, setting
+
+
+@dataclass(frozen=True)
+class StretchSettings:
+    """How a long recording is cut."""
+
+    length: float = setting(30.0, "of a stretch, s")
+    margin: float = setting(10.0, "that is smoothed with it at either end, s")
+    detections: int = setting(60_000, "a stretch that has so many is long enough")
+    shortest: float = setting(5.0, "and is cut then, though not shorter than this, s")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "length", "margin")
+        require_between(self, 1, 10**9, "detections")
+        require_between(self, 0.0, np.inf, "shortest")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """A frame, its time of measurement (s), and the tracks (n,) of its usable detections, -1 for none."""
+
+    time: float
+    frame: Frame
+    track_of: IntArray
+
+
+class Backlog:
+    """What of a recording is still needed: tracked frames in order of time, and moments at which boxes are wanted."""
+
+    def __init__(self, settings: StretchSettings) -> None:
+        self._settings = settings
+        self._frames: list[TrackedFrame] = []
+        self._moments = np.empty(0)
+        self._begin: float | None = None  # of the next stretch
+
+    def extend(self, frames: list[TrackedFrame]) -> None:
+        """Take in frames that were tracked."""
+        self._frames += frames
+
+    def want(self, moments: FloatArray) -> None:
+        """Boxes are wanted at these times (m,), s, too: later ones than before."""
+        self._moments = np.concatenate([self._moments, moments])
+
+    @property
+    def tracked(self) -> float:
+        """Time of the newest frame, s; -inf before the first."""
+        return self._frames[-1].time if self._frames else -np.inf
+
+    def stretches(self, until: float) -> Iterator[tuple[float, float]]:
+        """The spans [begin, end), s, that are complete, with their margins, before a time; infinite: all that is left.
+
+        What a stretch and those after it do not need is forgotten when the next one is asked for.
+        """
+        length, margin = self._settings.length, self._settings.margin
+        if self._begin is None:
+            if not self._frames and not len(self._moments):
+                return
+            self._begin = self._oldest(np.inf)
+        while len(self._moments):
+            end = self._end(self._begin)
+            last = until == np.inf and end + margin >= max(self._moments[-1], self.tracked)
+            if end + margin >= until and not last:
+                return
+            yield self._begin, (np.inf if last else end)
+            if last:
+                return
+            self._frames = [tracked for tracked in self._frames if tracked.time >= end - margin]
+            self._moments = self._moments[self._moments >= end - margin]
+            pause = self._oldest(end) - margin - end
+            self._begin = end + max(0.0, pause // length) * length  # past stretches of nothing
+
+    def around(self, begin: float, end: float) -> tuple[list[TrackedFrame], FloatArray]:
+        """The frames of a stretch with its margins, and the times (m,), s, that are wanted."""
+        first, last = begin - self._settings.margin, end + self._settings.margin
+        wanted = self._moments[(self._moments >= first) & (self._moments < last)]
+        return [tracked for tracked in self._frames if first <= tracked.time < last], wanted
+
+    def _end(self, begin: float) -> float:
+        """Where a stretch ends: after its length, or where it has enough."""
+        settings, count = self._settings, 0
+        for tracked in self._frames:
+            if tracked.time >= begin:
+                count += len(tracked.track_of)
+                if count >= settings.detections:
+                    return min(max(tracked.time, begin + settings.shortest), begin + settings.length)
+        return begin + settings.length
+
+    def _oldest(self, otherwise: float) -> float:
+        """Time of the first thing that is left, s."""
+        return min([*self._moments[:1].tolist(), *(tracked.time for tracked in self._frames[:1])], default=otherwise)
