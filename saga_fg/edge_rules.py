@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -30,9 +30,10 @@ from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedCou
 from saga_fg.node import distinct_types
 from saga_fg.road.cone_geometry import ConeGeometry, anticipated
 from saga_fg.scene_graph import Edges, SceneGraph
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+Leaders = Literal["any", "moving", "standing"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
 
@@ -73,7 +74,9 @@ class Neighbours:
         "velocity would be as a measurement of the target's; null: however well that is known",
     )
     parked: bool = setting(
-        False, "couples objects never seen moving whose velocity is known to within speed_scale, and no others"
+        False,
+        "couples objects never seen moving whose velocity is known to within speed_scale, and no others; the "
+        "speed of either is held against speed_scale as well",
     )
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
@@ -85,11 +88,12 @@ class Neighbours:
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, whatever their ends are and is known of them."""
-        if self.parked:
+        exponent = (f.distance / self.distance_scale) ** 2 + (f.turn / self.heading_scale) ** 2
+        if self.parked:  # who creeps in a jam does not share what makes standing objects seem to move
             able = (f.target_moved == 0) & (f.source_moved == 0)
+            exponent = exponent + (f.target_speed**2 + f.source_speed**2) / self.speed_scale**2
         else:
             able = (f.target_speed >= self.min_speed) & (f.source_speed >= self.min_speed)
-        exponent = (f.distance / self.distance_scale) ** 2 + (f.turn / self.heading_scale) ** 2
         rate = self.rate * np.exp(-(exponent + (f.velocity_difference / self.speed_scale) ** 2) / 2)
         return np.where(able & (f.distance <= self.max_distance), rate, 0.0)
 
@@ -120,6 +124,7 @@ class Following:
     lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
+    leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
     cones: ConeGeometry | None = settings_group(
         lambda: None, "vehicles that cones push aside lead, and are led, where they will be then; null: where they are"
     )
@@ -128,6 +133,7 @@ class Following:
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "rate", "max_gap")
         require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
+        require_one_of(self, "leaders", get_args(Leaders))
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, whatever the classes of their ends and whoever is nearer."""
@@ -135,6 +141,8 @@ class Following:
         led = (f.ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
         if not self.parked:
             led &= f.target_moved > 0
+        if self.leaders != "any":
+            led &= (f.source_moved > 0) == (self.leaders == "moving")
         exponent = (
             (f.ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (f.turn / self.heading_scale) ** 2
         )

@@ -6,16 +6,19 @@ an object is predicted at the end of a gap and where it reappears. All methods s
     kf            independent objects (their joint filter falls apart into one of each)
     hand-crafted  the edge rules that the configuration of the kind of data ships
     learned       `fit_interactions` on the other recordings
+    network       `fit_networks` on them, where it is asked for (extra [learn])
 
 The process noise of kf, by class, and the noise of the positions are the most likely ones, by the same likelihood of
 reappearances and on the same recordings as the learned interactions; hand-crafted has those of kf. Recordings are dealt
 into folds: what is measured on one was fitted on the others. Intervals are bootstraps over stretches of ten seconds.
+
+Pedestrians in company, who walk beside another that stays visible when they are hidden, are told apart as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +26,7 @@ from data_tools.metrics import Interval
 from data_tools.metrics.block_bootstrap import Average, relative_change_of_errors
 from pipelines.figures import FigureTable, cell
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.edge_rules import EdgeRule
 from saga_fg.errors import InputError
 from saga_fg.learning import (
@@ -35,6 +38,7 @@ from saga_fg.learning import (
     OwnMotionLikelihood,
     Trajectories,
     fit_interactions,
+    fit_networks,
     gap_errors,
     gap_moments,
     predict_gaps,
@@ -51,98 +55,154 @@ CLASSES = {
 """The classes that are hidden, by kind of recordings; all others are neighbours."""
 GAPS = (1.0, 2.0, 3.0)  # s
 Method = str
+KF, HAND_CRAFTED, LEARNED, NETWORK = "kf", "hand-crafted", "learned", "network"
 AVERAGES: tuple[Average, Average] = ("median", "mean")
 STRETCH = 10.0  # s
+BESIDE, ALIKE = 2.0, 0.5  # in company: another within so many m, whose velocity differs by less than so many m/s
+
+
+@dataclass(frozen=True)
+class CoastingSettings:
+    """How much is done: folds, how many of them are tested, gaps judged in a recording, whether by networks too."""
+
+    folds: int = 3
+    tested_folds: int | None = None
+    most_gaps: int = 500
+    network: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class CoastingErrors:
-    """n gaps: recording (n,) and stretch (n,) numbers, label (n,), gap (S,) lengths, s, errors (n, S) by method, m."""
+    """n gaps of up to S steps.
+
+    recording, stretch (n,) numbers; label, in_company (n,); gap (S,) lengths, s; errors (n, S) by method, m
+    """
 
     recording: IntArray
     stretch: IntArray
     label: StrArray
+    in_company: BoolArray
     gap: FloatArray
     errors: dict[Method, FloatArray]
 
-    def change(self, method: Method, base: Method, label: str, gap: float, average: Average) -> Interval:
-        """Relative change of the average error of a class at the end of gaps of `gap` seconds."""
-        rows, column = self._rows(label, gap)
-        a, b = (self.errors[name][rows, column] for name in (method, base))
-        return relative_change_of_errors(a, b, self.stretch[rows], average)
+    def select(self, rows: IntArray | BoolArray) -> CoastingErrors:
+        """Some of the gaps."""
+        errors = {method: e[rows] for method, e in self.errors.items()}
+        of_gaps = (self.recording[rows], self.stretch[rows], self.label[rows], self.in_company[rows])
+        return CoastingErrors(*of_gaps, self.gap, errors)
 
-    def of(self, method: Method, label: str, gap: float) -> FloatArray:
-        """The errors of a class at the end of gaps of `gap` seconds, m."""
-        rows, column = self._rows(label, gap)
-        return np.asarray(self.errors[method][rows, column])
+    def groups(self) -> dict[str, CoastingErrors]:
+        """By class, and the pedestrians in company."""
+        found = {label: self.select(self.label == label) for label in np.unique(self.label).tolist()}
+        together = (self.label == "pedestrian") & self.in_company
+        return found | ({"pedestrian in company": self.select(together)} if together.any() else {})
 
-    def _rows(self, label: str, gap: float) -> tuple[IntArray, int]:
+    def at(self, gap: float) -> tuple[float, CoastingErrors]:
+        """The length nearest to `gap`, s, and those gaps, with the errors (n,) at its end, of which that is known."""
         column = int(np.argmin(np.abs(self.gap - gap)))
         known = np.all([np.isfinite(e[:, column]) for e in self.errors.values()], axis=0)
-        return np.flatnonzero(known & (self.label == label)), column
+        kept = self.select(known)
+        return float(self.gap[column]), replace(kept, errors={m: e[:, column] for m, e in kept.errors.items()})
+
+    def change(self, method: Method, base: Method, average: Average) -> Interval:
+        """Relative change of the average of all errors."""
+        return relative_change_of_errors(self.errors[method], self.errors[base], self.stretch, average)
 
 
 def coasting_errors(
     recordings: Mapping[str, Trajectories],
     classes: tuple[str, ...],
     hand_crafted: Sequence[EdgeRule],
-    folds: int = 3,
-    settings: GapSettings | None = None,
+    settings: CoastingSettings | None = None,
     progress: Progress | None = None,
-) -> tuple[CoastingErrors, list[FittedInteractions]]:
+) -> tuple[CoastingErrors, dict[Method, list[FittedInteractions]]]:
     """Fit and measure on some recordings of one kind, fold by fold; returns what each fold learned, too.
 
     Raises `InputError` where the recordings of a fold have nothing to learn from.
     """
-    settings = settings or GapSettings()
+    settings, lengths = settings or CoastingSettings(), GapSettings()
     names = list(recordings)
-    folds = min(folds, len(names))
-    likelihoods = [OwnMotionLikelihood(recordings[name], classes, settings) for name in names]
+    folds = min(settings.folds, len(names))
+    likelihoods = []
+    for done, name in enumerate(names):
+        likelihoods.append(OwnMotionLikelihood(recordings[name], classes, lengths))
+        if progress is not None:
+            progress(f"own motion {name}", done + 1, len(names))
+    methods = {LEARNED: fit_interactions} | ({NETWORK: fit_networks} if settings.network else {})
+    learned: dict[Method, list[FittedInteractions]] = {method: [] for method in methods}
     parts: list[tuple[GapSample, FloatArray, dict[Method, FloatArray]]] = []
-    learned = []
-    for fold in range(folds):
+    for fold in range(min(folds, settings.tested_folds or folds)):
         training = [k for k in range(len(names)) if k % folds != fold]
         own = OwnMotion.most_likely([likelihoods[k] for k in training])
-        sample = GapSample.pool([_sample(recordings[names[k]], own, classes, settings, k) for k in training])
+        sample = GapSample.pool([_sample(recordings[names[k]], own, classes, lengths, k) for k in training])
         if len(sample) == 0:
             taught = ", ".join(names[k] for k in training)
-            wanted = f"some {' or '.join(classes)}, followed for {settings.followed:g} s"
+            wanted = f"some {' or '.join(classes)}, followed for {lengths.followed:g} s"
             raise InputError(f"recordings {taught}: expected {wanted}")
-        fitted = fit_interactions(sample, own.position_noise, own.acceleration_noise)
-        learned.append(fitted)
+        for method, fit in methods.items():
+            learned[method].append(fit(sample, own.position_noise, own.acceleration_noise))
         for k in range(fold, len(names), folds):
             trajectories = recordings[names[k]]
-            filtered = own.filtered(trajectories)
-            gaps = sample_gaps(trajectories, filtered, classes, settings, k)
-            joint = (
-                ("hand-crafted", tuple(hand_crafted), own.acceleration_noise, 0.0),
-                ("learned", fitted.rules, fitted.acceleration_noise, fitted.explained_noise),
-            )
-            errors = {"kf": gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0))}
-            for method, rules, noise, explained in joint:
-                filters = JointGaps(trajectories, filtered, noise, own.position_noise, rules, explained)
-                errors[method] = filters.errors(gaps, settings)
+            gaps = drawn_gaps(_sample(trajectories, own, classes, lengths, k), settings.most_gaps)
+            fitted = {method: found[-1] for method, found in learned.items()}
+            errors = _errors(trajectories, gaps, own, hand_crafted, fitted, lengths)
             parts.append((gaps, trajectories.time[gaps.moment] // STRETCH, errors))
             if progress is not None:
                 progress(f"coasting {names[k]}", len(parts), len(names))
     recording = np.concatenate([gaps.recording for gaps, _, _ in parts])
     stretch = np.unique(np.stack([recording, np.concatenate([s for _, s, _ in parts])]), axis=1, return_inverse=True)[1]
     first = next(iter(recordings.values()))
-    _, stride, steps = gap_moments(first, settings)
+    _, stride, steps = gap_moments(first, lengths)
     step = stride * float(np.median(np.diff(first.time)))
     return CoastingErrors(
         recording,
         stretch,
         np.concatenate([gaps.label for gaps, _, _ in parts]),
+        np.concatenate([_in_company(gaps) for gaps, _, _ in parts]),
         np.asarray(step * np.arange(1, steps + 1), dtype=np.float64),
         {method: np.concatenate([errors[method] for _, _, errors in parts]) for method in parts[0][2]},
     ), learned
 
 
+def drawn_gaps(gaps: GapSample, most: int) -> GapSample:
+    """At most so many of them, drawn at random, the same ones every time."""
+    if len(gaps) <= most:
+        return gaps
+    return gaps.select(np.sort(np.random.default_rng(1).choice(len(gaps), most, replace=False)))
+
+
+def _errors(
+    trajectories: Trajectories,
+    gaps: GapSample,
+    own: OwnMotion,
+    hand_crafted: Sequence[EdgeRule],
+    learned: Mapping[Method, FittedInteractions],
+    lengths: GapSettings,
+) -> dict[Method, FloatArray]:
+    """(n, S) by method."""
+    filtered = own.filtered(trajectories)
+    errors = {KF: gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0))}
+    joint: dict[Method, tuple[Sequence[EdgeRule], Mapping[str, float], float]]
+    joint = {HAND_CRAFTED: (tuple(hand_crafted), own.acceleration_noise, 0.0)}
+    joint |= {method: (f.rules, f.acceleration_noise, f.explained_noise) for method, f in learned.items()}
+    for method, (rules, noise, explained) in joint.items():
+        filters = JointGaps(trajectories, filtered, noise, own.position_noise, rules, explained)
+        errors[method] = filters.errors(gaps, lengths)
+    return errors
+
+
 def _sample(
-    trajectories: Trajectories, own: OwnMotion, classes: tuple[str, ...], settings: GapSettings, number: int
+    trajectories: Trajectories, own: OwnMotion, classes: tuple[str, ...], lengths: GapSettings, number: int
 ) -> GapSample:
-    return sample_gaps(trajectories, own.filtered(trajectories), classes, settings, number)
+    return sample_gaps(trajectories, own.filtered(trajectories), classes, lengths, number)
+
+
+def _in_company(gaps: GapSample) -> BoolArray:
+    """(n,) whether another of the class moves alike beside the object when it is hidden."""
+    offset = gaps.other_mean[:, 0] - gaps.mean[:, None]
+    near, alike = (np.hypot(offset[..., k], offset[..., k + 1]) for k in (0, 2))
+    same = (gaps.other_seen[:, 0] > 0) & (gaps.other_label == gaps.label[:, None])
+    return np.asarray((same & (near < BESIDE) & (alike < ALIKE)).any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -162,17 +222,14 @@ class CoastingFigure:
 def coasting_figures(errors: CoastingErrors) -> list[CoastingFigure]:
     """All classes, gaps and methods."""
     rows = []
-    for label in np.unique(errors.label).tolist():
-        for gap in GAPS:
-            for method in errors.errors:
-                e = errors.of(method, label, gap)
+    for group, mine in errors.groups().items():
+        for asked in GAPS:
+            gap, there = mine.at(asked)
+            for method, e in there.errors.items():
                 if len(e):
-                    changes = [
-                        None if method == "kf" else errors.change(method, "kf", label, gap, average)
-                        for average in AVERAGES
-                    ]
+                    changes = [None if method == KF else there.change(method, KF, average) for average in AVERAGES]
                     rows.append(
-                        CoastingFigure(label, gap, method, len(e), float(np.median(e)), float(e.mean()), *changes)
+                        CoastingFigure(group, gap, method, len(e), float(np.median(e)), float(e.mean()), *changes)
                     )
     return rows
 
@@ -188,7 +245,7 @@ def coasting_table(figures: Sequence[CoastingFigure], title: str) -> FigureTable
         ("class, gap", "method", "gaps", "median", "against kf", "mean", "against kf"),
         tuple(
             (
-                f"{row.label}, {row.gap:g} s",
+                f"{row.label}, {row.gap:.1f} s",
                 row.method,
                 str(row.gaps),
                 cell(row.median),

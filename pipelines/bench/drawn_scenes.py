@@ -18,7 +18,8 @@ from saga_fg.boxes import Boxes
 from saga_fg.by_class import DEFAULT
 from saga_fg.dataset import Annotations, Scene
 from saga_fg.discretisation import discretise
-from saga_fg.edge_rules import Neighbours, build_graph
+from saga_fg.edge_network import EdgeNetwork
+from saga_fg.edge_rules import Following, Neighbours, build_graph
 from saga_fg.frame import Detections, Frame
 from saga_fg.interactions import NodeTable, SharedVelocity
 from saga_fg.node import ConstantVelocity, NodeType
@@ -73,7 +74,9 @@ class DrawnSettings:
         )
 
 
-def drawn_config(settings: DrawnSettings, edges: tuple[Neighbours, ...] | None = None) -> TrackConfig:
+def drawn_config(
+    settings: DrawnSettings, edges: tuple[Following | Neighbours | EdgeNetwork, ...] | None = None
+) -> TrackConfig:
     """Trackers that know what is drawn but for the edges, which are the true ones if left out.
 
     Objects come from anywhere, are hidden for any time, and a miss says little: they may be hidden.

@@ -5,6 +5,7 @@ Scenes are drawn from the interaction model (`pipelines.bench.drawn_scenes`), an
     kf       independent objects, with the process noise that is the most likely one on scenes of other seeds
     saga     the true interactions and the true process noise, matched by the Hungarian algorithm
     graph    the same, matched as a graph
+    learned  as saga, with interactions and process noise learned from how objects move in those other scenes
 
 Each cell changes one thing about the base scene; the dense cells change several. Intervals are of a paired bootstrap
 over scenes. The claim is that of Sani et al. (SAGA-KF, ICPR 2024), the scenes are ours.
@@ -19,12 +20,14 @@ import numpy as np
 
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
 from data_tools.sightings import sightings
-from pipelines.bench.drawn_scenes import DrawnSettings, drawn_config, drawn_scene
+from pipelines.bench.drawn_scenes import LABEL, DrawnSettings, drawn_config, drawn_scene
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.arrays import FloatArray
+from saga_fg.by_class import DEFAULT
 from saga_fg.dataset import Scene
-from saga_fg.learning import Sightings, fit_acceleration_noise_by_class
+from saga_fg.edge_rules import Neighbours
+from saga_fg.learning import Sightings, Trajectories, fit_acceleration_noise_by_class, fit_interactions_in_view
 
 BASE = DrawnSettings()
 OCCLUDED = replace(BASE, spacing=2.5, hidden=0.4, hidden_for=3.0)
@@ -43,9 +46,15 @@ CELLS: Mapping[str, DrawnSettings] = {
     "dense, hidden, lively": replace(OCCLUDED, coupling=8.0, acceleration_noise=2.0),
 }
 DENSE = ("dense, hidden", "dense, hidden, lively")
-KF, SAGA, GRAPH = "kf", "saga", "graph"
+KF, SAGA, GRAPH, LEARNED = "kf", "saga", "graph", "learned"
 FIGURES = ("MOTA", "MOTP", "IDS")
 FIT_SCENES, FIRST_FIT_SEED = 4, 10_000
+LEARNED_SCENES, LEARNED_SECONDS = 2, 8.0  # of them that interactions are learned from, and how much of each
+LABEL_NOISE = 0.005  # standard deviation of the true positions, which are exact, for the sake of the filter, m
+TEMPLATE = Neighbours(
+    rate=0.7, distance_scale=10.0, heading_scale=1.0, speed_scale=1.5, max_distance=30.0, max_degree=8, classes=(LABEL,)
+)
+"""From where interactions are learned: no value is a true one, and more objects may interact than do."""
 
 Sums = Callable[[SceneMetrics], tuple[float, float]]
 
@@ -60,10 +69,19 @@ def _independent(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfi
     return config.with_acceleration_noise(fit_acceleration_noise_by_class(objects))
 
 
+def _learned(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfig:
+    """Interactions and process noise fitted to the truth of some scenes of the cell."""
+    recordings = [Trajectories.of_truth(scene).until(LEARNED_SECONDS) for scene in scenes[:LEARNED_SCENES]]
+    fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,))
+    config = drawn_config(settings, fitted.rules).with_acceleration_noise(fitted.acceleration_noise)
+    return replace(config, tracker=replace(config.tracker, explained_noise=fitted.explained_noise))
+
+
 CONTENDERS: Mapping[str, Callable[[DrawnSettings, Sequence[Scene]], TrackConfig]] = {
     KF: _independent,
     SAGA: lambda settings, scenes: drawn_config(settings),
     GRAPH: lambda settings, scenes: drawn_config(settings).with_association("graph"),
+    LEARNED: _learned,
 }
 """How each contender tracks a cell, given scenes of it, of other seeds, to learn from."""
 
@@ -71,6 +89,7 @@ COMPARISONS = (
     *((SAGA, KF, figure) for figure in FIGURES),
     *((GRAPH, KF, figure) for figure in FIGURES),
     (GRAPH, SAGA, "IDS"),
+    *((LEARNED, each, figure) for each in (KF, SAGA) for figure in FIGURES),
 )
 """Contender, what it is compared with, and the figure."""
 

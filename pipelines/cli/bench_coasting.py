@@ -25,6 +25,13 @@ def coasting(
         str | None, typer.Option("--recordings", help="Recordings of a single --data, with commas between them.")
     ] = None,
     folds: Annotated[int, typer.Option("--folds", min=2, help="Each is tested by what the others taught.")] = 3,
+    tested_folds: Annotated[
+        int | None, typer.Option("--tested-folds", min=1, help="Test the first folds only; all if left out.")
+    ] = None,
+    gaps: Annotated[int, typer.Option("--gaps", min=1, help="Gaps judged in a recording, drawn from all.")] = 500,
+    network: Annotated[
+        bool, typer.Option("--network", help="Train networks too (extra [learn]); minutes a fold.")
+    ] = False,
     json_file: JsonFile = None,
     config: Config = None,
     verbose: Verbose = False,
@@ -38,9 +45,16 @@ def coasting(
     Examples:
       saga-fg bench coasting --data kitti=data/kitti --json coasting.json
       saga-fg bench coasting --data eth_ucy=data/eth_ucy --data simulated=6
+      saga-fg bench coasting --data kitti=data/kitti --network --tested-folds 1
     """
     from data_tools.atomic_files import check_writable
-    from pipelines.bench.coasting_trajectories import CLASSES, coasting_errors, coasting_figures, coasting_table
+    from pipelines.bench.coasting_trajectories import (
+        CLASSES,
+        CoastingSettings,
+        coasting_errors,
+        coasting_figures,
+        coasting_table,
+    )
     from pipelines.config import load_config
     from pipelines.figures import write_figures
     from pipelines.learning import TrajectorySource
@@ -51,7 +65,7 @@ def coasting(
     if json_file is not None:
         check_writable(json_file)
     chosen = names("--recordings", recordings) if recordings is not None else None
-    figures = {}
+    figures, settings = {}, CoastingSettings(folds, tested_folds, gaps, network)
     for source in [TrajectorySource.parsed(value, chosen) for value in data]:
         if source.kind not in CLASSES:
             raise InputError(f"--data {source.kind}=...: expected recordings with truth: {', '.join(CLASSES)}")
@@ -60,7 +74,7 @@ def coasting(
             raise InputError(f"--data {source.kind}={source.place}: expected at least two recordings")
         rules = load_config(source.family, config).tracker.edges
         with progress_bar(unit="recordings") as progress:
-            errors, learned = coasting_errors(found, CLASSES[source.kind], rules, folds, progress=progress)
+            errors, learned = coasting_errors(found, CLASSES[source.kind], rules, settings, progress)
         rows = coasting_figures(errors)
         show_tables([coasting_table(rows, f"{source.kind}, {len(found)} recordings")])
         figures[source.kind] = {"recordings": list(found), "figures": rows, "learned": learned}

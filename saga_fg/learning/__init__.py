@@ -6,6 +6,7 @@ from saga_fg.learning.gap_prediction import gap_errors, negative_log_likelihood,
 from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments, sample_gaps
 from saga_fg.learning.independent_filter import FilteredTrajectories, filter_independently
 from saga_fg.learning.interaction_fit import TEMPLATE, FittedInteractions, fit_interactions, predict_with
+from saga_fg.learning.joint_fit import fit_interactions_in_view
 from saga_fg.learning.joint_gaps import JointGaps
 from saga_fg.learning.measurement_noise import fit_position_noise
 from saga_fg.learning.network_fit import fit_networks
@@ -37,6 +38,7 @@ __all__ = [
     "fit_acceleration_noise",
     "fit_acceleration_noise_by_class",
     "fit_interactions",
+    "fit_interactions_in_view",
     "fit_networks",
     "fit_position_noise",
     "fit_score_calibration",

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -25,27 +24,27 @@ from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, SharedCourse
 from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample
+from saga_fg.learning.rule_parameters import Rule, RuleParameters
 
-Rule = Following | Neighbours
-
-BOUNDS: Mapping[str, tuple[float, float]] = {
-    "rate": (1e-3, 5.0),
-    "distance_scale": (0.5, 100.0),
-    "gap_scale": (3.0, 100.0),
-    "lateral_scale": (0.3, 5.0),
-    "heading_scale": (0.05, 3.0),
-    "speed_scale": (0.1, 10.0),
-}
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s
 PRIOR = 2e-3  # weight of a unit of squared difference from the template, against the mean over the gaps
 FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
-MOST_GAPS = 1500  # that are learned from, drawn at random; more add nothing but time
+MOST_GAPS = 800  # that are learned from, drawn at random; more add nothing but time
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
+_SPEED = Following(
+    CarFollowing(time_constant=math.inf),
+    rate=1.0,
+    gap_scale=16.0,
+    lateral_scale=0.8,
+    classes=ROAD_USERS,
+    leaders="moving",
+)
 TEMPLATE: tuple[Rule, ...] = (
-    Following(CarFollowing(time_constant=math.inf), rate=1.0, gap_scale=16.0, lateral_scale=0.8, classes=ROAD_USERS),
-    Following(SharedCourse(), rate=0.7, gap_scale=16.0, lateral_scale=0.8, classes=ROAD_USERS),
+    _SPEED,
+    replace(_SPEED, rate=0.2, leaders="standing"),
+    replace(_SPEED, interaction=SharedCourse(), rate=0.7),
     Neighbours(
         rate=1.0,
         distance_scale=25.0,
@@ -66,7 +65,8 @@ TEMPLATE: tuple[Rule, ...] = (
         classes=("pedestrian",),
     ),
 )
-"""Following and turning after a leader; parked objects, which share the pose's errors; groups of people."""
+"""Following a leader, moving or perhaps parked; turning after a moving one; parked objects, which share errors of the
+pose; groups of people."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def fit_interactions(
     position_noise: float,
     acceleration_noise: Mapping[str, float],
     template: Sequence[Rule] = TEMPLATE,
-    iterations: int = 25,
+    iterations: int = 20,
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
@@ -127,35 +127,26 @@ def fit_interactions(
         raise InputError("sample: expected at least one object that is followed for long enough")
     sample = thinned(sample)
     rules = [rule for rule in template if acting_classes(rule.classes, sample).any()]
-    names = [
-        (k, name) for k, rule in enumerate(rules) for name in BOUNDS if math.isfinite(getattr(rule, name, math.inf))
-    ]
+    parameters = RuleParameters.of(rules)
+    m = len(parameters.start)
     labels, count = np.unique(sample.label, return_counts=True)
     own = [str(label) for label in labels[count >= FEWEST_GAPS]]
     classes = [*own, DEFAULT]
     class_of = np.array([classes.index(c) if c in own else len(own) for c in sample.label.tolist()])
     noise = [acceleration_noise.get(c, acceleration_noise[DEFAULT]) for c in classes]
-    start = np.array([math.log(getattr(rules[k], name)) for k, name in names] + [*np.log(noise), 0.0])
-    bounds = [tuple(np.log(BOUNDS[name])) for _, name in names]
-    bounds += [tuple(np.log(NOISE_BOUNDS))] * len(classes) + [EXPLAINED_BOUNDS]
-    start = np.clip(start, *np.array(bounds).T)
-
-    def valued(x: FloatArray) -> list[Rule]:
-        values: list[dict[str, Any]] = [{} for _ in rules]
-        for (k, name), value in zip(names, np.exp(x), strict=False):
-            values[k][name] = float(value)
-        return [replace(rule, **changes) for rule, changes in zip(rules, values, strict=True)]
+    bounds = [*parameters.bounds, *[tuple(np.log(NOISE_BOUNDS))] * len(classes), EXPLAINED_BOUNDS]
+    start = np.clip(np.concatenate([parameters.start, np.log(noise), [0.0]]), *np.array(bounds).T)
 
     def loss(x: FloatArray) -> float:
-        q = np.exp(x[len(names) : -1])[class_of]
-        prediction = predict_gaps(sample, couple_rules(valued(x), sample), q, x[-1])
-        prior = PRIOR * ((x[: len(names)] - start[: len(names)]) ** 2).sum()
+        q = np.exp(x[m:-1])[class_of]
+        prediction = predict_gaps(sample, couple_rules(parameters.valued(x[:m]), sample), q, x[-1])
+        prior = PRIOR * ((x[:m] - start[:m]) ** 2).sum()
         return float(negative_log_likelihood(sample, prediction, position_noise) + prior)
 
     found = minimize(loss, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations, "eps": 1e-3})
-    q = np.exp(found.x[len(names) : -1])
+    q = np.exp(found.x[m:-1])
     return FittedInteractions(
-        tuple(valued(found.x)),
+        tuple(parameters.valued(found.x[:m])),
         {label: float(value) for label, value in zip(classes, q, strict=True)},
         float(found.x[-1]),
         float(found.fun),

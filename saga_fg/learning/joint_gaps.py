@@ -1,12 +1,12 @@
-"""Gaps in trajectories as the joint filter lives through them: all objects in one state, coupled by edge rules.
+"""Trajectories, and gaps in them, as the joint filter lives through them: all objects in one state, coupled by rules.
 
-Up to a gap every object is measured at every moment at which it is seen. Then the joint state is kept, and for every
-gap that begins here it goes on from there: neighbours are measured at every step, the hidden object is not.
+Every object is measured at every moment at which it is seen. Where gaps begin the joint state is kept, and for each of
+them it goes on from there: neighbours are measured at every step, the hidden object is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -50,25 +50,8 @@ class JointGaps:
     def errors(self, gaps: GapSample, settings: GapSettings) -> FloatArray:
         """(W, S) distances, m, between where the objects of the gaps are and where they were predicted."""
         _, stride, steps = gap_moments(self._of, settings)
-        seen = np.isfinite(self._of.position[..., 0])
-        state, errors = JointKalmanFilter(), np.full((len(gaps), steps), np.nan)
-        present = np.empty(0, dtype=np.int64)
-        for k in range(int(gaps.moment.max(initial=-1)) + 1):
-            now = np.flatnonzero(seen[k])
-            gone = np.setdiff1d(present, now)
-            if len(gone):
-                state.marginalise(gone)
-            kept = np.setdiff1d(present, gone)
-            if k and len(kept):
-                self._predict(
-                    state, kept, self._filtered.heading[k - 1], k - 1, self._of.time[k] - self._of.time[k - 1]
-                )
-                self._measure(state, kept, k)
-            born = np.setdiff1d(now, kept)
-            if len(born):
-                mean = np.concatenate([self._of.position[k, born], np.zeros((len(born), 2))], axis=1)
-                state.add(born, mean, np.tile(self._birth, (len(born), 1, 1)))
-            present = now
+        errors = np.full((len(gaps), steps), np.nan)
+        for k, state, present, _ in self._in_view(int(gaps.moment.max(initial=-1)) + 1):
             rows = np.flatnonzero(gaps.moment == k)
             if len(rows):
                 start = state.snapshot()
@@ -77,6 +60,33 @@ class JointGaps:
                     errors[w] = self._gap(state, present, int(gaps.row[w]), k, stride, steps)
                 state.restore(start)
         return errors
+
+    def log_likelihood(self) -> tuple[float, int]:
+        """Of all positions but the first of each object, with the number of them."""
+        passed = list(self._in_view(len(self._of)))
+        return sum(log for *_, (log, _) in passed), sum(count for *_, (_, count) in passed)
+
+    def _in_view(self, moments: int) -> Iterator[tuple[int, JointKalmanFilter, IntArray, tuple[float, int]]]:
+        """After each moment: the filter, who is in view, and the log-likelihood of how many positions seen then."""
+        seen = np.isfinite(self._of.position[..., 0])
+        state, present = JointKalmanFilter(), np.empty(0, dtype=np.int64)
+        for k in range(moments):
+            now = np.flatnonzero(seen[k])
+            gone = np.setdiff1d(present, now)
+            if len(gone):
+                state.marginalise(gone)
+            kept, told = np.setdiff1d(present, gone), 0.0
+            if len(kept):
+                self._predict(
+                    state, kept, self._filtered.heading[k - 1], k - 1, self._of.time[k] - self._of.time[k - 1]
+                )
+                told = self._measure(state, kept, k)
+            born = np.setdiff1d(now, kept)
+            if len(born):
+                mean = np.concatenate([self._of.position[k, born], np.zeros((len(born), 2))], axis=1)
+                state.add(born, mean, np.tile(self._birth, (len(born), 1, 1)))
+            present = now
+            yield k, state, present, (told, len(kept))
 
     def _gap(
         self, state: JointKalmanFilter, present: IntArray, hidden: int, k: int, stride: int, steps: int
@@ -140,6 +150,6 @@ class JointGaps:
         )
         state.predict(discretise(build_graph(nodes, self._rules, explained_noise=self._explained), dt))
 
-    def _measure(self, state: JointKalmanFilter, rows: IntArray, k: int) -> None:
-        if len(rows):
-            state.update(Measurements(rows, self._of.position[k, rows], _H, self._R))
+    def _measure(self, state: JointKalmanFilter, rows: IntArray, k: int) -> float:
+        """The log-likelihood of the positions of `rows` at moment k."""
+        return state.update(Measurements(rows, self._of.position[k, rows], _H, self._R)) if len(rows) else 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -58,6 +58,11 @@ class Trajectories:
         known = np.isfinite(position[..., 0])
         origin = np.round(position[known].mean(axis=0)) if known.any() else np.zeros(2)
         return cls(time, names, label, length, position - origin, heading)
+
+    def until(self, time: float) -> Self:
+        """The moments up to a time after the first, s."""
+        kept = self.time <= self.time[0] + time
+        return replace(self, time=self.time[kept], position=self.position[kept], heading=self.heading[kept])
 
     def __len__(self) -> int:
         return len(self.time)

@@ -13,7 +13,7 @@ from pipelines.cli.main import app
 from saga_fg.edge_rules import Following
 from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing
-from saga_fg.learning import FittedInteractions
+from saga_fg.learning import FittedInteractions, Trajectories, filter_independently, sample_gaps
 
 
 def test_figures_are_those_of_the_errors_at_the_end_of_each_gap():
@@ -22,16 +22,44 @@ def test_figures_are_those_of_the_errors_at_the_end_of_each_gap():
     errors = CoastingErrors(
         np.zeros(40, dtype=np.int64),
         np.arange(40) // 4,
-        np.full(40, "car"),
+        np.where(np.arange(40) < 20, "car", "pedestrian"),
+        np.arange(40) % 2 == 0,
         0.5 * np.arange(1, 7),
         {"kf": kf, "learned": 0.5 * kf},
     )
-    rows = {(row.gap, row.method): row for row in coasting_figures(errors)}
-    assert set(rows) == {(gap, method) for gap in (1.0, 3.0) for method in ("kf", "learned")}
-    assert rows[1.0, "kf"].median == 2.0
-    assert rows[3.0, "learned"].mean == 4.0
-    assert rows[3.0, "learned"].mean_change.estimate == -0.5
-    assert rows[1.0, "kf"].mean_change is None
+    rows = {(row.label, row.gap, row.method): row for row in coasting_figures(errors)}
+    groups = {"car": 20, "pedestrian": 20, "pedestrian in company": 10}
+    assert set(rows) == {(g, gap, method) for g in groups for gap in (1.0, 3.0) for method in ("kf", "learned")}
+    assert {row.label: row.gaps for row in rows.values()} == groups
+    assert rows["car", 1.0, "kf"].median == 2.0
+    assert rows["car", 3.0, "learned"].mean == 4.0
+    assert rows["car", 3.0, "learned"].mean_change.estimate == -0.5
+    assert rows["car", 1.0, "kf"].mean_change is None
+
+
+def test_the_length_of_a_gap_is_that_of_its_steps():
+    error = np.ones((4, 3))
+    none = np.zeros(4, dtype=np.int64)
+    errors = CoastingErrors(none, none, np.full(4, "car"), none > 0, 0.4 * np.arange(1, 4), {"kf": error})
+    assert errors.at(1.0)[0] == pytest.approx(0.8)
+    assert errors.at(3.0)[0] == pytest.approx(1.2)
+
+
+def test_who_walks_beside_another_is_in_company():
+    moments, walking = 30, np.array([1.2, 0.0])
+    start = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 10.0], [1.0, 9.0]])
+    velocity = np.array([walking, walking, walking, -walking])
+    time = 0.4 * np.arange(moments)
+    position = start + time[:, None, None] * velocity
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0]) + np.zeros((moments, 4))
+    people = Trajectories(time, np.array(list("abcd")), np.full(4, "pedestrian"), np.zeros(4), position, heading)
+    filtered = filter_independently(people, np.full(4, 0.1), 0.05)
+    gaps = sample_gaps(people, filtered, ("pedestrian",))
+    assert (coasting_trajectories._in_company(gaps) == (gaps.row < 2)).all()
+    assert len(gaps) > 10
+    few = coasting_trajectories.drawn_gaps(gaps, 5)
+    assert len(few) == 5
+    assert set(few.moment.tolist()) <= set(gaps.moment.tolist())
 
 
 def test_a_recording_is_judged_by_what_the_others_taught(monkeypatch):
@@ -46,11 +74,12 @@ def test_a_recording_is_judged_by_what_the_others_taught(monkeypatch):
     recordings = {str(seed): following_pairs(pairs=2, moments=80, seed=seed) for seed in range(2)}
     errors, learned = coasting_trajectories.coasting_errors(recordings, ("car",), ())
     assert taught_by == [{1}, {0}], "no fold is tested on what it was fitted to"
-    assert len(learned) == 2
+    assert len(learned["learned"]) == 2
     np.testing.assert_allclose(
         errors.errors["hand-crafted"], errors.errors["kf"], atol=1e-6, err_msg="no rules: independent objects"
     )
-    kf, ours = (errors.of(method, "car", 2.0) for method in ("kf", "learned"))
+    _, at = errors.at(2.0)
+    kf, ours = at.errors["kf"], at.errors["learned"]
     assert len(kf) > 20
     assert ours.mean() < 0.9 * kf.mean()
 

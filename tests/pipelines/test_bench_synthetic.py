@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from pipelines.bench import synthetic as bench
 from pipelines.bench.drawn_scenes import INTERVAL, DrawnSettings, drawn_scene
 from pipelines.cli.main import app
+from saga_fg.edge_rules import Neighbours
 
 SHORT = DrawnSettings(groups=2, members=3, seconds=6.0)
 
@@ -46,8 +47,13 @@ def test_a_scene_is_its_seed() -> None:
 
 
 @pytest.fixture
-def uncoupled(monkeypatch: pytest.MonkeyPatch) -> bench.SyntheticResult:
+def little_to_learn_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "FIT_SCENES", 1)
+    monkeypatch.setattr(bench, "LEARNED_SECONDS", 0.6)
+
+
+@pytest.fixture
+def uncoupled(little_to_learn_from: None) -> bench.SyntheticResult:
     return bench.synthetic(range(2), {"no coupling": replace(SHORT, coupling=0.0)})
 
 
@@ -69,9 +75,9 @@ def test_a_cell_says_what_is_worse_in_it(uncoupled: bench.SyntheticResult) -> No
     assert cell.figure(bench.GRAPH, "IDS") == cell.figure(bench.KF, "IDS") + 3
 
 
+@pytest.mark.usefixtures("little_to_learn_from")
 def test_the_command_writes_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "CELLS", {"base": SHORT})
-    monkeypatch.setattr(bench, "FIT_SCENES", 1)
     figures = tmp_path / "figures.json"
     result = CliRunner().invoke(app, ["bench", "synthetic", "--seeds", "2", "--json", str(figures)])
     assert result.exit_code == 0, result.output
@@ -81,3 +87,15 @@ def test_the_command_writes_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     refused = CliRunner().invoke(app, ["bench", "synthetic", "--cells", "nothing"])
     assert refused.exit_code != 0
     assert "expected some of base" in refused.output
+
+
+def test_learned_interactions_are_from_scenes_of_other_seeds_and_near_the_true_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = DrawnSettings(groups=3, members=5, seconds=5.0)
+    monkeypatch.setattr(bench, "LEARNED_SCENES", 1)
+    config = bench.CONTENDERS[bench.LEARNED](settings, [drawn_scene(settings, 5)])
+    (rule,) = config.tracker.edges
+    assert isinstance(rule, Neighbours)
+    near = rule.rate * np.exp(-((settings.spacing / rule.distance_scale) ** 2) / 2)  # at the spacing of a group
+    assert near == pytest.approx(settings.rule.rate, rel=0.4)

@@ -313,3 +313,24 @@ def test_parked_objects_are_coupled_once_it_is_known_that_they_stand():
     new = replace(nodes, velocity_variance=np.array([0.01, 25.0, 0.01]))
     assert not edges(rule.pairs(new))
     assert not edges(rule.pairs(replace(nodes, has_moved=None)))
+
+
+def test_who_leads_may_be_those_that_move_or_those_that_stand():
+    """Before a car stands a parked one, and before that drives another."""
+    nodes = table(*straight(3))
+    nodes = replace(nodes, has_moved=np.array([True, False, True]))
+    assert leaders(Following().pairs(nodes)) == {2: 1}
+    assert leaders(Following(leaders="moving").pairs(nodes)) == {2: 0}
+    assert leaders(Following(leaders="standing").pairs(nodes)) == {2: 1}
+    with pytest.raises(InputError, match="leaders: expected one of any, moving, standing"):
+        Following(leaders="parked")
+
+
+def test_who_creeps_in_a_jam_is_not_coupled_as_parked_objects_are():
+    rule, side_by_side = Neighbours(parked=True, speed_scale=0.5, rate=1.0), [[0.0, 0.0], [3.0, 0.0]]
+
+    def rates(speed):
+        known = {"has_moved": np.zeros(2, dtype=bool), "velocity_variance": np.full(2, 0.01)}
+        return rule.pairs(replace(table(side_by_side, 0.0, speed=speed), **known)).rate
+
+    assert rates(1.5).max() < 1e-3 < 0.5 < rates(0.1).min()

@@ -1,5 +1,6 @@
 """Learning interactions: gaps, their prediction, and what comes out of the fit."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -19,6 +20,7 @@ from saga_fg.learning import (
     Trajectories,
     filter_independently,
     fit_interactions,
+    fit_interactions_in_view,
     gap_errors,
     negative_log_likelihood,
     predict_gaps,
@@ -141,3 +143,33 @@ def test_learning_from_nothing_is_an_error():
     _, sample = gaps_of(trajectories)
     with pytest.raises(InputError, match="at least one object that is followed"):
         fit_interactions(GapSample.pool([sample]), 0.005, {"default": 0.3})
+
+
+def test_objects_in_view_are_likeliest_by_the_rate_at_which_they_follow():
+    trajectories = following_pairs(pairs=3, moments=80)
+    followers = np.arange(6) >= 3
+    labels = np.where(followers, "car", "bus")  # leaders have their own noise
+    trajectories = dataclasses.replace(trajectories, label=labels)
+    filtered = filter_independently(trajectories, np.where(followers, 0.05, 1.5), 0.005)
+
+    def likelihood(rate):
+        rule = dataclasses.replace(FOLLOW, rate=rate, gap_scale=1e3)
+        return JointGaps(trajectories, filtered, {"car": 0.05, "default": 1.5}, 0.005, (rule,)).log_likelihood()
+
+    (right, count), (low, _), (high, _) = map(likelihood, (RATE, 0.5 * RATE, 2 * RATE))
+    assert count == 6 * 79
+    assert right > low + 5
+    assert right > high + 5
+
+
+def test_the_rate_of_objects_in_view_is_found_again():
+    trajectories = following_pairs(pairs=4, moments=30, seed=4)
+    labels = np.where(np.arange(8) >= 4, "car", "bus")
+    trajectories = dataclasses.replace(trajectories, label=labels)
+    template = dataclasses.replace(FOLLOW, gap_scale=math.inf, lateral_scale=math.inf, heading_scale=math.inf)
+    noise = {"car": 0.3, "default": 0.3}
+    fitted = fit_interactions_in_view([trajectories], 0.005, noise, (template,), iterations=5)
+    assert fitted.rules[0].rate == pytest.approx(RATE, rel=0.35)
+    assert fitted.acceleration_noise["car"] < 0.3 * fitted.acceleration_noise["default"]
+    with pytest.raises(InputError, match="seen twice"):
+        fit_interactions_in_view([trajectories.until(0.0)], 0.005, noise, (template,))
