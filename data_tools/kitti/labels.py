@@ -3,8 +3,8 @@
     frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y [score]
 
 2D boxes in pixels, sizes and positions in m in the rectified camera frame (bottom centre), angles in rad. `DontCare`
-lines mark regions of the image and have id -1. Source: development kit of the tracking benchmark,
-https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
+lines mark regions of the image and have id -1. `Person` is the other name of `Person_sitting`. Source: development kit
+of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def read_kitti_labels(path: str | Path) -> KittiObjects:
     objects = KittiObjects(
         frame=table.integers(0, "frame", 0),
         track_id=table.integers(1, "id", -1),
-        type=np.ascontiguousarray(table.values[:, 2]),
+        type=np.where(table.values[:, 2] == "Person", "Person_sitting", table.values[:, 2]),
         truncated=numbers[:, 0],
         occluded=numbers[:, 1],
         alpha=numbers[:, 2],

@@ -19,8 +19,10 @@ from data_tools.metrics.error_figures import (
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.hota import HotaFigures, hota_figures
 from data_tools.metrics.kitti_tracking import (
+    KittiSimilarity,
     KittiTrackingFigures,
     KittiTrackingSequence,
+    kitti_hota_figures,
     kitti_tracking_figures,
 )
 from data_tools.metrics.label_errors import LabelErrors, label_errors, label_velocities
@@ -42,6 +44,7 @@ __all__ = [
     "ErrorSample",
     "HotaFigures",
     "Interval",
+    "KittiSimilarity",
     "KittiTrackingFigures",
     "KittiTrackingSequence",
     "LabelErrors",
@@ -61,6 +64,7 @@ __all__ = [
     "error_figures",
     "errors_by_class",
     "hota_figures",
+    "kitti_hota_figures",
     "kitti_tracking_figures",
     "label_errors",
     "label_velocities",

@@ -22,7 +22,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.overlap import bev_iou, iou_3d
@@ -55,6 +55,29 @@ class HotaFigures:
     hota_at: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One scene as the metrics see it: at each moment the names of true and found objects, and (n, m) similarities."""
+
+    true: Sequence[IntArray | StrArray]
+    found: Sequence[IntArray | StrArray]
+    similarities: Sequence[FloatArray]
+
+    def sequence(self) -> dict[str, Any]:
+        """As `trackeval` wants it: names are numbers from 0."""
+        true, found = _numbered(self.true), _numbered(self.found)
+        return {
+            "num_timesteps": len(true),
+            "num_gt_ids": 1 + max((int(ids.max(initial=-1)) for ids in true), default=-1),
+            "num_tracker_ids": 1 + max((int(ids.max(initial=-1)) for ids in found), default=-1),
+            "num_gt_dets": sum(map(len, true)),
+            "num_tracker_dets": sum(map(len, found)),
+            "gt_ids": true,
+            "tracker_ids": found,
+            "similarity_scores": list(self.similarities),
+        }
+
+
 def hota_figures(
     scenes: Sequence[tuple[TrackTable, TrackTable]],
     label: str,
@@ -73,10 +96,15 @@ def hota_figures(
         raise InputError(f"similarity: expected one of {', '.join(get_args(Similarity))}, got {similarity!r}")
     if not scenes:
         raise InputError("scenes: expected at least one scene")
+    return compared_figures([_compared(*scene, label, similarity, reach) for scene in scenes], threshold)
+
+
+def compared_figures(scenes: Sequence[Compared], threshold: float = 0.5) -> HotaFigures:
+    """The figures of scenes whose similarities are known. Raises `MissingExtraError` without trackeval."""
     metrics = _trackeval_metrics()
     options = {"THRESHOLD": threshold, "PRINT_CONFIG": False}
     hota, clear, identity = metrics.HOTA(), metrics.CLEAR(options), metrics.Identity(options)
-    sequences = [_sequence(*scene, label, similarity, reach) for scene in scenes]
+    sequences = [scene.sequence() for scene in scenes]
     h, c, i = (
         metric.combine_sequences({str(n): metric.eval_sequence(data) for n, data in enumerate(sequences)})
         for metric in (hota, clear, identity)
@@ -108,35 +136,36 @@ def _trackeval_metrics() -> Any:
     return metrics
 
 
-def _sequence(truth: TrackTable, found: TrackTable, label: str, similarity: Similarity, reach: float) -> dict[str, Any]:
-    """One scene as `trackeval` wants it: per moment the numbers of true and found tracks, and their similarities."""
+def _numbered(names: Sequence[IntArray | StrArray]) -> list[IntArray]:
+    """The names at each moment as numbers from 0 without gaps."""
+    if not names:
+        return []
+    numbers = np.unique(np.concatenate(list(names)), return_inverse=True)[1].reshape(-1)
+    return np.split(numbers.astype(np.int64), np.cumsum([len(each) for each in names])[:-1])
+
+
+def _compared(truth: TrackTable, found: TrackTable, label: str, similarity: Similarity, reach: float) -> Compared:
+    """The objects of a class in one scene."""
     moments = 1 + int(max(truth.moment.max(initial=-1), found.moment.max(initial=-1)))
-    true_rows, true_ids, true_count = _of_class(truth, label, moments)
-    found_rows, found_ids, found_count = _of_class(found, label, moments)
-    return {
-        "num_timesteps": moments,
-        "num_gt_ids": true_count,
-        "num_tracker_ids": found_count,
-        "num_gt_dets": sum(map(len, true_ids)),
-        "num_tracker_dets": sum(map(len, found_ids)),
-        "gt_ids": true_ids,
-        "tracker_ids": found_ids,
-        "similarity_scores": [
-            _similarities(truth.boxes.select(a), found.boxes.select(b), similarity, reach)
+    true_rows, found_rows = (_rows_of_class(table, label, moments) for table in (truth, found))
+    return Compared(
+        [truth.id[rows] for rows in true_rows],
+        [found.id[rows] for rows in found_rows],
+        [
+            box_similarities(truth.boxes.select(a), found.boxes.select(b), similarity, reach)
             for a, b in zip(true_rows, found_rows, strict=True)
         ],
-    }
+    )
 
 
-def _of_class(table: TrackTable, label: str, moments: int) -> tuple[list[IntArray], list[IntArray], int]:
-    """Rows and track numbers of a class at each moment, and how many tracks there are."""
+def _rows_of_class(table: TrackTable, label: str, moments: int) -> list[IntArray]:
+    """Rows of a class at each moment."""
     rows = np.flatnonzero(table.boxes.label == label)
-    names, numbers = np.unique(table.id[rows], return_inverse=True)
-    cuts = np.searchsorted(table.moment[rows], np.arange(1, moments))
-    return np.split(rows, cuts)[:moments], np.split(numbers, cuts)[:moments], len(names)
+    return np.split(rows, np.searchsorted(table.moment[rows], np.arange(1, moments)))[:moments]
 
 
-def _similarities(truth: Boxes, found: Boxes, similarity: Similarity, reach: float) -> FloatArray:
+def box_similarities(truth: Boxes, found: Boxes, similarity: Similarity, reach: float = 4.0) -> FloatArray:
+    """(n, m) of all pairs; see the module."""
     if similarity == "bev_iou":
         return bev_iou(truth, found)
     if similarity == "iou_3d":

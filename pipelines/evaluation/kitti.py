@@ -18,7 +18,7 @@ from data_tools.metrics import (
     label_velocities,
 )
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
-from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
+from pipelines.evaluation.hota import HotaRow, hota_json, hota_table, kitti_hota
 from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.figures import FigureTable, cell
@@ -89,7 +89,7 @@ def evaluate_kitti(
         tuple(scored),
         tracking,
         LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
-        hota([(each.truth, each.found) for each in scored.values()], best) if with_hota else (),
+        kitti_hota(pairs, best) if with_hota else (),
         innovations or {},
     )
 

@@ -63,12 +63,7 @@ class ClassRows:
 def true_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassRows:
     """The true boxes of a class (name in lower case)."""
     kept = [_of_class(sequence.truth, label) for sequence in sequences]
-    exempt = [
-        (np.trunc(rows.truncated) > MAX_TRUNCATION)
-        | (np.trunc(rows.occluded) > MAX_OCCLUSION)
-        | _neighbour(rows, label)
-        for rows in kept
-    ]
+    exempt = [hardly_seen(rows) | _neighbour(rows, label) for rows in kept]
     return _joined(kept, exempt, _frames(sequences))
 
 
@@ -76,9 +71,7 @@ def found_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassR
     """The found boxes of a class (name in lower case)."""
     kept = [_of_class(sequence.found, label) for sequence in sequences]
     exempt = [
-        (np.abs(rows.bbox[:, 1] - rows.bbox[:, 3]) <= MIN_HEIGHT)
-        | _neighbour(rows, label)
-        | _in_ignored_area(rows, sequence.truth)
+        is_small(rows) | _neighbour(rows, label) | in_ignored_area(rows, sequence.truth)
         for rows, sequence in zip(kept, sequences, strict=True)
     ]
     return _joined(kept, exempt, _frames(sequences))
@@ -98,6 +91,18 @@ def _of_class(objects: KittiObjects, label: str) -> KittiObjects:
 
 def _neighbour(objects: KittiObjects, label: str) -> BoolArray:
     return np.asarray(np.char.lower(objects.type) != label)
+
+
+def hardly_seen(objects: KittiObjects) -> BoolArray:
+    """(N,) which true objects are truncated, or occluded beyond "largely"."""
+    return np.asarray(
+        (np.trunc(objects.truncated) > MAX_TRUNCATION) | (np.trunc(objects.occluded) > MAX_OCCLUSION), dtype=np.bool_
+    )
+
+
+def is_small(objects: KittiObjects) -> BoolArray:
+    """(N,) which objects are too low in the image to be asked for."""
+    return np.asarray(np.abs(objects.bbox[:, 1] - objects.bbox[:, 3]) <= MIN_HEIGHT, dtype=np.bool_)
 
 
 def _frames(sequences: Sequence[KittiTrackingSequence]) -> int:
@@ -123,8 +128,8 @@ def _joined(parts: Sequence[KittiObjects], exempt: Sequence[BoolArray], frames: 
     )
 
 
-def _in_ignored_area(rows: KittiObjects, truth: KittiObjects) -> BoolArray:
-    """Which rows lie with more than half of their image box in one DontCare area of their frame."""
+def in_ignored_area(rows: KittiObjects, truth: KittiObjects) -> BoolArray:
+    """(N,) which rows lie with more than half of their image box in one DontCare area of their frame."""
     areas = truth.select(np.char.lower(truth.type) == "dontcare")
     order = np.argsort(areas.frame, kind="stable")
     frame = areas.frame[order]
