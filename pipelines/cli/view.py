@@ -1,10 +1,10 @@
-"""`saga-fg view`: a result in space, in the viewer rerun."""
+"""`saga-fg view`: a result in space, in the viewer rerun or as a file for rerun or Foxglove."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -29,7 +29,11 @@ view_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mod
 
 Save = Annotated[
     Path | None,
-    typer.Option("--save", help="Write a file for rerun instead of opening the viewer.", metavar="FILE.rrd"),
+    typer.Option(
+        "--save",
+        help="Write a file instead of opening the viewer: .rrd for rerun, .mcap for Foxglove (extra [mcap]).",
+        metavar="FILE",
+    ),
 ]
 Spacing = Annotated[
     float, typer.Option("--spacing", min=0.0, help="Thin the LiDAR's points to this, m; 0 leaves them out.")
@@ -38,7 +42,7 @@ Spacing = Annotated[
 
 @view_app.callback()
 def view() -> None:
-    """See a result in space: boxes, tracks, ellipses, edges, truth, LiDAR points, landmarks (extra [view]: rerun)."""
+    """See a result in space: boxes, tracks, ellipses, edges, truth, LiDAR points, landmarks (rerun or Foxglove)."""
 
 
 @view_app.command()
@@ -62,7 +66,7 @@ def nuscenes(
     Examples:
       saga-fg view nuscenes tracks.json --dataroot data/nuscenes --scenes scene-0103
       saga-fg view nuscenes tracks.json --dataroot data/nuscenes --split mini_train \\
-          --detections lidar=megvii.json --save tracks.rrd
+          --detections lidar=megvii.json --save tracks.mcap
     """
     from pipelines.view.sources import nuscenes_view
 
@@ -140,31 +144,37 @@ def slam(
 
 def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView]], slam: Path | None = None) -> None:
     """Write or open the scenes that `make` gives, with the map of a run of SLAM."""
-    from data_tools.atomic_files import check_writable
-    from pipelines.view import load_rerun, log_scene, log_slam, read_slam_view, show_view, write_view
+    from pipelines.view import (
+        check_view_file,
+        draw_scene,
+        draw_slam,
+        in_order,
+        load_rerun,
+        read_slam_view,
+        show_rerun,
+        write_view,
+    )
     from saga_fg.errors import InputError
 
-    load_rerun()
-    if save is not None:
-        if save.suffix != ".rrd":  # which is no name of what is read, either
-            raise InputError(f"--save {save}: expected a file name that ends in .rrd")
-        check_writable(save)
+    if save is None:
+        load_rerun()
+    else:
+        check_view_file(save)
     with working("making the view"):
         scenes, driven = make(), read_slam_view(slam) if slam is not None else None
         roots = [each.report.scene.name for each in scenes]
         if driven is not None and len(scenes) > 1:
             raise InputError(f"--slam {slam}: expected one sequence, got {', '.join(roots)}; choose it by --sequences")
-
-        def draw(stream: Any) -> None:
-            for each in scenes:
-                log_scene(stream, each)
-            if driven is not None:
-                root = f"{roots[0]}/slam" if roots else "slam"
-                log_slam(stream, driven, root, scenes[0].report.scene.world_T_ego[0, :3, 3] if scenes else None)
-
+        drawings = [draw_scene(each) for each in scenes]
+        if driven is not None:
+            root = f"{roots[0]}/slam" if roots else "slam"
+            origin = scenes[0].report.scene.world_T_ego[0, :3, 3] if scenes else None
+            drawings.append(draw_slam(driven, root, origin))
+        roots = roots or ["slam"]
         if save is None:
-            show_view(result.name, roots or ["slam"], draw)
+            show_rerun(result.name, roots, in_order(*drawings))
         else:
-            write_view(save, result.name, roots or ["slam"], draw)
+            write_view(save, result.name, roots, in_order(*drawings))
     if save is not None:
-        typer.echo(f"{save}: {save.stat().st_size / 1e6:.1f} MB; open it with: rerun {save}")
+        how = f"open it with: rerun {save}" if save.suffix == ".rrd" else "open it in Foxglove"
+        typer.echo(f"{save}: {save.stat().st_size / 1e6:.1f} MB; {how}")

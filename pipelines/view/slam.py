@@ -1,7 +1,7 @@
-"""What `saga-fg slam` wrote, as rerun's entities: paths, the map's points, landmarks with their names.
+"""What `saga-fg slam` wrote, as drawings: paths, the map's points, landmarks with their names.
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
-    ROOT/pose                                     the vehicle along the trajectory, on the timeline `time`
+    ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
     ROOT/map, ROOT/landmarks                      points of map.ply and landmarks.ply
     ROOT/names                                    kind and number of the landmarks that are at a place (planes are not)
 
@@ -11,7 +11,7 @@ Metres, about `origin`.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,16 @@ import numpy as np
 
 from data_tools.lidar import read_scan
 from data_tools.trajectories import Trajectory, read_tum_poses
-from pipelines.view.stream import load_rerun
+from pipelines.view.drawing import VEHICLE, Cubes, Drawing, Lines, Marks, Points, Pose, one_colour
 from saga_fg.arrays import FloatArray, checked
 from saga_fg.errors import InputError
 
-PATHS = {"trajectory": (90, 90, 200), "odometry": (200, 120, 60), "online": (120, 180, 120)}
-MAP, LANDMARK = (130, 130, 130), (240, 100, 40)
+PATHS = {
+    "trajectory": one_colour((90, 90, 200)),
+    "odometry": one_colour((200, 120, 60)),
+    "online": one_colour((120, 180, 120)),
+}
+MAP, LANDMARK = one_colour((130, 130, 130)), one_colour((240, 100, 40))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,30 +55,27 @@ def read_slam_view(folder: Path) -> SlamView:
     return SlamView(paths, {name: read_scan(file).points for name, file in clouds.items()}, names, places)
 
 
-def log_slam(stream: Any, view: SlamView, root: str, origin: FloatArray | None = None) -> None:
-    """Log all of it to a `rerun.RecordingStream` below `root`; origin (3,) in its coordinates, the first pose if None.
+def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> Iterator[Drawing]:
+    """All of it in the frame `root`; origin (3,) in its coordinates, the first pose if None.
 
     Times count from the first pose.
     """
-    rerun = load_rerun()
     trajectory = view.paths["trajectory"]
     origin = trajectory.positions[0] if origin is None else origin
-    stream.log(root, rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for name, path in view.paths.items():
-        strip = rerun.LineStrips3D([path.positions - origin], colors=[PATHS[name]], radii=[0.08])
-        stream.log(f"{root}/{name}", strip, static=True)
+        yield Drawing(root, name, Lines([path.positions - origin], PATHS[name], np.array([0.08])))
     for name, points in view.points.items():
         radius, colour = (0.03, MAP) if name == "map" else (0.08, LANDMARK)
-        stream.log(f"{root}/{name}", rerun.Points3D(points - origin, radii=[radius], colors=[colour]), static=True)
+        yield Drawing(root, name, Points(points - origin, colour, radius))
     if view.names:
-        marks = rerun.Points3D(view.places - origin, radii=[0.15], colors=[LANDMARK], labels=view.names)
-        stream.log(f"{root}/names", marks, static=True)
-    stream.log(f"{root}/pose", rerun.Boxes3D(sizes=[(4.6, 1.9, 1.6)], colors=[PATHS["trajectory"]]), static=True)
+        yield Drawing(root, "names", Marks(view.places - origin, view.names, LANDMARK, 0.15))
+    body = Cubes(np.zeros((1, 3)), np.array([VEHICLE]), np.zeros(1), PATHS["trajectory"])
+    yield Drawing(f"{root}/pose", "body", body)
     times = trajectory.timestamps - trajectory.timestamps[0]
-    stream.reset_time()
-    for time, pose in zip(times.tolist(), trajectory.world_T_ego, strict=True):
-        stream.set_time("time", duration=time)
-        stream.log(f"{root}/pose", rerun.Transform3D(translation=pose[:3, 3] - origin, mat3x3=pose[:3, :3]))
+    for time, world_T_ego in zip(times.tolist(), trajectory.world_T_ego, strict=True):
+        pose = world_T_ego.copy()
+        pose[:3, 3] -= origin
+        yield Drawing(root, "pose", Pose(pose), time)
 
 
 def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:

@@ -21,7 +21,7 @@ from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.report import scene_of_run
 from pipelines.tracking import track_scene
-from pipelines.view import SceneView, log_scene, read_slam_view, write_view
+from pipelines.view import SceneView, draw_scene, read_slam_view, write_view
 from pipelines.view.scenes import HELD, ellipses
 from saga_fg import InputError
 
@@ -57,7 +57,7 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
     scene = SimulatedTraffic(SimulatorSettings(duration=2.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
     done = track_scene(scene, config.new_tracker("saga"))
     shown = scene_of_run({"saga": done}, config.tracker.edges, config.sensors)
-    write_view(tmp_path / "a.rrd", "a", ["scene-0001"], lambda stream: log_scene(stream, SceneView(shown)))
+    write_view(tmp_path / "a.rrd", "a", ["scene-0001"], draw_scene(SceneView(shown)))
     found = read_back(tmp_path / "a.rrd")
     origin, k = scene.world_T_ego[0, :3, 3], 12
     time = round(float(scene.timestamps[k] - scene.timestamps[0]), 9)
@@ -91,11 +91,10 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
 
 def test_the_ellipse_holds_ninety_percent() -> None:
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
-    half, quaternion = ellipses(covariance[None])
-    angle = 2 * np.arctan2(quaternion[0, 2], quaternion[0, 3])
+    half, (angle,) = ellipses(covariance[None])
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    np.testing.assert_allclose(turn @ np.diag(half[0, :2] ** 2) @ turn.T, HELD * covariance)
-    points = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 20000) @ turn / half[0, :2]
+    np.testing.assert_allclose(turn @ np.diag(half[0] ** 2) @ turn.T, HELD * covariance)
+    points = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 20000) @ turn / half[0]
     assert np.mean(np.sum(points**2, axis=1) < 1) == pytest.approx(0.9, abs=0.01)
 
 
@@ -181,14 +180,13 @@ def test_a_file_that_cannot_be_written_to_its_end_leaves_nothing(
 
     monkeypatch.setattr(rerun.RecordingStream, "flush", full)
     with pytest.raises(InputError, match=r"a\.rrd: not written, is the disk full\? File-writer thread"):
-        write_view(tmp_path / "a.rrd", "a", ["world"], lambda stream: None)
+        write_view(tmp_path / "a.rrd", "a", ["world"], [])
     assert not list(tmp_path.iterdir())
 
 
 def test_a_view_takes_the_place_of_no_file_of_a_result(tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
     (tmp_path / "map.ply").write_text("points")
     done = run("slam", tmp_path, "--save", tmp_path / "map.ply")
     assert done.exit_code == 2
-    assert "map.ply: expected a file name that ends in .rrd" in done.stderr
+    assert "map.ply: expected a file name that ends in .rrd (rerun) or .mcap (Foxglove)" in done.stderr
     assert (tmp_path / "map.ply").read_text() == "points"

@@ -1,0 +1,129 @@
+"""What there is to draw, whoever draws it: shapes with a name, in a frame of coordinates, at a time.
+
+    scenes.py, slam.py -> `Drawing`s in order of time -> to_rerun.py, to_mcap.py
+
+Frames are a tree of names: `Drawing(frame="scene/ego", name="lidar", shape=Pose(...))` says where the frame
+`scene/ego/lidar` is in `scene/ego`. A name that is drawn again takes the place of what it showed before.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray, IntArray
+
+VEHICLE = (4.6, 1.9, 1.6)  # length, width, height of the box drawn for the vehicle, m
+Colour = tuple[int, int, int]
+"""Red, green, blue, 0 to 255. Shapes have one of them for all, (1, 3), or one each, (N, 3)."""
+Facts = Mapping[str, Sequence[str]]
+"""Columns of texts by name: what is known of each of a number of things; the first one tells them apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cubes:
+    """N boxes: centre, size (length, width, height) (N, 3), m, yaw (N,), rad; facts of each, or none at all."""
+
+    centre: FloatArray
+    size: FloatArray
+    yaw: FloatArray
+    colour: IntArray
+    facts: Facts = field(default_factory=dict)
+
+    @property
+    def labels(self) -> list[str]:
+        """The facts of each box in a line; empty if there are none."""
+        return [" ".join(row) for row in zip(*self.facts.values(), strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """N strips of points (n, 3), m; radius (1,) or (N,), m."""
+
+    strips: Sequence[FloatArray]
+    colour: IntArray
+    radius: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """N arrows from their tail (N, 3), m, along a vector (N, 2) in the plane, m."""
+
+    tail: FloatArray
+    vector: FloatArray
+    colour: IntArray
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipses:
+    """N ellipses in the plane: centre (N, 3), half axes (N, 2), m, yaw (N,) of the first axis, rad."""
+
+    centre: FloatArray
+    half: FloatArray
+    yaw: FloatArray
+    colour: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """N places (N, 3), m, with their names."""
+
+    place: FloatArray
+    names: Sequence[str]
+    colour: IntArray
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A cloud of points (N, 3), m."""
+
+    points: FloatArray
+    colour: IntArray
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a frame is in its parent: (4, 4)."""
+
+    parent_T_child: FloatArray
+
+
+Shape = Cubes | Lines | Arrows | Ellipses | Marks | Points | Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A shape.
+
+    frame   whose coordinates the shape is in
+    name    of the layer, below that of the frame; of a pose: of the frame that it places
+    time    s from the start, None for what is always there
+    moment  which of the scene's moments, if it belongs to one
+    """
+
+    frame: str
+    name: str
+    shape: Shape
+    time: float | None = None
+    moment: int | None = None
+
+    @property
+    def path(self) -> str:
+        """The name with those of all frames above it."""
+        return f"{self.frame}/{self.name}"
+
+
+def in_order(*drawings: Iterable[Drawing]) -> Iterator[Drawing]:
+    """Merge drawings that are each in order of time; what is always there comes first."""
+    return heapq.merge(*drawings, key=lambda each: -np.inf if each.time is None else each.time)
+
+
+def one_colour(colour: Colour) -> IntArray:
+    """(1, 3), a colour for all."""
+    return np.array([colour], dtype=np.int64)

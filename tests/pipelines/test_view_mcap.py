@@ -1,0 +1,255 @@
+"""Views for Foxglove: what is in the file, read back by mcap's own reader and held against its own schemas."""
+
+from __future__ import annotations
+
+import base64
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+from typer.testing import CliRunner
+
+from data_tools.lidar import Scan
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from data_tools.trajectories import Trajectory, write_tum_poses
+from pipelines.cli import app
+from pipelines.config import load_config
+from pipelines.report import ReportScene, scene_of_run
+from pipelines.tracking import track_scene
+from pipelines.view import Drawing, SceneView, draw_scene, in_order, write_view
+from pipelines.view.foxglove_schemas import SCHEMAS
+from saga_fg import InputError
+from saga_fg.arrays import FloatArray
+from saga_fg.geometry import yaw_transform
+
+ROOT = "/scene-0001"
+
+
+@dataclass(frozen=True, eq=False)
+class TwoScans:
+    """Scans of a place on the roof; the first is earlier than the scene."""
+
+    timestamps: FloatArray
+    world_T_ego: FloatArray = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
+    ego_T_lidar: FloatArray = field(default_factory=lambda: yaw_transform(1.0, 0.0, 2.0, yaw=0.5))
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, row: int) -> Scan:
+        return Scan.of(np.array([[1.0, 2.0, 3.0], [1.001, 2.0, 3.0], [4.0, 5.0, 6.0 + row]]))
+
+
+@pytest.fixture(scope="module")
+def shown() -> ReportScene:
+    config = load_config("simulated")
+    scene = SimulatedTraffic(SimulatorSettings(duration=1.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
+    done = track_scene(scene, config.new_tracker("saga"))
+    return scene_of_run({"saga": done}, config.tracker.edges, config.sensors)
+
+
+@dataclass(frozen=True)
+class Read:
+    schema: str
+    time: int
+    content: Any
+
+
+def read_back(path: Path) -> tuple[dict[str, list[Read]], dict[str, Any]]:
+    """Messages by topic, as they stand in the file; schemas by name."""
+    reader = pytest.importorskip("mcap.reader", reason="mcap is not installed (extra [mcap])")
+    topics: dict[str, list[Read]] = {}
+    schemas: dict[str, Any] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in reader.make_reader(file, validate_crcs=True).iter_messages(
+            log_time_order=False
+        ):
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            assert message.publish_time == message.log_time
+            schemas[schema.name] = json.loads(schema.data)
+            found = Read(schema.name, message.log_time, json.loads(message.data))
+            topics.setdefault(channel.topic, []).append(found)
+    return topics, schemas
+
+
+def strict(schema: Any) -> Any:
+    """The schema with all that it names required, and nothing besides allowed."""
+    if isinstance(schema, list):
+        return [strict(each) for each in schema]
+    if not isinstance(schema, dict):
+        return schema
+    inner = {key: strict(value) for key, value in schema.items()}
+    if schema.get("type") == "object":
+        inner |= {"required": list(schema["properties"]), "additionalProperties": False}
+    return inner
+
+
+def seconds(stamp: dict[str, int]) -> int:
+    return stamp["sec"] * 10**9 + stamp["nsec"]
+
+
+def test_every_message_says_all_that_its_schema_names_and_times_ascend(tmp_path: Path, shown: ReportScene) -> None:
+    start = float(shown.scene.timestamps[0])
+    view = SceneView(shown, TwoScans(np.array([start - 0.1, start + 0.6])))
+    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(view))
+    topics, schemas = read_back(tmp_path / "a.mcap")
+    assert schemas == SCHEMAS
+    checks = {name: Draft202012Validator(strict(schema)) for name, schema in schemas.items()}
+    for topic, messages in topics.items():
+        assert len({each.schema for each in messages}) == 1, topic
+        times = [each.time for each in messages]
+        assert times == sorted(set(times)), topic
+        for each in messages:
+            checks[each.schema].validate(each.content)
+            if each.schema == "foxglove.SceneUpdate":
+                (deletion,) = each.content["deletions"]
+                assert deletion["type"] == 1
+                assert {seconds(entity["timestamp"]) for entity in each.content["entities"]} <= {each.time}
+                assert len({entity["id"] for entity in each.content["entities"]}) == len(each.content["entities"])
+    reader = pytest.importorskip("mcap.reader")
+    with (tmp_path / "a.mcap").open("rb") as file:
+        opened = reader.make_reader(file)
+        summary = opened.get_summary()
+        times = [message.log_time for _, _, message in opened.iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+
+
+def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path: Path, shown: ReportScene) -> None:
+    scene, table = shown.scene, shown.tracks["saga"]
+    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown)))
+    topics, _ = read_back(tmp_path / "a.mcap")
+    boxes = topics[f"{ROOT}/saga/boxes"]
+    assert [len(each.content["entities"]) for each in boxes] == np.bincount(table.moment, minlength=len(scene)).tolist()
+    np.testing.assert_allclose([each.time / 1e9 for each in boxes], scene.timestamps - scene.timestamps[0], atol=1e-6)
+    origin, k = scene.world_T_ego[0, :3, 3], len(scene) - 1
+    rows = np.flatnonzero(table.moment == k)
+    entities = boxes[k].content["entities"]
+    assert len(entities) > 5
+    assert [entity["id"] for entity in entities] == table.id[rows].tolist()
+    for entity, row in zip(entities, rows.tolist(), strict=True):
+        assert entity["frame_id"] == "scene-0001"
+        (cube,), (text,) = entity["cubes"], entity["texts"]
+        place, turn = cube["pose"]["position"], cube["pose"]["orientation"]
+        np.testing.assert_allclose(list(place.values()), table.boxes.position[row] - origin, atol=1e-3)
+        np.testing.assert_allclose(list(cube["size"].values()), table.boxes.size[row], atol=1e-3)
+        yaw = 2 * np.arctan2(turn["z"], turn["w"])
+        assert np.cos(yaw - table.boxes.yaw[row]) == pytest.approx(1.0, abs=1e-6)
+        assert {each["key"]: each["value"] for each in entity["metadata"]} == {
+            "id": table.id[row],
+            "class": table.boxes.label[row],
+            "score": f"{table.score[row]:.2f}",
+        }
+        assert text["text"].startswith(f"{table.id[row]} ")
+
+    def layer(name: str, kind: str) -> list[Any]:
+        (entity,) = topics[f"{ROOT}/saga/{name}"][k].content["entities"]
+        primitives: list[Any] = entity[kind]
+        return primitives
+
+    colours = [entity["cubes"][0]["color"] | {"a": 1.0} for entity in entities]
+    assert len({json.dumps(colour) for colour in colours}) == len(colours)
+    velocity = table.boxes.velocity[rows]
+    arrows = layer("velocities", "arrows")
+    lengths = [arrow["shaft_length"] + arrow["head_length"] for arrow in arrows]
+    np.testing.assert_allclose(lengths, np.hypot(*velocity.T), atol=2e-3)
+    assert [arrow["color"] for arrow in arrows] == colours
+    trails = layer("trails", "lines")
+    ends = [list(trail["points"][-1].values()) for trail in trails]
+    np.testing.assert_allclose(ends, table.boxes.position[rows] - origin, atol=1e-3)
+    spread = [sphere["size"]["x"] * sphere["size"]["y"] for sphere in layer("ellipses", "spheres")]
+    determinant = np.linalg.det(table.position_covariance[rows])
+    np.testing.assert_allclose(spread, 4 * 2 * np.log(10) * np.sqrt(determinant), rtol=0.02)
+    assert all(len(line["points"]) == 2 for line in layer("edges", "lines"))
+    assert scene.ground_truth is not None
+    seen, hidden = (topics[f"{ROOT}/truth/{name}"][k].content["entities"] for name in ("seen", "hidden"))
+    truth = scene.ground_truth[k]
+    assert [entity["id"] for entity in seen] == truth.id[truth.visible].tolist()
+    assert [entity["id"] for entity in hidden] == truth.id[~truth.visible].tolist()
+    (transform,) = topics[f"{ROOT}/ego"][k].content["transforms"]
+    assert (transform["parent_frame_id"], transform["child_frame_id"]) == ("scene-0001", "scene-0001/ego")
+    np.testing.assert_allclose(list(transform["translation"].values()), scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
+
+
+def test_scans_are_clouds_in_the_frame_of_their_sensor(tmp_path: Path, shown: ReportScene) -> None:
+    start = float(shown.scene.timestamps[0])
+    scans = TwoScans(np.array([start - 0.1, start + 0.6]))
+    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown, scans)))
+    topics, _ = read_back(tmp_path / "a.mcap")
+    first, second = topics[f"{ROOT}/ego/lidar/points"]
+    assert (first.time, second.time) == (0, 700_000_000)  # of what is earliest
+    assert topics[f"{ROOT}/saga/boxes"][0].time == 100_000_000
+    points = np.frombuffer(base64.b64decode(second.content["data"]), "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(points, [[1, 2, 3], [4, 5, 7]])  # thinned
+    assert second.content["point_stride"] == 12
+    assert [(each["name"], each["offset"], each["type"]) for each in second.content["fields"]] == [
+        ("x", 0, 7),
+        ("y", 4, 7),
+        ("z", 8, 7),
+    ]
+    (pose,) = topics[f"{ROOT}/ego/lidar"][0].content["transforms"]
+    assert pose["child_frame_id"] == first.content["frame_id"] == "scene-0001/ego/lidar"
+    np.testing.assert_allclose(list(pose["translation"].values()), [1, 0, 2])
+    np.testing.assert_allclose(list(pose["rotation"].values()), [0, 0, np.sin(0.25), np.cos(0.25)])
+
+
+def test_the_command_writes_the_file_that_the_suffix_names(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="mcap is not installed (extra [mcap])")
+    slam = tmp_path / "slam"
+    slam.mkdir()
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :2, 3] = 1.0
+    write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
+    (slam / "landmarks.json").write_text('[{"id": 2, "kind": "pole", "x": 3.0, "y": 4.0}]')
+    file = tmp_path / "s.mcap"
+    done = CliRunner().invoke(app, ["view", "slam", str(slam), "--save", str(file)])
+    assert done.exit_code == 0, done.output
+    assert "open it in Foxglove" in done.stdout
+    topics, schemas = read_back(file)
+    for each in (message for messages in topics.values() for message in messages):
+        Draft202012Validator(strict(schemas[each.schema])).validate(each.content)
+    ((entity,),) = (each.content["entities"] for each in topics["/slam/names"])
+    assert [text["text"] for text in entity["texts"]] == ["pole 2"]
+    assert [each.time for each in topics["/slam/pose"]] == [0, 100_000_000]
+
+
+def test_other_suffixes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.bag: expected a file name that ends in \.rrd \(rerun\) or \.mcap"):
+        write_view(tmp_path / "a.bag", "a", [], [])
+    done = CliRunner().invoke(app, ["view", "file", "tracks.csv", "--save", str(tmp_path / "a.bag")])
+    assert done.exit_code == 2
+    assert "expected a file name that ends in .rrd (rerun) or .mcap (Foxglove)" in done.stderr
+
+
+def test_without_mcap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    done = CliRunner().invoke(app, ["view", "file", "tracks.csv", "--save", str(tmp_path / "t.mcap")])
+    assert done.exit_code == 2
+    assert 'pip install "saga-fg[mcap]"' in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_drawing_that_fails_leaves_no_file(tmp_path: Path, shown: ReportScene) -> None:
+    pytest.importorskip("mcap", reason="mcap is not installed (extra [mcap])")
+
+    def broken() -> Any:
+        yield next(draw_scene(SceneView(shown)))
+        raise InputError("scan 7: broken")
+
+    with pytest.raises(InputError, match="scan 7"):
+        write_view(tmp_path / "a.mcap", "a", ["scene-0001"], broken())
+    assert not list(tmp_path.iterdir())
+
+
+def test_several_scenes_are_drawn_in_order_of_time(shown: ReportScene) -> None:
+    times = [each.time for each in in_order(draw_scene(SceneView(shown)), draw_scene(SceneView(shown)))]
+    always = times.count(None)
+    assert times[:always] == [None] * always
+    assert times[always:] == sorted(times[always:])  # type: ignore[type-var]
+    assert Drawing("a", "b", next(draw_scene(SceneView(shown))).shape).path == "a/b"
