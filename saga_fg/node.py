@@ -184,7 +184,7 @@ class NodeType:
 
 def distinct_types(types: Sequence[NodeType]) -> tuple[list[NodeType], IntArray]:
     """The distinct ones of n node types, in order of appearance, and the number (n,) of each among them."""
-    ids = [id(t) for t in types]
-    found = dict.fromkeys(ids)
+    ids = list(map(id, types))
+    found = dict(zip(ids, types, strict=True))
     number = dict(zip(found, range(len(found)), strict=True))
-    return [types[ids.index(one)] for one in found], np.array([number[i] for i in ids], dtype=np.int64)
+    return list(found.values()), np.array(list(map(number.__getitem__, ids)), dtype=np.int64)
