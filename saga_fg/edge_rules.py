@@ -2,14 +2,6 @@ r"""Edge rules: which nodes of the estimated graph interact, through which funct
 
     rate_ij = rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
 
-Neighbours may count by what they have to tell besides (`spread`):
-
-    rate_ij <- rate_ij s_i^2 / ( s_i^2 + s_j^2 + spread^2 )
-
-s^2 the variances of velocities. That is the gain of a Kalman filter that took the velocity of j, off by the spread, for
-a measurement of that of i. Of what is in view detections tell more than neighbours do, who pull a bus that brakes for
-its stop; what is hidden soon has nobody else to go by.
-
 A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the tracker in place of these.
 """
 
@@ -25,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
 from saga_fg.edge_features import EdgeFeatures, features_of
+from saga_fg.edge_news import News
 from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.node import distinct_types
@@ -68,10 +61,8 @@ class Neighbours:
     max_distance: float = setting(20.0, "no edge beyond this distance, m")
     min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
     max_degree: int = setting(4, "edges kept per influenced node, strongest first")
-    spread: float | None = setting(
-        None,
-        "standard deviation of the difference between neighbours' velocities, m/s: an edge is as weak as the source's "
-        "velocity would be as a measurement of the target's; null: however well that is known",
+    news: News | None = settings_group(
+        lambda: None, "edges count by what they have to tell; null: whatever is known of their ends"
     )
     parked: bool = setting(
         False,
@@ -83,8 +74,6 @@ class Neighbours:
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "rate", "max_distance", "min_speed", "max_degree")
         require_positive(self, "distance_scale", "heading_scale", "speed_scale", infinite=True)
-        if self.spread is not None:
-            require_between(self, 0, math.inf, "spread")
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, whatever their ends are and is known of them."""
@@ -106,8 +95,8 @@ class Neighbours:
             able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
         rate = self.strength(features_of(nodes, target, source))
-        if self.spread is not None:
-            rate = rate * news(nodes.velocity_variance[target], nodes.velocity_variance[source], self.spread)
+        if self.news is not None:
+            rate = rate * self.news.shares(nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
 
@@ -123,6 +112,9 @@ class Following:
     gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
     lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
+    news: News | None = settings_group(
+        lambda: None, "edges count by what they have to tell; null: whatever is known of their ends"
+    )
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
     leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
     cones: ConeGeometry | None = settings_group(
@@ -158,17 +150,10 @@ class Following:
         target, source = close_pairs(seen.position, able, self.max_gap)
         features = features_of(seen, target, source)
         rate = self.strength(features)
+        if self.news is not None:
+            rate = rate * self.news.shares(nodes, target, source)
         nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
-
-
-def news(target: FloatArray, source: FloatArray, spread: float) -> FloatArray:
-    """Shares (E,) in [0, 1]: what there is to learn of a target's velocity from the source's, see the module.
-
-    target, source  (E,) variances of their velocities, (m/s)^2;  spread  of the difference between the two, m/s
-    """
-    total = target + source + spread**2
-    return np.where(total > 0, target / np.where(total > 0, total, 1.0), 0.0)
 
 
 def lateral_of_arc(f: EdgeFeatures) -> FloatArray:

@@ -38,7 +38,8 @@ class NodeTable:
     has_moved (n,) whether a node was ever clearly in motion, which tells a parked car from one that waits in a queue;
     None if nobody knows; closed (n,) the weight in [0, 1] with which a stop line is closed, as the belief on its light
     says, None where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
-    or of a lane (its centre); width: by row, of a lane, m
+    or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
+    nobody knows
     """
 
     id: IntArray
@@ -53,6 +54,7 @@ class NodeTable:
     closed: FloatArray | None = None
     outline: Mapping[int, FloatArray] = field(default_factory=dict)
     width: Mapping[int, float] = field(default_factory=dict)
+    unseen: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.id)

@@ -145,6 +145,7 @@ class Roadside:
             weight,
             outline,
             width,
+            None if tracks.unseen is None else np.concatenate([tracks.unseen, np.zeros(m)]),
         )
 
 

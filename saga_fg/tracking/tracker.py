@@ -403,7 +403,7 @@ class Tracker:
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them: the tracks, then the nodes of the roadside."""
         types = self._state.types_of(self._columns.label)
-        tracks = nodes_of(self._columns, self._box, types, self._told())
+        tracks = nodes_of(self._columns, self._box, types, self._told(), self._time)
         return self.roadside.beside(tracks, self._origin, self._state)
 
     def _of_class(self, label: StrArray, *names: str) -> FloatArray:

@@ -49,8 +49,10 @@ def boxes_of(
     return Boxes(columns.label[rows], centre, box.size[rows], box.yaw[rows], velocity)
 
 
-def nodes_of(columns: TrackColumns, box: BoxFilter, types: tuple[NodeType, ...], told: Kinematics) -> NodeTable:
-    """All tracks as edge rules see them, now and not later; the course stands in for a heading that is not known."""
+def nodes_of(
+    columns: TrackColumns, box: BoxFilter, types: tuple[NodeType, ...], told: Kinematics, time: float
+) -> NodeTable:
+    """All tracks as edge rules see them at `time`, s; the course stands in for a heading that is not known."""
     velocity, P = told.velocity, told.P_velocity
     return NodeTable(
         columns.id,
@@ -62,6 +64,7 @@ def nodes_of(columns: TrackColumns, box: BoxFilter, types: tuple[NodeType, ...],
         np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
         (P[:, 0, 0] + P[:, 1, 1]) / 2,
         columns.has_moved.copy(),
+        unseen=np.maximum(time - columns.last_seen, 0.0),
     )
 
 
