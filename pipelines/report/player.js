@@ -1,7 +1,7 @@
 const $ = id => document.getElementById(id);
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, SCORE = 9, XX = 10, XY = 11, YY = 12, COASTING = 13;
 const ELLIPSE_95 = 5.991, TRAIL = 3, COASTS = 150;  // chi-square with 2 degrees of freedom; s; ms
-const LAYERS = {truth: "true objects", detections: "detections", tracks: "tracks", ids: "ids", trails: "trails", ellipses: "ellipses", edges: "edges"};
+const LAYERS = {road: "road", truth: "true objects", detections: "detections", tracks: "tracks", ids: "ids", trails: "trails", ellipses: "ellipses", edges: "edges"};
 
 async function unpack(text) {
   const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -24,6 +24,7 @@ function player(scenes, start) {
     $("method").value = names.includes(before) ? before : names[names.length - 1];
     $("method").hidden = names.length < 2;
     $("time").max = last();
+    $("show-road").parentElement.hidden = !scene.road;
     picked = null;
     show(0);
   }
@@ -77,6 +78,7 @@ function player(scenes, start) {
     if (!scene.times.length) return;
     place();
     const tracks = method().moments[k], thin = 1 / zoom;
+    if (shown.road && scene.road) drawRoad(g, scene.road, k, thin);
     if (shown.truth && scene.truth) for (const row of scene.truth[k]) { box(row, 1); g.fillStyle = row[6] ? "#cfd6dc" : hidden(); g.fill(); }
     drawEgo();
     if (shown.detections) {

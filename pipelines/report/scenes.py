@@ -2,7 +2,7 @@
 
     scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]]}},
-             "truth": [[object, ...]], "detections": [[detection, ...]]}
+             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see `pipelines.report.road`}
     track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
     object     [class, x, y, length, width, yaw, visible]
     detection  [class, x, y, length, width, yaw, score]
@@ -22,6 +22,7 @@ import numpy as np
 
 from data_tools.metrics import TrackTable
 from pipelines.report.edges import edges_of_moments
+from pipelines.report.road import road_data
 from pipelines.tracking import TrackedScene
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
@@ -94,6 +95,7 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
             _whole(np.column_stack([_box_columns(boxes, labels, origin), 1000 * score]))
             for boxes, score in zip(*shown, strict=True)
         ],
+        "road": road_data(scene.frames, shown[0], origin),
     }
 
 

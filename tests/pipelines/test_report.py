@@ -5,16 +5,14 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 import re
-import shutil
-import subprocess
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from page_in_browser import tried_in_browser
 from typer.testing import CliRunner
 
 from data_tools.metrics import TrackTable, label_errors
@@ -185,18 +183,10 @@ def test_a_table_of_tracks_becomes_a_page(tmp_path: Path):
     assert "expected the times of the detections" in wrong.stderr
 
 
-CATCH = """<script>window.faults = [];
-window.addEventListener("error", e => window.faults.push(e.message));
-window.addEventListener("unhandledrejection", e => window.faults.push(String(e.reason)));
-console.error = (...words) => window.faults.push(words.join(" "));</script>"""
-
-TRY = """<script>
-const wait = setInterval(() => {
-  if (document.body.dataset.ready !== "yes") return;
-  clearInterval(wait);
+TRY = """
   const view = document.getElementById("view"), time = document.getElementById("time");
   const pixels = () => view.toDataURL();
-  const found = {faults: window.faults, clock: [], charts: document.querySelectorAll("#charts svg").length};
+  Object.assign(found, {clock: [], charts: document.querySelectorAll("#charts svg").length});
   const before = pixels();
   time.value = 25; time.oninput();
   found.clock.push(document.getElementById("clock").value);
@@ -215,31 +205,11 @@ const wait = setInterval(() => {
   document.getElementById("show-tracks").click();
   document.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowRight", bubbles: true}));
   found.clock.push(document.getElementById("clock").value);
-  const output = document.createElement("pre");
-  output.id = "found"; output.textContent = JSON.stringify(found);
-  document.body.append(output);
-}, 50);
-</script>"""
+"""
 
 
 def test_the_page_works_in_a_browser(runs, tmp_path: Path):
-    chromium = os.environ.get("CHROMIUM") or next(
-        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
-    )
-    if chromium is None:
-        pytest.skip("no Chromium on the path, nor in the variable CHROMIUM")
-    page = page_of(runs, charts=[latency_chart(np.arange(100.0))])
-    page = page.replace("<head>", "<head>" + CATCH).replace("</body>", TRY + "</body>")
-    path = tmp_path / "page.html"
-    path.write_text(page, encoding="utf-8")
-    done = subprocess.run(
-        [chromium, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
-         "--window-size=1300,900", "--virtual-time-budget=10000", "--dump-dom", path.as_uri()],
-        capture_output=True, text=True, check=True, timeout=120,
-    )  # fmt: skip
-    match = re.search(r'<pre id="found">(.*?)</pre>', done.stdout)
-    assert match is not None, done.stdout[-2000:]
-    found = json.loads(html.unescape(match[1]))
+    found = tried_in_browser(page_of(runs, charts=[latency_chart(np.arange(100.0))]), TRY, tmp_path)
     assert found["faults"] == []
     assert found["clock"] == ["2.5 s", "2.6 s"]
     assert found["moved"]

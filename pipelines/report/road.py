@@ -1,0 +1,76 @@
+"""The road of a scene as the page's player wants it: lanes, stop lines and lights that its frames brought along.
+
+    road  {"lanes": [[width, x, y, x, y, ...]], "lines": [[light, x, y, x, y]], "lights": [[x, y]],
+           "colours": [[colour of each light]]}, or null where no frame brought a map
+
+Lengths in cm about the scene's start; lights are counted from 0. A colour is 0 red, 1 amber, 2 green
+(`saga_fg.road.COLOURS`), the one last reported at or before the moment; null before the first report. A report is of
+the light nearest to it, or of none if that is further than `SignalSettings.max_distance` is by default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray
+from saga_fg.boxes import Boxes
+from saga_fg.frame import Frame
+from saga_fg.road import SIGHTINGS, Lane, SignalSettings, StopLine, TrafficLight
+
+Colours = list[list[int | None]]
+
+
+def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: FloatArray) -> dict[str, Any] | None:
+    """The road as the module's docstring says, ready for JSON.
+
+    detections  of each moment, in world coordinates and in order of time
+    origin      (2,) place of the scene's start, m
+    """
+    lanes: dict[str, Lane] = {}
+    lines: dict[str, StopLine] = {}
+    lights: dict[str, TrafficLight] = {}
+    maps = {id(frame.road_map): frame.road_map for frame in frames if frame.road_map is not None}  # most bring the same
+    for known in maps.values():
+        for light in known.lights:  # what is known already stays as it is, for the tracker does so, too
+            lights.setdefault(light.name, light)
+        for line in known.stop_lines:
+            lines.setdefault(line.name, line)
+        for lane in known.lanes:
+            lanes.setdefault(lane.name, lane)
+    if not lanes and not lights:
+        return None
+    number = {name: k for k, name in enumerate(lights)}
+    places = np.array([light.position for light in lights.values()]).reshape(-1, 2)
+    return {
+        "lanes": [[round(100 * lane.width), *_centimetres(lane.centre, origin)] for lane in lanes.values()],
+        "lines": [[number[line.light], *_centimetres(line.ends, origin)] for line in lines.values()],
+        "lights": [_centimetres(place, origin) for place in places],
+        "colours": _colours(places, detections),
+    }
+
+
+def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
+    """Of each moment, the colour last reported of each light; lights (L, 2)."""
+    reach = SignalSettings().max_distance
+    now: list[int | None] = [None] * len(lights)
+    colours = []
+    for boxes in detections:
+        sightings = boxes.select(np.flatnonzero(np.isin(boxes.label, SIGHTINGS)))
+        if len(lights) and len(sightings):
+            now = now.copy()
+            apart = np.linalg.norm(sightings.position[:, None, :2] - lights, axis=2)
+            nearest = apart.argmin(axis=1)
+            for label, light, far in zip(sightings.label, nearest.tolist(), apart.min(axis=1), strict=True):
+                if far < reach:
+                    now[light] = SIGHTINGS.index(str(label))
+        colours.append(now)
+    return colours
+
+
+def _centimetres(points: Any, origin: FloatArray) -> list[int]:
+    """Points (..., 2) one after another."""
+    flat: list[float] = (100 * (np.asarray(points) - origin)).ravel().tolist()
+    return [round(value) for value in flat]
