@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-from threadpoolctl import threadpool_limits
-
+from pipelines.threads import one_thread
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.frame import Frame
 from saga_fg.track import Tracks
@@ -60,8 +59,7 @@ def track_scene(scene: Scene, tracker: OnlineTracker, progress: Progress | None 
     wanted: list[Tracks] = []
     milliseconds: list[float] = []
     done, latest, total = 0, None, len(scene.frames)
-    # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_thread():
         for moment in scene.timestamps.tolist():
             while done < total and scene.frames[done].timestamp <= moment:
                 start = time.perf_counter()

@@ -22,6 +22,14 @@ def _require_positive(settings: object, *names: str) -> None:
             raise InputError(f"{name}: expected {expected}, got {value}")
 
 
+def _require_counts(settings: object, *names: str) -> None:
+    """Raise `InputError` unless the named settings, each the fewest and the most, are growing numbers from 0 on."""
+    for name in names:
+        fewest, most = getattr(settings, name)
+        if not 0 <= fewest <= most:
+            raise InputError(f"{name}: expected two growing numbers >= 0, got {(fewest, most)}")
+
+
 @dataclass(frozen=True)
 class RoadSettings:
     """Shape of the road, in m; traffic keeps to the right."""
@@ -100,6 +108,11 @@ class PedestrianSettings:
     pause_duration: float = setting(4.0, "mean duration of a stop, s")
     jitter: float = setting(0.25, "standard deviation of a person's place around that in the group, m")
 
+    def __post_init__(self) -> None:
+        _require_counts(self, "groups", "group_size")
+        _require_positive(self, "walking_speed", "pause_interval", "pause_duration")
+        require_between(self, 0, math.inf, "jitter")
+
 
 @dataclass(frozen=True)
 class CyclistSettings:
@@ -113,8 +126,7 @@ class CyclistSettings:
     def __post_init__(self) -> None:
         _require_positive(self, "speed", "change_time")
         require_between(self, 0, math.inf, "spread")
-        if not 0 <= self.count[0] <= self.count[1]:
-            raise InputError(f"count: expected two growing numbers >= 0, got {self.count}")
+        _require_counts(self, "count")
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from data_tools.metrics import scene_metrics
 from pipelines.bench.drawn_scenes import DrawnSettings, drawn_config, drawn_scene
-from pipelines.bench.measuring import one_thread
 from pipelines.observers import StageClock
+from pipelines.threads import one_thread
 from pipelines.tracking import Progress
 from saga_fg.track import Tracks
 from saga_fg.tracking import AssociationName

@@ -17,8 +17,8 @@ from typing import Any
 from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscenes_tracking_metrics
 from data_tools.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
-from pipelines.bench.measuring import one_thread
 from pipelines.config import load_config
+from pipelines.threads import one_thread
 from pipelines.tracking import track_dataset
 from saga_fg.errors import InputError
 

@@ -30,9 +30,9 @@ from data_tools.lidar import (
     segment_ground,
     voxel_downsample,
 )
-from pipelines.bench.measuring import one_thread
 from pipelines.config import load_config
 from pipelines.detector_free import cluster_scene
+from pipelines.threads import one_thread
 from pipelines.tracking import Progress, track_scene
 from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.boxes import Boxes

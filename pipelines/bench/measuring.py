@@ -10,22 +10,14 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_info, threadpool_limits
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Linear algebra on one thread: problems of this size only get slower on more."""
-    with threadpool_limits(1):
-        yield
+from threadpoolctl import threadpool_info
 
 
 def timed(run: Callable[[], Any]) -> float:

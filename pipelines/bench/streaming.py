@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.bench.measuring import one_thread, resident_memory
+from pipelines.bench.measuring import resident_memory
+from pipelines.threads import one_thread
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.discretisation import discretise

@@ -61,14 +61,12 @@ def serve(
       saga-fg serve --listen 127.0.0.1:7447 --reorder 0.1
       saga-fg status
     """
-    from threadpoolctl import threadpool_limits
-
     from pipelines.serving import StreamSettings, StreamTracker
+    from pipelines.threads import one_thread
 
     settings = configured("file", config, method, estimator, lag, association, interactions)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), StreamSettings(reorder=reorder))
-    # the filter's matrices are small: threads of the linear algebra library would cost more than they bring
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_thread():
         _serve(stream, listen, allow_remote)
     typer.echo(_summary(stream.status()), err=True)
 

@@ -17,8 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, Protocol
 
-from threadpoolctl import threadpool_limits
-
+from pipelines.threads import one_thread
 from saga_fg.dataset import Dataset
 from saga_fg.errors import SagaError
 
@@ -97,7 +96,7 @@ def perform(job: Job) -> Outcome:
     name, digests, start = job.input.name, dict[str, str](), time.perf_counter()
     here = version("saga-fg")
     try:
-        with threadpool_limits(limits=1), tempfile.TemporaryDirectory() as folder, job.input.opened() as at:
+        with one_thread(), tempfile.TemporaryDirectory() as folder, job.input.opened() as at:
             digests = dict(at.digests)
             if digests == job.known:
                 return Outcome(name, "unchanged", digests, version=here)

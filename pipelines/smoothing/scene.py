@@ -6,13 +6,12 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from threadpoolctl import threadpool_limits
-
 from pipelines.config import Method
 from pipelines.smoothing.assembly import count_labels, label_moments
 from pipelines.smoothing.config import SmoothConfig
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import smooth_objects
+from pipelines.threads import one_thread
 from pipelines.tracking import Progress
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
@@ -45,7 +44,7 @@ def smooth_scene(
 ) -> SmoothedScene:
     """Smooth one recording, with the edges of the tracker's settings unless `method` is another than `saga`."""
     tracking = config.tracking.of_method(method)
-    with threadpool_limits(limits=1, user_api="blas"):  # threads cost more than they bring to small matrices
+    with one_thread():
         start = time.perf_counter()
         evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, tracking.tracker.classes)
         tracker = tracking.new_tracker(method)

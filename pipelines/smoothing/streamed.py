@@ -22,7 +22,6 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from pipelines.config import Method
 from pipelines.smoothing.assembly import LabelledStates, dropped_boxes, label_states, source_counts
@@ -33,6 +32,7 @@ from pipelines.smoothing.lifetimes import Lifetimes
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import SmoothedObjects, smooth_objects
 from pipelines.smoothing.stretches import Backlog, StretchSettings, TrackedFrame
+from pipelines.threads import one_thread
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.dataset import Scene
@@ -131,7 +131,7 @@ class _Run:
         frames, cpu = 0, 0.0
         for part in parts:
             begin = time.perf_counter()
-            with threadpool_limits(limits=1, user_api="blas"):  # as for whole scenes
+            with one_thread():
                 self._coming += part.frames
                 self._backlog.want(part.timestamps)
                 self._track(float(part.timestamps[-1]) + self._early)
@@ -141,7 +141,7 @@ class _Run:
             if progress is not None:
                 progress(self._name, frames, frames)
         begin = time.perf_counter()
-        with threadpool_limits(limits=1, user_api="blas"):
+        with one_thread():
             self._track(np.inf)
             self._smooth(np.inf)
             self._lifetimes.retire(np.empty(0, dtype=np.int64))
