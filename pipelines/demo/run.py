@@ -76,7 +76,7 @@ def _report(comparison: Comparison, config: TrackConfig, first: int, start: int)
     rules = config.tracker.edges
     return Report(
         "saga-fg demo",
-        [f"{count} simulated scenes", *TITLES.values()],
+        [f"{count} simulated scene" + "s" * (count != 1), *TITLES.values()],
         [scene_of_run({m: comparison.runs[m][k] for m in METHODS}, rules, config.sensors) for k in order],
         [FigureTable(TABLE_TITLE, COLUMNS, tuple(table_rows(comparison)))],
         configuration=write_settings(config, comments=False),
