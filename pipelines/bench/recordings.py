@@ -23,8 +23,9 @@ from data_tools.metrics import (
 from data_tools.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
+from pipelines.evaluation.hota import HotaRow, kitti_hota
 from pipelines.evaluation.kitti import CLASSES, kitti_label_errors
-from pipelines.evaluation.nuscenes import nuscenes_label_errors
+from pipelines.evaluation.nuscenes import nuscenes_hota, nuscenes_label_errors
 from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.tracking import TrackedScene
 from saga_fg.dataset import Dataset
@@ -41,10 +42,12 @@ class Score:
 
     figures_of  headline figures of some scenes, by their numbers; a number may occur more than once
     errors      at the labels, scene by scene
+    hota        HOTA of all scenes by class, where a set has it; raises `MissingExtraError` without trackeval
     """
 
     figures_of: Callable[[Sequence[int]], dict[str, float]]
     errors: tuple[LabelErrors, ...]
+    hota: Callable[[], Sequence[HotaRow]] = tuple
 
     @property
     def figures(self) -> dict[str, float]:
@@ -94,7 +97,7 @@ class NuScenesSet:
             nuscenes_label_errors(scene, placed_detections(runs[name].scene))
             for name, scene in zip(scored, scenes, strict=True)
         )
-        return Score(figures_of, tuple(errors))
+        return Score(figures_of, tuple(errors), lambda: nuscenes_hota(scenes, nuscenes_tracking_metrics(scenes)))
 
 
 class KittiSet:
@@ -124,7 +127,11 @@ class KittiSet:
                     figures |= {f"{name} sAMOTA": f.samota, f"{name} MOTA": f.mota, f"{name} IDS": float(f.ids)}
             return figures
 
-        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()))
+        def of_cars() -> Sequence[HotaRow]:
+            f = kitti_tracking_figures(pairs, "car", 0.25)
+            return kitti_hota(pairs, {"car": f.threshold}) if f is not None else ()
+
+        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()), of_cars)
 
 
 class SimulatedSet:

@@ -14,15 +14,19 @@ from dataclasses import dataclass
 from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.coasting import coasting_errors
 from pipelines.bench.drawn_differences import drawn_differences
+from pipelines.bench.learned_folds import learn_by_folds
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
+from pipelines.evaluation.hota import HotaRow
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.frame import Frame
+from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.track import Tracks
 
 SAGA, KF, BASELINE = "saga", "kf", "centerpoint"
+LEARNED = Variant("learned interactions")
 LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE")
 
 
@@ -31,11 +35,14 @@ class TrackingBenchSettings:
     """How much is done.
 
     components  whether to switch components off one by one
+    contenders  whether to track by graph matching and by interactions learned on other scenes of the set, and to judge
+                by HOTA
     draws       sets of scenes drawn for the intervals of figures averaged over recall; 0: no intervals of these
     coasting    whether to measure the coasting error
     """
 
     components: bool = True
+    contenders: bool = False
     draws: int = 200
     coasting: bool = True
     seed: int = 0
@@ -105,7 +112,11 @@ def bench_set(
 ) -> SetResult:
     """Compare on one set."""
     settings = settings or TrackingBenchSettings()
-    compared = variants(base, settings.components)
+    compared = variants(base, settings.components, settings.contenders)
+    learned: dict[str, LearnedInteractions] = {}
+    if settings.contenders:
+        learned = learn_by_folds(recordings.dataset, progress)
+        compared += (LEARNED,)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
     coasting: list[dict[str, ErrorSample]] = []
@@ -114,7 +125,8 @@ def bench_set(
         scene = recordings.dataset.scene(name)
         for done, variant in enumerate(compared):
             clock = clocks[variant.name]
-            timed = _Timed(variant.config(base).new_tracker(variant.method, clock), clock)
+            config = base.with_interactions(learned[name]) if variant is LEARNED else variant.config(base)
+            timed = _Timed(config.new_tracker(variant.method, clock), clock)
             runs[variant.name][name] = track_scene(scene, timed)
             seconds[variant.name] += timed.seconds
             if progress is not None:
@@ -128,10 +140,16 @@ def bench_set(
         per_frame = 1000 / max(sum(run.frames for run in tracked.values()), 1)
         stages = {stage: per_frame * spent for stage, spent in clocks[variant.name].seconds.items()}
         spent = per_frame * seconds[variant.name]
-        results[variant.name] = VariantResult(variant, score, score.figures, spent, stages)
+        judged = {f"HOTA {row.label}": row.figures.hota for row in _in_space(score)} if settings.contenders else {}
+        results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages)
     differences = graph_differences(results[SAGA].score, results[KF].score, coasting, settings)
     carried = {name: ErrorSample.pool(scene[name] for scene in coasting) for name in (SAGA, KF)} if coasting else {}
     return SetResult(recordings.name, scenes, results, differences, carried)
+
+
+def _in_space(score: Score) -> list[HotaRow]:
+    """HOTA of cars by their overlap in space."""
+    return [row for row in score.hota() if row.label == "car" and row.overlap == "3D"]
 
 
 def graph_differences(

@@ -36,6 +36,7 @@ def _without(kind: type) -> Callable[[tuple[EdgeRule, ...]], tuple[EdgeRule, ...
 
 
 METHODS = (Variant("saga"), Variant("kf", "kf"), Variant("centerpoint", "centerpoint"))
+GRAPH_MATCHING = Variant("graph matching", changes={"tracker.association.method": "graph"})
 COMPONENTS = (
     Variant("without following", changes={"tracker.edges": _without(Following)}),
     Variant("without neighbours", changes={"tracker.edges": _without(Neighbours)}),
@@ -50,7 +51,7 @@ COMPONENTS = (
     Variant("matching without existence", changes={"tracker.association.existence_weight": 0.0}),
     Variant("matching without scores", changes={"tracker.association.score_weight": 0.0}),
     Variant("greedy matching", changes={"tracker.association.method": "greedy"}),
-    Variant("graph matching", changes={"tracker.association.method": "graph"}),
+    GRAPH_MATCHING,
     Variant("tracks that never leave unseen", changes={"tracker.existence.lifetime": math.inf}),
     Variant("scores without steadiness", changes={"tracker.existence.steadiness_weight": 0.0}),
     Variant("coasting tracks scored in full", changes={"tracker.existence.coasting_score": 1.0}),
@@ -79,7 +80,7 @@ def _next(old: Any, rest: str, value: Any) -> Any:
     return value(old) if callable(value) else value
 
 
-def variants(base: TrackConfig, components: bool = True) -> tuple[Variant, ...]:
-    """The methods and, if wanted, each component that the configuration has switched on."""
-    on = tuple(variant for variant in COMPONENTS if variant.config(base) != base) if components else ()
-    return METHODS + on
+def variants(base: TrackConfig, components: bool = True, matching: bool = False) -> tuple[Variant, ...]:
+    """The methods and, if wanted, each component that the configuration has switched on, or graph matching alone."""
+    chosen = COMPONENTS if components else (GRAPH_MATCHING,) if matching else ()
+    return METHODS + tuple(variant for variant in chosen if variant.config(base) != base)

@@ -25,6 +25,13 @@ def tracking(
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
     components: Annotated[bool, typer.Option(help="Switch the components off one by one as well.")] = True,
+    contenders: Annotated[
+        bool,
+        typer.Option(
+            help="Graph matching, and interactions learned on other recordings of the set, as well, and HOTA of cars "
+            "(needs the extra [eval])."
+        ),
+    ] = False,
     coasting: Annotated[bool, typer.Option(help="Measure the coasting error as well.")] = True,
     draws: Annotated[int, typer.Option("--draws", min=0, help="Drawn sets of scenes for intervals; 0: none.")] = 200,
     config: Config = None,
@@ -43,6 +50,7 @@ def tracking(
       saga-fg bench tracking --sets simulated --scenes 4 --draws 0
       saga-fg bench tracking --data data --json figures.json --markdown tables.md
       saga-fg bench tracking --data data --sets kitti --no-components --no-coasting
+      saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components --no-coasting
     """
     from data_tools.atomic_files import check_writable, write_text
     from pipelines.bench.recordings import SETS, recording_set
@@ -56,7 +64,7 @@ def tracking(
             check_writable(path)
     everything = (*SETS, "simulated") if data is not None else ("simulated",)
     chosen = [recording_set(name, data, scenes) for name in (names("--sets", sets) if sets else everything)]
-    settings = TrackingBenchSettings(components, draws, coasting)
+    settings = TrackingBenchSettings(components, contenders, draws, coasting)
     results = []
     with progress_bar(unit="variants") as progress:
         for recordings in chosen:

@@ -85,9 +85,14 @@ def evaluate_nuscenes(
             nuscenes_label_errors(each.tracking, placed_detections(each.scene) if each.scene.frames else None)
             for each in scored.values()
         ),
-        hota([_in_range(each.tracking) for each in scored.values()], _best_thresholds(tracking)) if with_hota else (),
+        nuscenes_hota([each.tracking for each in scored.values()], tracking) if with_hota else (),
         innovations or {},
     )
+
+
+def nuscenes_hota(scenes: Sequence[NuScenesTrackingScene], tracking: NuScenesTrackingMetrics) -> list[HotaRow]:
+    """HOTA, at the scores of the best MOTA. Raises `MissingExtraError` without trackeval."""
+    return hota([_in_range(scene) for scene in scenes], _best_thresholds(tracking))
 
 
 def nuscenes_label_errors(scene: NuScenesTrackingScene, detections: PlacedBoxes | None = None) -> LabelErrors:

@@ -12,14 +12,17 @@ from typer.testing import CliRunner
 
 from data_tools.metrics import ErrorSample, Interval, LabelErrors
 from data_tools.simulator import SimulatorSettings, simulate_scene
+from pipelines.bench import learned_folds
 from pipelines.bench.coasting import HIDDEN, NEVER_GIVEN_UP, coasting_errors, kept_alive
-from pipelines.bench.recordings import Score, SimulatedSet
+from pipelines.bench.recordings import NuScenesSet, Score, SimulatedSet
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
 from pipelines.bench.variants import COMPONENTS, METHODS, changed, variants
 from pipelines.cli.main import app
 from pipelines.config import Family, load_config
+from pipelines.tracking import track_scene
 from saga_fg import InputError
 from saga_fg.edge_rules import Following
+from saga_fg.learned_interactions import LearnedInteractions
 
 FAMILIES: tuple[Family, ...] = ("nuscenes", "kitti", "simulated", "file")
 SHORT = replace(SimulatorSettings(), duration=6.0, warm_up=5.0)
@@ -99,6 +102,43 @@ def test_a_set_is_tracked_by_every_variant() -> None:
     assert not result.variants["centerpoint"].stages
     assert len(result.errors("saga")) == len(result.errors("kf"))
     assert "velocity RMSE" in result.differences
+
+
+def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is learned here is that nobody interacts: then saga is kf."""
+
+    def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
+        return LearnedInteractions(learned_from=" ".join(recordings))
+
+    monkeypatch.setattr(learned_folds, "learn_interactions", learn)
+    recordings = SimulatedSet(3, settings=replace(SHORT, duration=1.0))
+    first, second, third = recordings.dataset.scenes
+    learned = learned_folds.learn_by_folds(recordings.dataset)
+    assert {name: found.learned_from for name, found in learned.items()} == {
+        first: second,
+        second: f"{first} {third}",
+        third: second,
+    }
+    settings = TrackingBenchSettings(components=False, contenders=True, draws=0, coasting=False)
+    result = bench_set(recordings, load_config("simulated"), settings)
+    assert list(result.variants) == ["saga", "kf", "centerpoint", "graph matching", "learned interactions"]
+    assert result.variants["learned interactions"].figures == pytest.approx(result.variants["kf"].figures, nan_ok=True)
+    with pytest.raises(InputError, match="scenes to learn from beside it"):
+        learned_folds.learn_by_folds(SimulatedSet(1, settings=SHORT).dataset)
+
+
+def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:
+    pytest.importorskip("trackeval")
+    root = tmp_path / "nuscenes"
+    (tmp_path / "short.yaml").write_text("duration: 3.0\nwarm_up: 5.0\n")
+    saga_fg("simulate", "-o", root, "--scenes", "1", "--config", tmp_path / "short.yaml")
+    (root / "v1.0-mini" / "splits.json").write_text(json.dumps({"one": ["scene-0001"]}))
+    recordings = NuScenesSet("one", root, {"lidar": root / "detections" / "lidar.json"}, "one")
+    config = load_config("nuscenes")
+    runs = {name: track_scene(recordings.dataset.scene(name), config.new_tracker("kf")) for name in ("scene-0001",)}
+    rows = recordings.score(runs).hota()
+    assert {(row.label, row.overlap) for row in rows} >= {("car", "2D"), ("car", "3D")}
+    assert all(0 <= row.figures.hota <= 1 for row in rows)
 
 
 def saga_fg(*arguments: str | Path) -> str:
