@@ -28,9 +28,9 @@ from saga_fg.learning.rule_parameters import Rule, RuleParameters
 
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s
-PRIOR = 2e-3  # weight of a unit of squared difference from the template, against the mean over the gaps
+PRIOR = 2e-2  # weight of a unit of squared difference from the template, against the mean over the gaps
 FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
-MOST_GAPS = 800  # that are learned from, drawn at random; more add nothing but time
+MOST_GAPS = 500  # that are learned from, drawn at random; more add nothing but time
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
 _SPEED = Following(
@@ -114,7 +114,7 @@ def fit_interactions(
     position_noise: float,
     acceleration_noise: Mapping[str, float],
     template: Sequence[Rule] = TEMPLATE,
-    iterations: int = 20,
+    iterations: int = 15,
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 

@@ -7,7 +7,7 @@ maximum over any set of recordings (all but those that are tested on) costs noth
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ class OwnMotionLikelihood:
     def __init__(self, trajectories: Trajectories, classes: tuple[str, ...], settings: GapSettings) -> None:
         self.loss = {c: np.zeros((len(ACCELERATION_NOISE), len(POSITION_NOISE))) for c in classes}
         self.count = dict.fromkeys(classes, 0)
+        settings = replace(settings, neighbours=1)  # nobody asks where they are
         for i, q in enumerate(ACCELERATION_NOISE):
             for j, r in enumerate(POSITION_NOISE):
                 filtered = filter_independently(trajectories, np.full(len(trajectories.label), q), r)
