@@ -15,7 +15,7 @@ The motion of the world never depends on which sensor speaks, so a new sensor is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -121,6 +121,12 @@ class Sensor:
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
     )
+    class_accuracy: float = setting(
+        0.9, "chance that the class of a detection is the true one, else one of its group (tracker.class_groups)"
+    )
+    confusion: Mapping[str, Mapping[str, float]] = settings_group(
+        dict, "by true class, how often objects are taken for each class, in place of class_accuracy"
+    )
     colour_accuracy: float = setting(0.9, "chance that the colour reported of a traffic light is the true one")
     clutter_area: float | None = setting(
         None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
@@ -134,6 +140,11 @@ class Sensor:
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1, "detection_probability", "colour_accuracy")
+        if not 0 < self.class_accuracy < 1:
+            raise InputError(f"class_accuracy: expected a chance inside 0 to 1, got {self.class_accuracy!r}")
+        for label, taken_for in self.confusion.items():
+            if not all(0 <= share < math.inf for share in taken_for.values()) or sum(taken_for.values()) == 0:
+                raise InputError(f"confusion.{label}: expected shares >= 0, some above, got {dict(taken_for)!r}")
         for label, chance in self.class_detection.items():
             if not 0 <= chance <= 1:
                 raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")
@@ -166,6 +177,16 @@ class Sensor:
         occurring, index = distinct(label)
         chance = [self.class_detection.get(c, self.detection_probability) for c in occurring]
         return np.array(chance, dtype=np.float64)[index]
+
+    def confusion_among(self, group: Sequence[str]) -> FloatArray:
+        """A (k, k): the chance that an object of each class of a group (rows) is taken for each (columns)."""
+        k = len(group)
+        A = np.full((k, k), (1 - self.class_accuracy) / max(k - 1, 1))
+        np.fill_diagonal(A, self.class_accuracy)
+        for row, label in enumerate(group):
+            if label in self.confusion:
+                A[row] = [max(self.confusion[label].get(other, 0.0), LEAST_PROBABILITY) for other in group]
+        return np.asarray(A / A.sum(axis=1, keepdims=True))
 
     def deviations(self, label: StrArray, *names: str) -> FloatArray:
         """(k, N) the noise parameters of these names, of the class of each label (N,)."""

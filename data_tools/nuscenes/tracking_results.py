@@ -42,8 +42,9 @@ def write_tracking_results(
 
     `scenes` may be a generator: it is consumed while the file is written, and the file appears when all is done.
     Only the seven tracking classes are written, per sample the 500 boxes of highest score; an unknown velocity becomes
-    zero. Track ids become "scene-id" and so are unique over scenes. Raises `InputError` for a path that is not
-    writable, tracks that do not fit the scene, a size or heading that is unknown, a track that changes its class.
+    zero. Track ids become "scene-id" and so are unique over scenes; of a track that changes its class, what is not of
+    the first class is "scene-id-class". Raises `InputError` for a path that is not writable, tracks that do not fit the
+    scene, a size or heading that is unknown.
     """
     _write(path, (sample for scene, moments in scenes for sample in _samples(str(path), scene, moments)), meta)
 
@@ -85,9 +86,10 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
     best = np.argsort(-tracks.score[rows], kind="stable")[:MAX_BOXES]
     chosen = tracks.select(rows[np.sort(best)])
     boxes = chosen.boxes
+    names = []
     for id_, label in zip(chosen.id.tolist(), boxes.label.tolist(), strict=True):
-        if class_of.setdefault(id_, label) != label:
-            raise InputError(f"sample {token}: track {id_}: expected one class, got {class_of[id_]} and {label}")
+        first = class_of.setdefault(id_, label) == label
+        names.append(f"{scene}-{id_}" if first else f"{scene}-{id_}-{label}")
     unmeasured = ~np.isfinite(boxes.size).all(axis=1) | ~np.isfinite(boxes.yaw)
     if unmeasured.any():
         id_ = int(chosen.id[np.argmax(unmeasured)])
@@ -97,7 +99,7 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
         boxes.size[:, [1, 0, 2]].round(6).tolist(),
         yaw_quaternion(boxes.yaw).round(12).tolist(),
         np.nan_to_num(boxes.velocity).round(6).tolist(),
-        chosen.id.tolist(),
+        names,
         boxes.label.tolist(),
         chosen.score.tolist(),
         upper_triangle(chosen.position_covariance).round(6).tolist(),
@@ -110,12 +112,12 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
             "size": size,
             "rotation": rotation,
             "velocity": velocity,
-            "tracking_id": f"{scene}-{id_}",
+            "tracking_id": name,
             "tracking_name": label,
             "tracking_score": score,
             "position_covariance": covariance,
         }
-        for translation, size, rotation, velocity, id_, label, score, covariance in columns
+        for translation, size, rotation, velocity, name, label, score, covariance in columns
     ]
 
 

@@ -2,7 +2,8 @@
 
 Noise is Gaussian along the line of sight and across it, with standard deviations base + slope * range, and
 independent from frame to frame. A radar adds the range rate: the velocity over ground along the line of sight, of what
-is not there around 0, as of a return from the roadside. The logit of a score is, for a true detection,
+is not there around 0, as of a return from the roadside. Classes are mistaken from frame to frame, too. The logit of a
+score is, for a true detection,
 
     true_logit + 2 (visible share - 1) - range / 40 m + noise,          for a false one    clutter_logit + noise.
 """
@@ -16,7 +17,7 @@ import numpy as np
 from data_tools.simulator.fleet import KINDS
 from data_tools.simulator.pedestrians import BODY
 from data_tools.simulator.settings import SensorSettings
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.frame import Detections
 from saga_fg.geometry import transform_points, wrap_angle, yaw_of
@@ -67,7 +68,7 @@ def observe(
         velocity = boxes.velocity[seen] + sensor.velocity_noise * rng.standard_normal((n, 2))
     logit = sensor.true_logit + 2 * (share[seen] - 1) - r / 40 + sensor.logit_noise * rng.standard_normal(n)
     true = Boxes(
-        boxes.label[seen],
+        _told_classes(sensor, boxes.label[seen], rng),
         position,
         boxes.size[seen] * np.exp(sensor.size_noise * rng.standard_normal((n, 3))),
         boxes.yaw[seen] + sensor.yaw_noise * rng.standard_normal(n),
@@ -85,6 +86,18 @@ def observe(
         rates = np.concatenate([rate, np.zeros(len(false))])
         rates = rates + sensor.range_rate_noise * rng.standard_normal(len(rates))
     return Detections(reported, 1 / (1 + np.exp(-logits)), rates).select(order)
+
+
+def _told_classes(sensor: SensorSettings, label: StrArray, rng: np.random.Generator) -> StrArray:
+    """The classes (n,) that are reported of objects of classes `label` (n,): vehicles are mistaken for one another."""
+    if sensor.class_accuracy == 1:
+        return label
+    kinds = np.array(sorted({kind.label for kind in KINDS}))
+    k = np.searchsorted(kinds, label)
+    known = kinds[np.minimum(k, len(kinds) - 1)] == label
+    wrong = known & (rng.random(len(label)) > sensor.class_accuracy)
+    other = kinds[(k + rng.integers(1, len(kinds), len(label))) % len(kinds)]
+    return np.where(wrong, other, label)
 
 
 def _clutter(sensor: SensorSettings, world_T_ego: FloatArray, rng: np.random.Generator) -> tuple[Boxes, FloatArray]:

@@ -200,6 +200,7 @@ class SensorSettings:
         None, "standard deviation of the range rate over ground, m/s; null: no range rate"
     )
     boxes: bool = setting(True, "whether it measures sizes and headings")
+    class_accuracy: float = setting(1.0, "chance that it tells cars, trucks and buses rightly, else for another")
     colour_accuracy: float | None = setting(
         None, "chance that it tells the colour of a traffic light rightly; null: it sees no colours"
     )
@@ -219,6 +220,7 @@ class SensorSettings:
             raise InputError(f"field_of_view: expected an angle in (0, 2 pi] rad, got {self.field_of_view}")
         if self.colour_accuracy is not None:
             require_between(self, 0, 1, "colour_accuracy")
+        require_between(self, 0, 1, "class_accuracy")
         if not 0 <= self.detection_probability <= 1:
             raise InputError(f"detection_probability: expected a share in [0, 1], got {self.detection_probability}")
         if not self.hidden_share < self.clear_share:

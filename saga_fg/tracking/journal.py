@@ -19,6 +19,7 @@ import numpy as np
 from saga_fg.arrays import FloatArray
 from saga_fg.association import gate, mahalanobis
 from saga_fg.by_class import class_settings
+from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.edge_effects import EdgeEffect, edge_effects
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.observer import Stage, TrackerView
@@ -82,11 +83,12 @@ class Journal:
     def _candidates(
         self, row: int, place: FloatArray, observed: Observed, taken: dict[int, int], chosen: int | None
     ) -> list[Event]:
-        """The detections of the class that come into question for a track, the nearest first."""
+        """The detections of the class, or its group, that come into question for a track, the nearest first."""
         assert self._predicted is not None
         label = str(self._predicted.columns.label[row])
         settings = class_settings(self._settings.classes, ClassSettings, label)
-        rows = np.flatnonzero(observed.boxes.label == label)
+        akin = ClassGroups(self._settings.class_groups).akin
+        rows = np.flatnonzero([akin(label, other) for other in observed.boxes.label.tolist()])
         measured = observed.boxes.position[rows, :2]
         d2, _ = mahalanobis(place[None], self._predicted.P[row][None], measured, observed.R[rows, :2, :2])
         apart, limit = np.hypot(*(measured - place).T), gate(settings.gate)

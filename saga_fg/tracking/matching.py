@@ -23,6 +23,7 @@ Generalized Intersection over Union, CVPR 2019.
 from __future__ import annotations
 
 import math
+from operator import eq
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from saga_fg.by_class import class_values
 from saga_fg.overlap import paired_giou_3d
 from saga_fg.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.quadratic_matching import QuadraticMatching
+from saga_fg.tracking.class_belief import ClassEvidence
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 
@@ -63,6 +65,7 @@ def associate(
     settings: TrackerSettings,
     clutter_area: float,
     cross: CrossCovariances | None = None,
+    said: ClassEvidence | None = None,
 ) -> Matching:
     """The pairs of a frame.
 
@@ -71,8 +74,9 @@ def associate(
     expected   (n,) chance that the track is detected: its existence times that of an object to be detected
     clutter_area  of the module, m^2, of the sensor that speaks
     cross      covariances of the positions of tracks with each other, which the method `graph` needs
+    said       of classes, where some are mistaken for each other
     """
-    found = candidates(predicted, P, expected, observed, settings, clutter_area)
+    found = candidates(predicted, P, expected, observed, settings, clutter_area, said)
     if settings.association.method == "graph" and cross is not None:
         pairs = pair_costs(found.track, found.detection, found.innovation, found.S, cross)
         pairs = pairs._replace(cost=settings.association.pair_weight * pairs.cost)
@@ -90,10 +94,12 @@ def candidates(
     observed: Observed,
     settings: TrackerSettings,
     clutter_area: float,
+    said: ClassEvidence | None = None,
 ) -> Candidates:
-    """The pairs of one class that are inside its gate; the arguments are those of `associate`."""
+    """The pairs of one class, or group, that are inside its gate; the arguments are those of `associate`."""
     (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(observed.boxes.label)
-    same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
+    akin = eq if said is None else said.groups.akin
+    same = np.array([akin(c, s) for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
     shares, reach, overlap_weight = class_values(
         settings.classes, ClassSettings, predicted.label, "gate", "max_distance", "overlap_weight"
     )
@@ -103,8 +109,9 @@ def candidates(
     innovation, S = np.stack([x[near], y[near]], axis=-1), P[t] + observed.R[d, :2, :2]
     d2, log_det = mahalanobis_of_pairs(innovation, S)
     gates = {share: gate(share) for share in set(shares.tolist())}
-    inside = (d2 < np.array([gates[share] for share in shares.tolist()])[t]).nonzero()[0]
-    found = Candidates(t, d, innovation, S, d2, d2 + log_det).select(inside)
+    of_class = 0.0 if said is None else said.costs(t, d)
+    inside = (d2 + of_class < np.array([gates[share] for share in shares.tolist()])[t]).nonzero()[0]
+    found = Candidates(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
     return found._replace(
         gain=found.gain
         - _overlap(found, predicted, observed.boxes, overlap_weight)

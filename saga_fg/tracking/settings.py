@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from saga_fg.by_class import DEFAULT
+from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
@@ -152,6 +152,11 @@ class TrackerSettings:
     edges: tuple[Following | Neighbours | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = settings_group(
         lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
     )
+    class_groups: tuple[tuple[str, ...], ...] = setting(
+        (),
+        "groups of classes that detectors mistake for each other: tracks believe in all of a group, and a detection of "
+        "one may be of a track of another; []: a track has the class it was born with",
+    )
     explained_noise: float = setting(
         0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
     )
@@ -187,7 +192,19 @@ class TrackerSettings:
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))
+        self._require_groups_that_move_alike()
         require_stable(self.edges, self.max_step)
+
+    def _require_groups_that_move_alike(self) -> None:
+        grouped = [label for group in self.class_groups for label in group]
+        if len(set(grouped)) < len(grouped) or not all(len(group) > 1 for group in self.class_groups):
+            raise InputError(f"class_groups: expected groups of two classes and more, none in two, got {grouped}")
+        for group in self.class_groups:
+            kinds = {type(class_settings(self.classes, ClassSettings, label).motion).__name__ for label in group}
+            if len(kinds) > 1:
+                raise InputError(
+                    f"class_groups: expected one kind of motion in {', '.join(group)}, got {sorted(kinds)}"
+                )
 
 
 @dataclass(frozen=True)

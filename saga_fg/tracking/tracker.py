@@ -10,7 +10,7 @@ import copy
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
 from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
+from saga_fg.tracking.class_belief import ClassEvidence, ClassGroups
 from saga_fg.tracking.columns import TrackColumns
 from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
@@ -52,7 +53,7 @@ class Snapshot:
     """A tracker at one moment, see `Tracker.snapshot`."""
 
     state: Any
-    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow, Roadside, Standing]
+    own: tuple[TrackColumns, BoxFilter, SensorEvidence, TrafficFlow, Roadside, Standing, FloatArray]
     numbers: tuple[float, FloatArray, int, int]
     graph: SceneGraph | None
     assignment: Assignment
@@ -97,6 +98,8 @@ class Tracker:
         self._box = BoxFilter.empty()
         self.roadside = Roadside(self.settings.signals)
         self._standing = Standing.empty()
+        self._groups = ClassGroups(self.settings.class_groups)
+        self._belief = np.empty((0, len(self._groups)))  # of the tracks, which class
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far."""
@@ -121,14 +124,16 @@ class Tracker:
         self.roadside.heed(frame, sensor, self._origin, self._state, delay)
         observed = observe(frame, sensor, self.settings.classes)
         self._tell("observe", frame, observed)
-        matching = self._associate(observed, sensor, delay)
+        said = self._groups.likelihood(observed.boxes.label, sensor)
+        matching = self._associate(observed, sensor, delay, said)
         self._tell("associate", frame, observed, matching)
+        self._classify(matching, said)
         self._update(observed, matching, delay)
         self._tell("update", frame, observed, matching)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
         self._tell("believe", frame, observed, matching)
         self._watch_traffic(matching)
-        born = self._bear(observed, matching, frame.sensor, delay)
+        born = self._bear(observed, matching, frame.sensor, delay, said)
         self._tell("births", frame, observed, matching, born)
         rows = np.concatenate([matching.detection, born])
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self._columns.id) - len(born) :]])
@@ -164,7 +169,8 @@ class Tracker:
 
     def snapshot(self) -> Snapshot:
         """All that the tracker knows; what it does later leaves it as it is."""
-        own = copy.deepcopy((self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing))
+        told = (self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing, self._belief)
+        own = copy.deepcopy(told)
         numbers = (self._time, self._origin, self._next_id, self.late_frames)
         return Snapshot(self._state.snapshot(), own, numbers, self.graph, self.assignment)
 
@@ -172,7 +178,7 @@ class Tracker:
         """Go on from where a tracker of the same settings was; as often as wanted from one snapshot."""
         self._state.restore(snapshot.state)
         own = copy.deepcopy(snapshot.own)
-        self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing = own
+        self._columns, self._box, self._evidence, self._flow, self.roadside, self._standing, self._belief = own
         self._time, self._origin, self._next_id, self.late_frames = snapshot.numbers
         self.graph, self.assignment = snapshot.graph, snapshot.assignment
 
@@ -216,8 +222,8 @@ class Tracker:
         self._standing.predict(dt, self._kinematics(), settings)
         return np.concatenate([self._standing.noise_scale(settings), np.ones(len(self.roadside))])
 
-    def _associate(self, observed: Observed, sensor: Sensor, delay: float) -> Matching:
-        """Register what was observed to the prediction, as of `delay` s ago."""
+    def _associate(self, observed: Observed, sensor: Sensor, delay: float, said: FloatArray) -> Matching:
+        """Register what was observed to the prediction, as of `delay` s ago; said (m, C) of classes."""
         columns = self._columns
         if len(columns.id) == 0 or len(observed) == 0:
             return Matching.empty()
@@ -225,7 +231,8 @@ class Tracker:
         predicted = self._boxes(position, np.full_like(position, np.nan))
         expected = columns.existence * sensor.detection_chance(columns.label)
         area = self.settings.association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
-        return associate(predicted, P, expected, observed, self.settings, area, cross)
+        evidence = ClassEvidence(self._groups, self._belief, said) if len(self._groups) else None
+        return associate(predicted, P, expected, observed, self.settings, area, cross, evidence)
 
     def _predicted_positions(self, delay: float) -> tuple[FloatArray, FloatArray, CrossCovariances | None]:
         """Of all tracks `delay` s ago; with the covariances between them where they are needed."""
@@ -234,6 +241,13 @@ class Tracker:
         if self.settings.association.method != "graph":
             return position, P, None
         return position, P, self._state.cross_covariances_before(ids, label, delay)
+
+    def _classify(self, matching: Matching, said: FloatArray) -> None:
+        """What detections say (m, C) of the classes of their tracks."""
+        if len(self._groups):
+            t = matching.track
+            self._belief[t] = self._groups.updated(self._belief[t], said[matching.detection])
+            self._columns.label = self._groups.labels(self._belief, self._columns.label)
 
     def _update(self, observed: Observed, matching: Matching, delay: float) -> None:
         columns, boxes = self._columns, observed.boxes
@@ -313,7 +327,7 @@ class Tracker:
         passages = passages_of(self._columns, self._box, matching.track, now, stands, self._origin, self._time)
         self._flow.pass_by(passages)
 
-    def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float) -> IntArray:
+    def _bear(self, observed: Observed, matching: Matching, sensor: str, delay: float, said: FloatArray) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
 
         Those of `delay` s ago have moved on since.
@@ -337,6 +351,7 @@ class Tracker:
             TrackColumns.born(ids, boxes.label, p, told, seen, self._time, confirmed, accepted)
         )
         self._evidence.born(sensor, p, seen)
+        self._belief = np.concatenate([self._belief, self._groups.updated(0 * said[born], said[born])])
         self._standing = self._standing.extended(Standing.born(kinematics, stands))
         self._box = self._box.extended(
             BoxFilter.born(
@@ -358,13 +373,14 @@ class Tracker:
         if dead.any():
             self._state.remove(columns.id[dead])
             self._columns, self._box = columns.select(~dead), self._box.select(~dead)
-            self._standing = self._standing.select(~dead)
+            self._standing, self._belief = self._standing.select(~dead), self._belief[~dead]
             self._evidence.select(~dead)
 
     def _report(self, timestamp: float) -> Tracks:
-        return reported_tracks(
-            timestamp, self._columns, self._box, self._told(), self._origin, self._time, self.settings
-        )
+        columns = self._columns
+        if len(self._groups):
+            columns = replace(columns, score=columns.score * self._groups.certainty(self._belief))
+        return reported_tracks(timestamp, columns, self._box, self._told(), self._origin, self._time, self.settings)
 
     # views on the state
 

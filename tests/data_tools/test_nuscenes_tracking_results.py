@@ -122,11 +122,17 @@ def test_the_best_500_boxes_are_kept(tmp_path: Path) -> None:
     assert kept.score.min() == 100 / 600
 
 
+def test_a_track_of_the_format_keeps_its_class(tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    write_tracking_results(path, [(scene(), [tracks(), tracks(labels=["bus"])])], META)
+    samples = read_tracking_results(path).samples
+    assert (samples["a"].id.tolist(), samples["b"].id.tolist()) == (["scene-1-7"], ["scene-1-7-bus"])
+
+
 @pytest.mark.parametrize(
     ("moments", "message"),
     [
         ([tracks()], "expected tracks for 2 samples, got 1"),
-        ([tracks(), tracks(labels=["bus"])], "sample b: track 7: expected one class, got car and bus"),
         ([tracks(size=(np.nan, 2, 1)), tracks()], "sample a: track 7: expected a known size and heading"),
         ([tracks(yaw=np.nan), tracks()], "sample a: track 7: expected a known size and heading"),
     ],

@@ -1,0 +1,108 @@
+r"""Of which class an object is: a discrete belief of its track over the classes that detectors mistake for each other.
+
+    L_j(c)    = A_s(z_j | c)                              what detection j of the class z_j says
+    cost_ij  += -2 log sum_c b_i(c) L_j(c)                in matching, within the group
+    b_i(c)   <- b_i(c) L_j(c) / sum                       when it is the track's
+
+A_s(z | c) is the chance that sensor s calls an object of class c a z. False detections are reckoned with by class, so
+that this is the ratio of likelihoods of `saga_fg.tracking.matching` again. A track's class is the likeliest, the one it
+had if there are several; its score counts by the belief in that class. Beliefs stay where they can be changed: a
+detector that errs in one frame errs in the next as well. Between groups, and outside of all, nothing is matched, and
+nothing believed but the class at birth.
+
+Source: Bar-Shalom, Kirubarajan, Gokberk, Tracking with Classification-Aided Multiframe Data Association, IEEE
+Transactions on Aerospace and Electronic Systems 41(3), 2005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
+from saga_fg.sensor import Sensor
+
+LEAST_BELIEF = 1e-3  # in each class of the group
+
+
+class ClassGroups:
+    """C classes in groups of those that are mistaken for each other; beliefs and likelihoods are (..., C), 0 outside
+    of the group."""
+
+    def __init__(self, groups: Sequence[Sequence[str]]) -> None:
+        self._groups = tuple(tuple(group) for group in groups)
+        self.classes = tuple(label for group in self._groups for label in group)
+        number = np.repeat(np.arange(len(self._groups)), [len(group) for group in self._groups])
+        self._mates = (number[:, None] == number).astype(np.float64)
+        self._column = {label: k for k, label in enumerate(self.classes)}
+
+    def __len__(self) -> int:
+        return len(self.classes)
+
+    def akin(self, one: str, other: str) -> bool:
+        """Whether the classes are one, or of one group."""
+        if one == other:
+            return True
+        a, b = self._column.get(one), self._column.get(other)
+        return a is not None and b is not None and bool(self._mates[a, b])
+
+    def likelihood(self, label: StrArray, sensor: Sensor) -> FloatArray:
+        """L (m, C) of detections of the classes `label` (m,) by a sensor."""
+        if not self.classes:
+            return np.empty((len(label), 0))
+        row, of_group = self._rows(label)
+        return np.asarray(self._confusion(sensor)[row] * of_group[:, None])
+
+    def updated(self, belief: FloatArray, likelihood: FloatArray) -> FloatArray:
+        """Beliefs (k, C) after what one detection each says (k, C); the first one's own word where all are 0."""
+        if not self.classes:
+            return belief
+        of_group = likelihood > 0
+        before = np.where(belief.sum(axis=1, keepdims=True) > 0, belief, of_group)
+        after = before * likelihood
+        after = after / np.maximum(after.sum(axis=1, keepdims=True), 1e-300)
+        after = np.where(of_group, np.maximum(after, LEAST_BELIEF), 0.0)
+        return np.asarray(after / np.maximum(after.sum(axis=1, keepdims=True), 1e-300))
+
+    def labels(self, belief: FloatArray, label: StrArray) -> StrArray:
+        """The classes (n,) believed in (n, C), of tracks that had the classes `label` (n,)."""
+        row, of_group = self._rows(label)
+        had = np.where(of_group, belief[np.arange(len(label)), row], np.inf)
+        best = belief.argmax(axis=1)
+        likelier = belief.max(axis=1, initial=0.0) > had + 1e-9
+        return np.where(likelier, np.array(self.classes)[best], label)
+
+    def certainty(self, belief: FloatArray) -> FloatArray:
+        """(n,) the belief (n, C) in the class that is told; 1 outside of all groups."""
+        most = belief.max(axis=1, initial=0.0)
+        return np.where(most > 0, most, 1.0)
+
+    def _rows(self, label: StrArray) -> tuple[IntArray, BoolArray]:
+        """Of labels (n,): their columns (n,), 0 for those outside of all groups, and which are inside of one (n,)."""
+        occurring, index = distinct(label)
+        column = np.array([self._column.get(c, -1) for c in occurring], dtype=np.int64)[index]
+        return np.maximum(column, 0), column >= 0
+
+    def _confusion(self, sensor: Sensor) -> FloatArray:
+        """A (C, C): by reported class, the chance of it for each true class of its group, 0 for others."""
+        A = np.zeros((len(self), len(self)))
+        for group in self._groups:
+            rows = [self._column[label] for label in group]
+            A[np.ix_(rows, rows)] = sensor.confusion_among(group).T
+        return A
+
+
+@dataclass(frozen=True, eq=False)
+class ClassEvidence:
+    """Of a frame: belief (n, C) of the tracks, likelihood (m, C) of the detections."""
+
+    groups: ClassGroups
+    belief: FloatArray
+    likelihood: FloatArray
+
+    def costs(self, track: IntArray, detection: IntArray) -> FloatArray:
+        """(K,) what the classes of pairs cost, see the module."""
+        chance = (self.belief[track] * self.likelihood[detection]).sum(axis=1)
+        return np.asarray(-2 * np.log(np.where(chance > 0, chance, 1.0)))
