@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -103,7 +104,8 @@ def fusion(
         scenes.append(scene)
         if progress is not None:
             progress("tracking", len(scenes), len(seeds))
-    amota = {name: _amota(of_name)(range(len(scenes)))["AMOTA"] for name, of_name in compared.items()}
+    figures = {name: _amota(of_name) for name, of_name in compared.items()}
+    amota = {name: figures_of(range(len(scenes)))["AMOTA"] for name, figures_of in figures.items()}
     better = max(singles, key=lambda name: amota[name])
     others = {name: sensor_model(config.sensors, name) for name in singles if name != better}
     kept: dict[str, list[BoolArray]] = {BOTH: [], better: []}
@@ -117,10 +119,10 @@ def fusion(
     return FusionResult(
         amota=amota,
         better=better,
-        gain=_gain(compared[BOTH], compared[better]),
+        gain=_gain(figures[BOTH], figures[better], len(scenes)),
         survival={name: float(found.mean()) if len(found) else float("nan") for name, found in followed.items()},
         followed=len(followed[BOTH]),
-        poor_loss=_gain(compared[WITH_POOR], compared[BOTH]),
+        poor_loss=_gain(figures[WITH_POOR], figures[BOTH], len(scenes)),
         seeds=tuple(seeds),
     )
 
@@ -191,9 +193,15 @@ def _joined(scene: Scene, other: Scene) -> Scene:
 
 
 def _amota(scenes: Sequence[NuScenesTrackingScene]) -> FiguresOf:
-    return lambda rows: {"AMOTA": nuscenes_tracking_metrics([scenes[row] for row in rows]).overall.amota}
+    """Of drawn scenes; what was drawn before is not scored again."""
+
+    @cache
+    def of_rows(rows: tuple[int, ...]) -> Mapping[str, float]:
+        return {"AMOTA": nuscenes_tracking_metrics([scenes[row] for row in rows]).overall.amota}
+
+    return lambda rows: of_rows(tuple(rows))
 
 
-def _gain(a: Sequence[NuScenesTrackingScene], b: Sequence[NuScenesTrackingScene]) -> Interval:
+def _gain(a: FiguresOf, b: FiguresOf, scenes: int) -> Interval:
     """AMOTA of `a` less that of `b`."""
-    return drawn_differences(_amota(a), _amota(b), len(a), DRAWS)["AMOTA"]
+    return drawn_differences(a, b, scenes, DRAWS)["AMOTA"]
