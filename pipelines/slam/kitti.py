@@ -39,6 +39,7 @@ from saga_fg.geometry import transform_points
 from saga_fg.landmarks import Landmark
 
 POLE_HEIGHT = 3.0  # m above the first pose, to which poles are drawn
+_GAP = 2.0  # m between sightings of a wall, beyond which two pieces of it are drawn
 _EDGE_COLOUR = (148, 103, 189)
 _COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
 
@@ -78,7 +79,7 @@ def write_lidar_slam(
         _write_covariances(folder / "covariances.csv", result)
         write_ply(folder / "map.ply", points)
         _write_landmarks(folder, result)
-        paths = {"GPS/IMU": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
+        paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
         if objects is not None:
             write_text(folder / "tracks.csv", tracks_csv(objects))
         driven = () if objects is None else tuple(tracks(objects).values())
@@ -148,21 +149,30 @@ def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
 
 
 def _pieces(result: LidarSlam, kind: str) -> FloatArray:
-    """Ends (W, 2, 2), from above, of the seen piece of each wall or lane edge: the outermost feet of its sightings."""
+    """Ends (W, 2, 2), from above, of the pieces of walls or lane edges that were seen, one or several of each."""
     ends = []
     for mark in result.landmarks:
         if mark.kind.name != kind:
             continue
         place = mark.kind.coordinates(mark.state)
-        foot = np.array([place["x"], place["y"]])
         normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
         along = np.array([-normal[1], normal[0]])
-        centres = [
-            transform_points(result.world_T_lidar[seen.pose], extent)[:, :2]
-            for seen, extent in zip(result.sightings, result.extents, strict=True)
-            if seen.landmark == mark.number
-        ]
-        u = np.concatenate(centres) @ along
-        foot = (foot @ normal) * normal
-        ends.append(np.stack([foot + u.min() * along, foot + u.max() * along]))
+        foot = (np.array([place["x"], place["y"]]) @ normal) * normal
+        spans = []
+        for seen, extent in zip(result.sightings, result.extents, strict=True):
+            if seen.landmark == mark.number:
+                u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
+                spans.append((float(u.min()), float(u.max())))
+        ends += [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]
     return np.array(ends).reshape(-1, 2, 2)
+
+
+def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """What spans cover together, gaps up to `_GAP` filled: houses on both sides of a street may lie in one plane."""
+    covered: list[tuple[float, float]] = []
+    for low, high in sorted(spans):
+        if covered and low <= covered[-1][1] + _GAP:
+            covered[-1] = (covered[-1][0], max(high, covered[-1][1]))
+        else:
+            covered.append((low, high))
+    return covered

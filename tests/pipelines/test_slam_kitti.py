@@ -15,7 +15,7 @@ from data_tools.simulator.scan_drive import SimulatedScans
 from data_tools.simulator.street import KERB, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
-from pipelines.slam.kitti import write_lidar_slam
+from pipelines.slam.kitti import covered_spans, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
 from pipelines.slam.sightings import EDGE, POLE
@@ -130,6 +130,11 @@ def test_the_command_on_real_scans(recordings: Path, tmp_path: Path, odometry: s
     assert "8 scans" in outcome.stdout
     assert "trajectory against GPS/IMU: ATE" in outcome.stdout
     assert (tmp_path / "run" / "map.ply").is_file()
+
+
+def test_a_wall_is_drawn_where_it_was_seen() -> None:
+    """On both sides of a street, not across it; what was seen piece by piece is one."""
+    assert covered_spans([(8.0, 12.0), (-9.0, -6.0), (13.0, 14.0), (9.0, 10.0)]) == [(-9.0, -6.0), (8.0, 14.0)]
 
 
 def test_settings_out_of_range_are_refused() -> None:
