@@ -26,6 +26,7 @@ from saga_fg.learning import (
     fit_sensor,
     fit_trail_noise,
     follow,
+    learn_confusion,
     sample_with_truth,
 )
 from saga_fg.node import ConstantVelocity
@@ -71,12 +72,14 @@ def _reported(dataset: Dataset, names: Sequence[str], suffix: str, progress: Pro
 
 def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
     samples: dict[str, list[DetectionSample]] = {}
-    kept = list(scenes)
+    kept, groups = list(scenes), config.tracker.class_groups
     for scene in kept:
-        for name, sample in sample_with_truth(scene, config.sensors).items():
+        for name, sample in sample_with_truth(scene, config.sensors, groups=groups).items():
             samples.setdefault(name, []).append(sample)
     pooled = {name: DetectionSample.pool(parts) for name, parts in samples.items()}
     learned = {name: fit_sensor(sample, sensor_model(config.sensors, name), GATE) for name, sample in pooled.items()}
+    for name, tables in (learn_confusion(kept, config.sensors, groups) if groups else {}).items():
+        learned[name] = replace(learned[name], confusion={**learned[name].confusion, **tables})
     config = replace(config, sensors={**config.sensors, **learned})
     objects: dict[str, list[Sightings]] = {}
     for scene in kept:

@@ -1,6 +1,7 @@
 """What can be learned from recordings: noise, scores and detection probability of sensors, process noise of motion,
 and interactions."""
 
+from saga_fg.learning.class_confusion import learn_confusion
 from saga_fg.learning.detection_sample import DetectionSample
 from saga_fg.learning.gap_prediction import gap_errors, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments, sample_gaps
@@ -47,6 +48,7 @@ __all__ = [
     "follow",
     "gap_errors",
     "gap_moments",
+    "learn_confusion",
     "match_to_truth",
     "negative_log_likelihood",
     "predict_gaps",

@@ -6,7 +6,7 @@ visible.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from saga_fg.frame import Detections, Frame
 from saga_fg.geometry import wrap_angle
 from saga_fg.learning.detection_sample import DetectionSample
 from saga_fg.sensor import Sensor, sensor_model
+from saga_fg.tracking.class_belief import ClassGroups
 
 GATE = 4.0  # m; poor sensors err by metres, and wrong matches are taken account of
 
@@ -38,13 +39,17 @@ class MatchedFrame:
     truth: IntArray
 
 
-def match_to_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE) -> Iterator[MatchedFrame]:
+def match_to_truth(
+    scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE, groups: Sequence[Sequence[str]] = ()
+) -> Iterator[MatchedFrame]:
     """The frames between the first and the last annotated moment, matched class by class within `gate`, m.
 
+    Of classes in one of the `groups`, which are mistaken for each other, also across classes within half of it.
     Raises `InputError` for a scene without ground truth.
     """
     if scene.ground_truth is None:
         raise InputError(f"scene {scene.name}: expected ground truth")
+    mates = ClassGroups(groups)
     for frame in scene.frames:
         sensor = sensor_model(sensors, frame.sensor)
         time = frame.timestamp + sensor.time_offset
@@ -55,16 +60,19 @@ def match_to_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GA
         detections = sensor.in_world(frame)
         boxes, truth = detections.boxes, annotations.boxes
         distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - truth.position[None, :, :2], -1, 0))
-        possible = (boxes.label[:, None] == truth.label[None]) & (distance < gate)
+        reach = np.where(boxes.label[:, None] == truth.label, gate, gate / 2 * mates.akin(boxes.label, truth.label))
+        possible = distance < reach
         yield MatchedFrame(
             frame, detections, sensor.origin(frame), annotations, *assign(distance, possible, unmatched=gate)
         )
 
 
-def sample_with_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE) -> dict[str, DetectionSample]:
+def sample_with_truth(
+    scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE, groups: Sequence[Sequence[str]] = ()
+) -> dict[str, DetectionSample]:
     """What a recording with annotations shows of each of its sensors. Raises `InputError` without annotations."""
     parts: dict[str, list[DetectionSample]] = {}
-    for matched in match_to_truth(scene, sensors, gate):
+    for matched in match_to_truth(scene, sensors, gate, groups):
         sensor = sensor_model(sensors, matched.frame.sensor)
         parts.setdefault(matched.frame.sensor, []).append(_sample(matched, sensor))
     return {name: DetectionSample.pool(part) for name, part in parts.items()}

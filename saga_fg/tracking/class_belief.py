@@ -41,12 +41,13 @@ class ClassGroups:
     def __len__(self) -> int:
         return len(self.classes)
 
-    def akin(self, one: str, other: str) -> bool:
-        """Whether the classes are one, or of one group."""
-        if one == other:
-            return True
-        a, b = self._column.get(one), self._column.get(other)
-        return a is not None and b is not None and bool(self._mates[a, b])
+    def akin(self, labels: StrArray, others: StrArray) -> BoolArray:
+        """Which classes (n,) are one with others (m,), or of one group with them: (n, m)."""
+        (row, inside), (column, there) = self._rows(labels), self._rows(others)
+        if not self.classes:
+            return np.asarray(labels[:, None] == others)
+        mates = (self._mates[row[:, None], column] > 0) & inside[:, None] & there
+        return np.asarray(mates | (labels[:, None] == others))
 
     def likelihood(self, label: StrArray, sensor: Sensor) -> FloatArray:
         """L (m, C) of detections of the classes `label` (m,) by a sensor."""

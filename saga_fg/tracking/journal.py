@@ -87,8 +87,8 @@ class Journal:
         assert self._predicted is not None
         label = str(self._predicted.columns.label[row])
         settings = class_settings(self._settings.classes, ClassSettings, label)
-        akin = ClassGroups(self._settings.class_groups).akin
-        rows = np.flatnonzero([akin(label, other) for other in observed.boxes.label.tolist()])
+        groups = ClassGroups(self._settings.class_groups)
+        rows = np.flatnonzero(groups.akin(np.array([label]), observed.boxes.label)[0])
         measured = observed.boxes.position[rows, :2]
         d2, _ = mahalanobis(place[None], self._predicted.P[row][None], measured, observed.R[rows, :2, :2])
         apart, limit = np.hypot(*(measured - place).T), gate(settings.gate)

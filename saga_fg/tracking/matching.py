@@ -23,7 +23,6 @@ Generalized Intersection over Union, CVPR 2019.
 from __future__ import annotations
 
 import math
-from operator import eq
 from typing import NamedTuple
 
 import numpy as np
@@ -98,8 +97,9 @@ def candidates(
 ) -> Candidates:
     """The pairs of one class, or group, that are inside its gate; the arguments are those of `associate`."""
     (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(observed.boxes.label)
-    akin = eq if said is None else said.groups.akin
-    same = np.array([akin(c, s) for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
+    same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
+    if said is not None:
+        same = said.groups.akin(np.array(classes), np.array(seen))
     shares, reach, overlap_weight = class_values(
         settings.classes, ClassSettings, predicted.label, "gate", "max_distance", "overlap_weight"
     )

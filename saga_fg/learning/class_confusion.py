@@ -1,0 +1,45 @@
+r"""How often a sensor takes objects of each class for one of another, from detections beside the truth.
+
+    A(z | c) = ( n_cz + 1 ) / ( n_c + k )
+
+n_cz of the n_c detections of objects of class c were reported as z, among the k classes of its group: the mean of the
+posterior after a uniform prior.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+from saga_fg.dataset import Scene
+from saga_fg.learning.truth_matches import match_to_truth
+from saga_fg.sensor import Sensor
+
+FEWEST = 20  # detections of a class that tell what it is taken for
+
+
+def learn_confusion(
+    scenes: Iterable[Scene], sensors: Mapping[str, Sensor], groups: Sequence[Sequence[str]]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Sensor -> true class -> reported class -> share, of the classes in `groups` that were detected often enough.
+
+    Raises `InputError` for a scene without ground truth.
+    """
+    seen: dict[str, Counter[tuple[str, str]]] = {}
+    for scene in scenes:
+        for matched in match_to_truth(scene, sensors, groups=groups):
+            true = matched.annotations.boxes.label[matched.truth].tolist()
+            reported = matched.detections.boxes.label[matched.detection].tolist()
+            seen.setdefault(matched.frame.sensor, Counter()).update(zip(true, reported, strict=True))
+    return {name: _tables(counts, groups) for name, counts in seen.items()}
+
+
+def _tables(counts: Counter[tuple[str, str]], groups: Sequence[Sequence[str]]) -> dict[str, dict[str, float]]:
+    tables = {}
+    for group in groups:
+        for label in group:
+            total = sum(counts[label, other] for other in group)
+            if total >= FEWEST:
+                shares = {other: (counts[label, other] + 1) / (total + len(group)) for other in group}
+                tables[label] = {other: round(share, 4) for other, share in shares.items()}
+    return tables

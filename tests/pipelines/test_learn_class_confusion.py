@@ -1,0 +1,30 @@
+"""What a sensor takes the classes of a group for, learned from simulated traffic."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from pipelines.bench.variants import changed
+from pipelines.config import load_config
+from pipelines.learning.noise import learn_noise
+
+VEHICLES = ("bus", "car", "truck")
+
+
+def test_confusion_is_found_by_sensor():
+    simulator = SimulatorSettings(duration=5.0)
+    right = {"lidar": 1.0, "camera": 0.7}
+    sensors = {name: replace(simulator.sensors[name], class_accuracy=share) for name, share in right.items()}
+    dataset = SimulatedTraffic(replace(simulator, sensors=sensors), scenes=1, seed=702)
+    start = load_config("simulated")
+    learned = learn_noise(dataset, dataset.scenes, changed(start, "tracker.class_groups", (VEHICLES,)), True)
+    for name, share in right.items():
+        table = learned.config.sensors[name].confusion["car"]
+        assert table["car"] == pytest.approx(share, abs=0.06)
+        assert table["bus"] == pytest.approx((1 - share) / 2, abs=0.05)
+        assert np.sum(list(table.values())) == pytest.approx(1.0, abs=1e-3)
+    apart = learn_noise(dataset, dataset.scenes, start, True)
+    assert not apart.config.sensors["camera"].confusion
+    assert learned.config.sensors["camera"].detection_probability > apart.config.sensors["camera"].detection_probability
