@@ -8,7 +8,7 @@ from following_pairs import RATE, following_pairs
 from typer.testing import CliRunner
 
 from pipelines.bench import coasting_trajectories
-from pipelines.bench.coasting_trajectories import CoastingErrors, coasting_figures
+from pipelines.bench.coasting_trajectories import CoastingErrors, CoastingSettings, coasting_figures
 from pipelines.cli.main import app
 from saga_fg.edge_rules import Following
 from saga_fg.errors import InputError
@@ -82,6 +82,21 @@ def test_a_recording_is_judged_by_what_the_others_taught(monkeypatch):
     kf, ours = at.errors["kf"], at.errors["learned"]
     assert len(kf) > 20
     assert ours.mean() < 0.9 * kf.mean()
+
+
+def test_networks_are_judged_beside_the_rest_where_they_are_asked_for(monkeypatch):
+    def nothing(sample, position_noise, acceleration_noise):
+        return FittedInteractions((), acceleration_noise, 0.0, 0.0)
+
+    for fit in ("fit_interactions", "fit_networks"):
+        monkeypatch.setattr(coasting_trajectories, fit, nothing)
+    recordings = {str(seed): following_pairs(pairs=1, moments=50, seed=seed) for seed in range(2)}
+    settings = CoastingSettings(network=True, tested_folds=1)
+    errors, learned = coasting_trajectories.coasting_errors(recordings, ("car",), (), settings)
+    assert list(errors.errors) == ["kf", "hand-crafted", "learned", "network"]
+    assert {method: len(found) for method, found in learned.items()} == {"learned": 1, "network": 1}
+    assert set(errors.recording.tolist()) == {0}
+    np.testing.assert_allclose(errors.errors["network"], errors.errors["kf"], atol=1e-6)
 
 
 def test_recordings_in_which_nobody_is_followed_are_named():
