@@ -22,6 +22,7 @@ from pipelines.threads import one_thread
 from saga_fg.smoothing import Labels
 
 ROADS, APART = 400, 1000.0  # side by side, m apart: platoons do not meet
+VELOCITY_NOISE = 1.0  # standard deviation of a measured velocity, m/s
 PART = 30.0  # s that are read at a time, after which memory is looked at
 
 
@@ -89,14 +90,19 @@ def _peak() -> float:
 
 
 def write_traffic(path: Path, settings: StreamingBenchSettings) -> None:
-    """A table of what is seen of the traffic, cars of one size."""
+    """A table of what is seen of the traffic: cars of one size that head where they drive, velocities measured."""
+    rng = np.random.default_rng(settings.seed)
     with path.open("w", encoding="utf-8") as file:
-        file.write("timestamp,label,x,y,z,length,width,height,yaw,score\n")
+        file.write("timestamp,label,x,y,z,length,width,height,yaw,vx,vy,score\n")
         for k, instant in enumerate(traffic(settings, round(settings.seconds * settings.rate)), start=1):
             seen = instant.measurements
             road = APART * (np.asarray(seen.nodes) // PLATOON % ROADS)
-            for x, y in (seen.z + np.column_stack([np.zeros(len(road)), road])).tolist():
-                file.write(f"{k / settings.rate:.6f},car,{x:.4f},{y:.4f},0.8,4.5,1.8,1.6,0,0.9\n")
+            velocity = instant.truth[np.searchsorted(instant.transition.nodes, seen.nodes), 2:]
+            yaw = np.arctan2(velocity[:, 1], velocity[:, 0])
+            measured = velocity + VELOCITY_NOISE * rng.normal(size=velocity.shape)
+            for x, y, *moves in np.column_stack([seen.z[:, 0], seen.z[:, 1] + road, yaw, measured]).tolist():
+                moves_text = ",".join(f"{value:.4f}" for value in moves)
+                file.write(f"{k / settings.rate:.6f},car,{x:.4f},{y:.4f},0.8,4.5,1.8,1.6,{moves_text},0.9\n")
 
 
 def _against_batch(folder: Path, settings: StreamingBenchSettings) -> tuple[float, int, int]:

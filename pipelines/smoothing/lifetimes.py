@@ -46,7 +46,12 @@ class _Weighed:
         return float(weighted_medians(np.zeros(len(self.value), dtype=np.int64), 1, self.value, self.weight)[0])
 
 
-@dataclass
+def _unmeasured() -> tuple[_Weighed, ...]:
+    """Length, width and height, of which nothing is known."""
+    return _Weighed(), _Weighed(), _Weighed()
+
+
+@dataclass(slots=True)
 class _Life:
     """Of one object, so far: sums of the score and of the front along its direction; lengths, widths and heights."""
 
@@ -57,7 +62,7 @@ class _Life:
     votes: float = 0.0
     yaw: float = np.nan  # the last that was given out
     sign: float = 1.0  # -1 where the directions given out are half a turn off those of the object's start
-    sizes: tuple[_Weighed, ...] = field(default_factory=lambda: (_Weighed(), _Weighed(), _Weighed()))
+    sizes: tuple[_Weighed, ...] = field(default_factory=_unmeasured)
 
     def measure(self, size: FloatArray, weight: FloatArray) -> None:
         """Sizes (m, 3), m, with weights (m,)."""
@@ -115,7 +120,7 @@ class Lifetimes:
         for id_ in self._lives.keys() - set(present.tolist()):
             life = self._lives.pop(id_)
             size = life.median_size()
-            life.sizes = (_Weighed(), _Weighed(), _Weighed())
+            life.sizes = ()
             self._over[id_] = (size, life)
 
     def lasting(self, id_: int, prior_looks: float) -> Lasting:
@@ -128,6 +133,7 @@ class Lifetimes:
     def _life(self, id_: int) -> _Life:
         if id_ in self._over and id_ not in self._lives:  # it comes again
             size, life = self._over.pop(id_)
+            life.sizes = _unmeasured()
             if np.isfinite(size).all():
                 life.measure(size[None], np.array([float(max(life.seen, 1))]))
             self._lives[id_] = life

@@ -23,7 +23,7 @@ class StretchSettings:
     """How a long recording is cut."""
 
     length: float = setting(30.0, "of a stretch, s")
-    margin: float = setting(10.0, "that is smoothed with it at either end, s")
+    margin: float = setting(7.0, "that is smoothed with it at either end, s")
     detections: int = setting(60_000, "a stretch that has so many is long enough")
     shortest: float = setting(5.0, "and is cut then, though not shorter than this, s")
 

@@ -21,7 +21,7 @@ from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.random_walk import ScalarReadings, previous_rows, scalar_readings, smooth_walks
 from saga_fg.smoothing.states import Lives, StateTable
 
-TELLING_PATH = 2.0  # m
+TELLING_PATH = 10.0  # m
 CLEAR = 3.0  # standard deviations by which a motion is no estimation error
 COURSE_NOISE = 0.1  # standard deviation between heading and direction of motion, rad
 
