@@ -172,18 +172,18 @@ def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
         lifetimes.seen(7, np.array([probability]), np.array([[size, 2.0, np.nan]]), np.array([probability]))
         lifetimes.seen(7, np.array([probability]), np.array([[size, 2.0, 1.5]]), np.array([probability]))
         lifetimes.looked(7, looks)
-    lifetimes.given_out(7, lifetimes.turned(7, 0.1), yaw=0.1, path=-1.0, votes=3.0)
+    lifetimes.given_out(7, lifetimes.turned(7, 0.1), yaw=0.1, path=-3.0, votes=3.0)
     assert lifetimes.turned(7, 0.2) == 1
     turned = lifetimes.turned(7, 0.1 - np.pi)  # the next stretch sees it the other way round
     assert turned == -1
-    lifetimes.given_out(7, turned, yaw=0.1 - np.pi, path=4.0, votes=1.0)
+    lifetimes.given_out(7, turned, yaw=0.1 - np.pi, path=12.0, votes=1.0)
     lifetimes.retire(np.array([7]))
     lifetimes.retire(np.array([], dtype=np.int64))
     size, score, backwards = lifetimes.lasting(7, prior_looks=2.0)
     assert 4.0 < size[0] < 4.2  # the far guess of 9 m does not count for more than its weight
     assert size[1:] == pytest.approx([2.0, 1.5])
     assert score == pytest.approx(3.0 / 12)
-    assert backwards  # 5 m against the direction of its start
+    assert backwards  # 15 m against the direction of its start
 
 
 def test_many_values_are_kept_by_their_weights() -> None:
