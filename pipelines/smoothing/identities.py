@@ -26,6 +26,8 @@ class Identities:
     ) -> dict[int, int]:
         """The name of each of some objects (n,), ascending, in a stretch [begin, end), s, that may be infinite.
 
+        No two have the same: one whose names are all taken has that of another which needs its own no more.
+
         object_of, track_of (N,): of its detections in order of time, -1 for none; times (N,), s
         """
         begin, end = span
@@ -37,8 +39,8 @@ class Identities:
         for id_ in ids.tolist():
             tracks = self._in_order(pairs[pairs[:, 0] == id_, 1].tolist(), first, begin)
             known = [self._owner[track][0] for track in tracks if track in self._owner]
-            name = next((name for name in known if name not in names.values()), id_)
-            names[id_] = name if name not in names.values() else id_
+            taken = set(names.values())
+            names[id_] = next(name for name in (*known, id_, *ids.tolist()) if name not in taken)
             for k, track in enumerate(tracks):
                 if k == 0 or first[track] < end:
                     self.joined += track != names[id_] and track not in self._owner

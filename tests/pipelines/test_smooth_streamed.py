@@ -166,6 +166,14 @@ def test_an_object_keeps_its_name_from_stretch_to_stretch() -> None:
     assert names == {2: 2}
 
 
+def test_objects_that_were_one_have_names_of_their_own_when_they_part() -> None:
+    identities, track_of, times = Identities(), np.array([9, 2]), np.array([0.0, 9.0])
+    together = identities.name(np.array([9]), np.array([9, 9]), track_of, times, (0.0, 10.0))
+    assert together == {9: 9}
+    apart = identities.name(np.array([2, 9]), track_of, track_of, times, (10.0, 20.0))
+    assert apart == {2: 9, 9: 2}
+
+
 def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
     lifetimes = Lifetimes()
     for size, probability, looks in ((4.0, 0.5, 3), (4.2, 0.9, 2), (9.0, 0.1, 5)):

@@ -65,6 +65,8 @@ def test_classes_keep_to_themselves():
 def test_without_an_area_all_that_is_inside_the_gate_is_matched():
     assert pairs(boxes([0.0]), boxes([3.5]), probability=0.01, expected=0.01) == [(0, 0)]
     assert pairs(boxes([0.0]), boxes([9.0])) == []
+    beside = {"default": ClassSettings(max_distance=20.0, overlap_weight=20.0)}
+    assert pairs(boxes([0.0]), boxes([0.0], y=3.5), classes=beside) == [(0, 0)]  # however little the boxes overlap
 
 
 def test_a_track_that_nobody_believes_in_takes_no_detection_from_afar():
