@@ -112,9 +112,9 @@ def candidates(
     of_class = 0.0 if said is None else said.costs(t, d)
     inside = (d2 + of_class < np.array([gates[share] for share in shares.tolist()])[t]).nonzero()[0]
     found = Candidates(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
-    cost = found.gain - _overlap(found, predicted, observed.boxes, overlap_weight)
-    unmatched = _unmatched(found, cost, expected, observed.probability, of_detection, settings.association, clutter_area)
-    return found._replace(gain=cost - unmatched)
+    found = found._replace(gain=found.gain - _overlap(found, predicted, observed.boxes, overlap_weight))
+    unmatched = _unmatched(found, expected, observed.probability, of_detection, settings.association, clutter_area)
+    return found._replace(gain=found.gain - unmatched)
 
 
 def _overlap(found: Candidates, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:
@@ -126,7 +126,6 @@ def _overlap(found: Candidates, predicted: Boxes, detected: Boxes, weight: Float
 
 def _unmatched(
     found: Candidates,
-    cost: FloatArray,
     expected: FloatArray,
     probability: FloatArray,
     of_detection: IntArray,
@@ -135,11 +134,11 @@ def _unmatched(
 ) -> FloatArray:
     """(K,) of the module; where clutter is spread over an infinite area, so much that as many as can be are matched.
 
-    cost (K,): of the pairs; of_detection (m,): the number of each detection's class
+    found.gain (K,): what the pairs cost; of_detection (m,): the number of each detection's class
     """
     if clutter_area == math.inf:
-        dearest = cost.max(initial=0.0)
-        return np.full(len(cost), dearest + 1 + len(cost) * (dearest - cost.min(initial=dearest)))
+        dearest = found.gain.max(initial=0.0)
+        return np.full(len(found.gain), dearest + 1 + len(found.gain) * (dearest - found.gain.min(initial=dearest)))
     false = np.maximum(np.bincount(of_detection, weights=1 - probability), LEAST_CLUTTER)
     of_track = settings.existence_weight * _log_odds(expected)
     by_score = settings.score_weight * _log_odds(probability)
