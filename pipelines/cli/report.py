@@ -113,7 +113,10 @@ def file(
 def _write(output: Path, make: Callable[[], Report]) -> None:
     from data_tools.atomic_files import check_writable, write_text
     from pipelines.report import report_page
+    from saga_fg.errors import InputError
 
+    if output.suffix not in (".html", ".htm"):
+        raise InputError(f"{output}: expected a file name that ends in .html")
     check_writable(output)
     with working("making the page"):
         page = report_page(make())

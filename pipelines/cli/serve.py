@@ -104,8 +104,14 @@ def status(
     """
     from pipelines.serving import StreamClient, parse_address
 
-    with StreamClient(parse_address(address), timeout=10.0) as client:
-        answer = client.ask({"type": "status"})
+    where = parse_address(address)
+    with StreamClient(where, timeout=10.0) as client:
+        try:
+            answer = client.ask({"type": "status"})
+        except OSError as error:
+            raise InputError(f"{where}: expected the status of `saga-fg serve`: {error}") from error
+    if answer.get("type") != "status":
+        raise InputError(f"{where}: expected the status of `saga-fg serve`, got {str(answer)[:80]}")
     typer.echo(json.dumps(answer) if as_json else _summary(answer))
 
 

@@ -59,7 +59,10 @@ def g2o(
     loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
     with working("optimising"):
-        optimised = optimise_poses(graph, loss)
+        try:
+            optimised = optimise_poses(graph, loss)
+        except InputError as error:  # of a graph that is whole and still has no optimum, as one in pieces
+            raise InputError(f"{file}: {error}") from error
     guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:

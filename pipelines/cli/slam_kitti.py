@@ -92,9 +92,10 @@ def kitti(
     typer.echo(f"{output}: {', '.join(counts)}")
     for name in ("odometry", "online", *(["without_objects"] if objects else []), "trajectory"):
         e, what = figures[name], name.replace("_", " ")
-        typer.echo(
-            f"{what} against GPS/IMU: ATE {e['ate']:.3f} m, RPE {e['relative_translation']:.3f} m and "
-            f"{57.29578 * e['relative_rotation']:.3f} deg per {e['relative_distance']:g} m, end {e['end_error']:.3f} m"
-        )
+        relative = f"no RPE on a path shorter than {e['relative_distance']:g} m"
+        if e["pieces"]:
+            turn = 57.29578 * e["relative_rotation"]
+            relative = f"RPE {e['relative_translation']:.3f} m and {turn:.3f} deg per {e['relative_distance']:g} m"
+        typer.echo(f"{what} against GPS/IMU: ATE {e['ate']:.3f} m, {relative}, end {e['end_error']:.3f} m")
     if not blind:
         typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")

@@ -129,7 +129,7 @@ def file(
 
 @view_app.command()
 def slam(
-    result: Annotated[Path, typer.Argument(help="Folder that a command of `saga-fg slam` wrote.")],
+    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam kitti`, `victoria-park` or `plaza` wrote.")],
     save: Save = None,
     verbose: Verbose = False,
 ) -> None:

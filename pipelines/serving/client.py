@@ -23,6 +23,7 @@ class StreamClient:
         family = (
             socket.AF_UNIX if address.path is not None else socket.AF_INET6 if ":" in address.host else socket.AF_INET
         )
+        self._address = address
         self._socket = socket.socket(family)
         self._socket.settimeout(timeout)
         try:
@@ -37,11 +38,16 @@ class StreamClient:
         self._socket.sendall(message if isinstance(message, bytes) else encode(message))
 
     def receive(self) -> dict[str, Any]:
-        """The next answer."""
+        """The next answer. Raises `InputError` for what is none."""
         line = self._lines.readline()
         if not line:
             raise ConnectionError("the service has closed the connection")
-        answer: dict[str, Any] = json.loads(line)
+        try:
+            answer = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{self._address}: expected an answer in JSON, got {line[:80]!r}") from error
+        if not isinstance(answer, dict):
+            raise InputError(f"{self._address}: expected an object as answer, got {line[:80]!r}")
         return answer
 
     def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -109,13 +110,16 @@ def _frame_message(message: Mapping[str, Any], settings: StreamSettings) -> Fram
     if len(rows) > settings.max_detections:
         raise InputError(f"detections: expected at most {settings.max_detections}, got {len(rows)}")
     coordinates = message.get("coordinates", "world")
-    frame = Frame(
-        timestamp=_number("", message, "timestamp"),
-        sensor=_name("", message, "sensor", "sensor"),
-        detections=_detections(rows),
-        world_T_ego=_pose(message["ego"]) if message.get("ego") is not None else None,
-        coordinates=cast(Coordinates, coordinates if isinstance(coordinates, str) else repr(coordinates)),
-    )
+    try:
+        frame = Frame(
+            timestamp=_number("", message, "timestamp"),
+            sensor=_name("", message, "sensor", "sensor"),
+            detections=_detections(rows),
+            world_T_ego=_pose(message["ego"]) if message.get("ego") is not None else None,
+            coordinates=cast(Coordinates, coordinates if isinstance(coordinates, str) else repr(coordinates)),
+        )
+    except InputError as error:  # names the field as a frame has it
+        raise InputError(re.sub("^world_T_ego:", "ego:", str(error))) from error
     return FrameMessage(frame, seq)
 
 

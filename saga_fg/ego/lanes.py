@@ -13,8 +13,8 @@ far: of all lanes that run its way, beside which it is e_j off with the variance
     P(j) = q_j / (sum_i q_i + elsewhere / width),      q_j = N(e_j; 0, S)
     P    = (1 - P(stands)) P(j) exp( -v^2 / (2 (drift^2 + sigma_v^2)) ),      sigma_v = speed times heading's deviation
 
-Where the pose is known to less than a lane's width no lane is likely, and nothing is said: the lanes then take hold
-from where it is known better, round by round. A robust loss lets go who changes lanes. The factor is
+Where the pose is less well known than to a lane's width no lane is likely, and nothing is said: the lanes then take
+hold from where it is known better, round by round. A robust loss lets go who changes lanes. The factor is
 `factors.lane_keeping_factors`.
 """
 

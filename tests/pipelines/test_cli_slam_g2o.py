@@ -42,6 +42,16 @@ def test_the_command_writes_the_optimum(tmp_path: Path, dim: int) -> None:
     assert (output / "above.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_graph_in_pieces_is_refused_by_the_name_of_its_file(tmp_path: Path) -> None:
+    file, output = tmp_path / "pieces.g2o", tmp_path / "out"
+    poses = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in (3, 4, 7))
+    file.write_text(poses + "EDGE_SE2 3 4 1 0 0 1 0 0 1 0 1\n")
+    result = CliRunner().invoke(app, ["slam", "g2o", str(file), "--output", str(output)])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {file}: pose 7: expected measurements that connect it")
+    assert not output.exists()
+
+
 def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
     graph, truth = loop(2, seed=0)
     wrong = graph.first_T_second.copy()

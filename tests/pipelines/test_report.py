@@ -176,6 +176,10 @@ def test_a_table_of_tracks_becomes_a_page(tmp_path: Path):
     assert alone.exit_code == 0, alone.output
     same = run(app, ["report", "file", str(tracks), "--output", str(tracks)])
     assert same.exit_code == 2
+    no_page = run(app, ["report", "file", str(tracks), "--output", str(tmp_path / "page.pdf")])
+    assert no_page.exit_code == 2
+    assert "page.pdf: expected a file name that ends in .html" in no_page.stderr
+    assert not (tmp_path / "page.pdf").exists()
     other = tmp_path / "other.csv"
     other.write_text("timestamp,label,x,y,scene\n100,car,0,0,d\n")
     wrong = run(app, ["report", "file", str(tracks), "--detections", str(other), "--output", str(output)])

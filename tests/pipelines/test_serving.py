@@ -87,7 +87,7 @@ def test_a_frame_is_read_with_all_its_fields():
         (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "length": 0}]}', r"size\[0\]: expected positive"),
         (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "label": ""}]}', "label: expected a name"),
         (b'{"timestamp": 1, "sensor": {}, "detections": []}', "sensor: expected a name"),
-        (b'{"timestamp": 1, "coordinates": "ego", "detections": []}', "world_T_ego: expected a pose"),
+        (b'{"timestamp": 1, "coordinates": "ego", "detections": []}', "^ego: expected a pose"),
         (b'{"timestamp": 1, "coordinates": [], "detections": []}', "coordinates: expected one of"),
         (b'{"timestamp": 1, "ego": {"x": 1, "y": 2}, "detections": []}', "ego.yaw: expected a number"),
         (b'{"timestamp": 1, "seq": -1, "detections": []}', "seq: expected an integer"),

@@ -129,6 +129,8 @@ def test_the_command_on_real_scans(recordings: Path, tmp_path: Path, odometry: s
     assert outcome.exit_code == 0, outcome.output
     assert "8 scans" in outcome.stdout
     assert "trajectory against GPS/IMU: ATE" in outcome.stdout
+    assert "no RPE on a path shorter than 10 m" in outcome.stdout
+    assert "nan" not in outcome.stdout
     assert (tmp_path / "run" / "map.ply").is_file()
 
 
