@@ -61,8 +61,8 @@ def g2o(
     with working("optimising"):
         try:
             optimised = optimise_poses(graph, loss)
-        except InputError as error:  # of a graph that is whole and still has no optimum, as one in pieces
-            raise InputError(f"{file}: {error}") from error
+        except InputError as refusal:  # of a graph that is whole and still has no optimum, as one in pieces
+            raise InputError(f"{file}: {refusal}") from refusal
     guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
