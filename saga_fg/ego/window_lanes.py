@@ -27,8 +27,8 @@ class WindowLanes:
         self._kept: list[Keeping] = []
 
     def learn(self, road_map: RoadMap | None) -> None:
-        """Take in a map that a frame brings along."""
-        if road_map is not None:
+        """Take in a map that a frame brings along; most bring the same."""
+        if road_map is not None and road_map not in self._maps:
             self._maps.append(road_map)
             self._lanes = known_lanes(self._maps)
 

@@ -18,8 +18,9 @@ from saga_fg.ego import (
     estimate_jointly,
     estimate_online,
     lane_key,
+    window_lanes,
 )
-from saga_fg.ego.lanes import keepings, known_lanes
+from saga_fg.ego.lanes import KnownLane, keepings, known_lanes
 from saga_fg.geometry import inverse_transform, yaw_transform
 from saga_fg.road import Lane, RoadMap
 
@@ -132,3 +133,17 @@ def test_a_vehicle_keeps_the_lane_that_it_surely_drives_along() -> None:
 def test_settings_that_cannot_be_are_refused(field: str, value: float) -> None:
     with pytest.raises(InputError, match=field):
         LaneSettings(**{field: value})
+
+
+def test_a_map_that_every_frame_brings_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[int] = []
+
+    def counted(maps: list[RoadMap | None]) -> list[KnownLane]:
+        read.append(len(maps))
+        return known_lanes(maps)
+
+    monkeypatch.setattr(window_lanes, "known_lanes", counted)
+    lanes = window_lanes.WindowLanes(LaneSettings(), None)
+    for _ in range(3):
+        lanes.learn(road())
+    assert read == [1, 2]  # at the start, and with the first map
