@@ -28,7 +28,7 @@ class WindowLanes:
 
     def learn(self, road_map: RoadMap | None) -> None:
         """Take in a map that a frame brings along; most bring the same."""
-        if road_map is not None and road_map not in self._maps:
+        if road_map is not None and all(road_map is not known for known in self._maps):
             self._maps.append(road_map)
             self._lanes = known_lanes(self._maps)
 
