@@ -11,7 +11,7 @@ from pipelines.learning.noise import LearnedNoise
 from saga_fg.by_class import class_settings
 from saga_fg.tracking import ClassSettings
 
-LEARNED = ("noise", "calibration", "detection_probability", "class_detection", "field_of_view")
+LEARNED = ("noise", "calibration", "detection_probability", "class_detection", "field_of_view", "confusion")
 DIGITS = 4
 
 
@@ -21,20 +21,21 @@ def learned_fragment(learned: LearnedNoise, origin: str) -> str:
     for name in learned.detections:
         values = asdict(learned.config.sensors[name])
         sensors[name] = {key: _rounded(values[key]) for key in LEARNED if values[key] != {}}
-    data: dict[str, Any] = {"sensors": sensors}
+    tracker: dict[str, Any] = {}
+    if any("confusion" in values for values in sensors.values()):  # it is one among the classes of these groups
+        tracker["class_groups"] = [list(group) for group in learned.config.tracker.class_groups]
     if learned.classes:
         classes = learned.config.tracker.classes
-        data["tracker"] = {
-            "classes": {
-                label: {
-                    "motion": {
-                        "kind": "constant_velocity",
-                        **_rounded(asdict(class_settings(classes, ClassSettings, label).motion)),
-                    }
+        tracker["classes"] = {
+            label: {
+                "motion": {
+                    "kind": "constant_velocity",
+                    **_rounded(asdict(class_settings(classes, ClassSettings, label).motion)),
                 }
-                for label in learned.classes
             }
+            for label in learned.classes
         }
+    data: dict[str, Any] = {"sensors": sensors, **({"tracker": tracker} if tracker else {})}
     text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
     return f"# Learned by saga-fg learn noise from {origin}; pass it to --config.\n{text}"
 
