@@ -75,6 +75,8 @@ def labelled_recordings(
 
 
 def _table(result: Path) -> Path:
+    if not result.exists():
+        raise InputError(f"{result}: expected a folder that `saga-fg smooth` wrote, or its table, there is nothing")
     if not result.is_dir():
         return result
     found = [result / f"labels{suffix}" for suffix in (".csv", ".ndjson") if (result / f"labels{suffix}").is_file()]

@@ -91,6 +91,9 @@ def test_labels_of_a_file_are_judged_without_truth(tmp_path: Path) -> None:
     assert found["precision_recall"] == {}
     assert found["consistency"]["labels"]["boxes"] == 15
     assert found["consistency"]["labels"]["jerkiness"] < 1.0
+    run = runner.invoke(app, ["evaluate", "labels", str(tmp_path / "nothing"), "--file", str(table)])
+    assert run.exit_code == 2
+    assert "expected a folder that `saga-fg smooth` wrote" in run.stderr
 
 
 def _short(folder: Path) -> Path:
