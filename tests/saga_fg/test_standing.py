@@ -28,7 +28,8 @@ def beliefs(frames, settings=SETTINGS):
     tracker, found = Tracker(settings), []
     for f in frames:
         tracker.step(f)
-        found.append(tracker.snapshot().own[-1].belief.item())
+        (standing,) = (part for part in tracker.snapshot().own if isinstance(part, Standing))
+        found.append(standing.belief.item())
     return found
 
 
