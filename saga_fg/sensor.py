@@ -125,7 +125,9 @@ class Sensor:
         0.9, "chance that the class of a detection is the true one, else one of its group (tracker.class_groups)"
     )
     confusion: Mapping[str, Mapping[str, float]] = settings_group(
-        dict, "by true class, how often objects are taken for each class, in place of class_accuracy"
+        dict,
+        "by true class, how often objects are taken for each class, their own among them, as counts or shares; in "
+        "place of class_accuracy",
     )
     colour_accuracy: float = setting(0.9, "chance that the colour reported of a traffic light is the true one")
     clutter_area: float | None = setting(
@@ -145,6 +147,8 @@ class Sensor:
         for label, taken_for in self.confusion.items():
             if not all(0 <= share < math.inf for share in taken_for.values()) or sum(taken_for.values()) == 0:
                 raise InputError(f"confusion.{label}: expected shares >= 0, some above, got {dict(taken_for)!r}")
+            if label not in taken_for:
+                raise InputError(f"confusion.{label}: expected {label} among the classes it is taken for")
         for label, chance in self.class_detection.items():
             if not 0 <= chance <= 1:
                 raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")

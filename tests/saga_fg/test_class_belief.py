@@ -74,6 +74,11 @@ def test_between_classes_believed_alike_the_track_keeps_its_own():
     assert kept.tolist() == ["truck", "car", "pedestrian"]
 
 
+def test_a_misspelt_class_in_a_table_of_confusion_is_refused():
+    with pytest.raises(InputError, match=r"confusion\.car: expected car among the classes it is taken for"):
+        Sensor(confusion={"car": {"carr": 0.9, "truck": 0.1}})
+
+
 def test_a_table_of_confusion_takes_the_place_of_one_number():
     sensor = Sensor(confusion={"truck": {"truck": 3.0, "car": 1.0}})
     A = sensor.confusion_among(("car", "truck", "bus"))
