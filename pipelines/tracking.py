@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.frame import Frame
 from saga_fg.track import Tracks

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from data_tools.metrics import scene_metrics
 from pipelines.bench.drawn_scenes import DrawnSettings, drawn_config, drawn_scene
 from pipelines.observers import StageClock
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from pipelines.tracking import Progress
 from saga_fg.track import Tracks
 from saga_fg.tracking import AssociationName

@@ -18,7 +18,7 @@ from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscene
 from data_tools.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
 from pipelines.config import load_config
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from pipelines.tracking import track_dataset
 from saga_fg.errors import InputError
 

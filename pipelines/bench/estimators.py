@@ -16,8 +16,8 @@ import numpy as np
 from pipelines.bench.contenders import Contender, Filter, GtsamWindow, Ours, OurWindow, Textbook, dense
 from pipelines.bench.estimator_figures import Criterion, Row, Soak, criteria, exponents
 from pipelines.bench.flocks import Flock, Kind, flock
-from pipelines.bench.measuring import environment, resident_memory, size_of, timed
-from pipelines.threads import one_thread
+from pipelines.bench.measuring import environment, size_of, timed
+from pipelines.process import one_thread, resident_memory
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError

@@ -14,8 +14,8 @@ import numpy as np
 
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
+from pipelines.process import one_thread
 from pipelines.smoothing import SmoothConfig, smooth_known_objects
-from pipelines.threads import one_thread
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.dataset import Scene

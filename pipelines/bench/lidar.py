@@ -32,7 +32,7 @@ from data_tools.lidar import (
 )
 from pipelines.config import load_config
 from pipelines.detector_free import cluster_scene
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from pipelines.tracking import Progress, track_scene
 from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.boxes import Boxes

@@ -7,13 +7,10 @@ frame, so that what is left of it hits all of them alike. Figures are medians, a
 from __future__ import annotations
 
 import platform
-import resource
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,15 +22,6 @@ def timed(run: Callable[[], Any]) -> float:
     begin = time.thread_time()
     run()
     return 1e3 * (time.thread_time() - begin)
-
-
-def resident_memory() -> float:
-    """Of this process, MB."""
-    status = Path("/proc/self/statm")
-    if status.exists():
-        return int(status.read_text().split()[1]) * resource.getpagesize() / 1e6
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # where there is no better: the most it ever was
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
 def size_of(value: Any) -> float:

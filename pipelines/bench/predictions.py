@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from pipelines.tracking import OnlineTracker
 from saga_fg.arrays import IntArray, StrArray
 from saga_fg.association import assign

@@ -20,7 +20,7 @@ from pipelines.bench.contenders import Filter, Ours
 from pipelines.bench.flocks import DT, Flock, Frame, flock
 from pipelines.bench.graph_tracking import JointGraphTracking, SeparateGraphTracking
 from pipelines.bench.measuring import timed
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from pipelines.tracking import Progress
 from saga_fg.arrays import BoolArray
 from saga_fg.discretisation import discretise

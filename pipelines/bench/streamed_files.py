@@ -15,10 +15,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from data_tools.detection_files import read_detections, read_scenes_in_parts
-from pipelines.bench.measuring import resident_memory
 from pipelines.bench.streaming import PLATOON, StreamingBenchSettings, traffic
+from pipelines.process import one_thread, resident_memory
 from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
-from pipelines.threads import one_thread
 from saga_fg.smoothing import Labels
 
 ROADS, APART = 400, 1000.0  # side by side, m apart: platoons do not meet

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.bench.measuring import resident_memory
-from pipelines.threads import one_thread
+from pipelines.process import one_thread, resident_memory
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.discretisation import discretise

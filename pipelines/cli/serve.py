@@ -61,8 +61,8 @@ def serve(
       saga-fg serve --listen 127.0.0.1:7447 --reorder 0.1
       saga-fg status
     """
+    from pipelines.process import one_thread
     from pipelines.serving import StreamSettings, StreamTracker
-    from pipelines.threads import one_thread
 
     settings = configured("file", config, method, estimator, lag, association, interactions)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), StreamSettings(reorder=reorder))

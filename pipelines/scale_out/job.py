@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, Protocol
 
-from pipelines.threads import one_thread
+from pipelines.process import one_thread
 from saga_fg.dataset import Dataset
 from saga_fg.errors import SagaError
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from pipelines.bench.measuring import resident_memory
+from pipelines.process import resident_memory
 from pipelines.serving.clock import Clock
 from pipelines.serving.latency import Latencies
 from pipelines.serving.messages import FrameMessage, about, parse_message, tracks_message

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from pipelines.config import Method
+from pipelines.process import one_thread
 from pipelines.smoothing.assembly import count_labels, label_moments
 from pipelines.smoothing.config import SmoothConfig
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import smooth_objects
-from pipelines.threads import one_thread
 from pipelines.tracking import Progress
 from saga_fg.dataset import Dataset, Scene
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.config import Method
+from pipelines.process import one_thread
 from pipelines.smoothing.assembly import LabelledStates, dropped_boxes, label_states, source_counts
 from pipelines.smoothing.config import SmoothConfig
 from pipelines.smoothing.identities import Identities
@@ -32,7 +33,6 @@ from pipelines.smoothing.lifetimes import Lifetimes
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import SmoothedObjects, smooth_objects
 from pipelines.smoothing.stretches import Backlog, StretchSettings, TrackedFrame
-from pipelines.threads import one_thread
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.dataset import Scene

@@ -1,0 +1,30 @@
+"""This process: the threads of its linear algebra, and its memory.
+
+To matrices as small as a filter's, threads cost more than they bring.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Linear algebra on one thread, which also keeps sums in one order."""
+    with threadpool_limits(limits=1):
+        yield
+
+
+def resident_memory() -> float:
+    """Of this process, MB."""
+    status = Path("/proc/self/statm")
+    if status.exists():
+        return int(status.read_text().split()[1]) * resource.getpagesize() / 1e6
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # where there is no better: the most it ever was
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
