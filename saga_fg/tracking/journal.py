@@ -35,6 +35,7 @@ class Journal:
 
     def __init__(self, settings: TrackerSettings, write: Callable[[Event], None]) -> None:
         self._settings, self._write = settings, write
+        self._groups = ClassGroups(settings.class_groups)
         self._before: TrackerView | None = None  # at the end of the frame before
         self._predicted: TrackerView | None = None
         self._effects: list[EdgeEffect] = []
@@ -87,8 +88,7 @@ class Journal:
         assert self._predicted is not None
         label = str(self._predicted.columns.label[row])
         settings = class_settings(self._settings.classes, ClassSettings, label)
-        groups = ClassGroups(self._settings.class_groups)
-        rows = np.flatnonzero(groups.akin(np.array([label]), observed.boxes.label)[0])
+        rows = np.flatnonzero(self._groups.akin(np.array([label]), observed.boxes.label)[0])
         measured = observed.boxes.position[rows, :2]
         d2, _ = mahalanobis(place[None], self._predicted.P[row][None], measured, observed.R[rows, :2, :2])
         apart, limit = np.hypot(*(measured - place).T), gate(settings.gate)
@@ -131,12 +131,13 @@ class Journal:
             noise = now.observed.R[detection, :2, :2][None]
             d2, _ = mahalanobis(old.places()[same], old.P[same], measured[None], noise)
             nearest = same[np.argsort(d2[:, 0])[:3]]
+            of_class = class_settings(self._settings.classes, ClassSettings, event["label"])
             event |= {
                 "detection": int(now.observed.row[detection]),
                 "position": _numbers(measured),
                 "probability": float(now.observed.probability[detection]),
-                "least_probability": class_settings(self._settings.classes, ClassSettings, event["label"]).birth_score,
-                "gate": gate(class_settings(self._settings.classes, ClassSettings, event["label"]).gate),
+                "least_probability": of_class.birth_score,
+                "gate": gate(of_class.gate),
                 "nearest_tracks": [
                     {"track": int(old.columns.id[k]), "distance2": float(d2[same == k, 0][0])} for k in nearest.tolist()
                 ],

@@ -30,7 +30,7 @@ import numpy as np
 from saga_fg.arrays import FloatArray, IntArray, distinct
 from saga_fg.association import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
 from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_values
+from saga_fg.by_class import class_settings, class_values
 from saga_fg.overlap import paired_giou_3d
 from saga_fg.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.quadratic_matching import QuadraticMatching
@@ -100,17 +100,16 @@ def candidates(
     same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
     if said is not None:
         same = said.groups.akin(np.array(classes), np.array(seen))
-    shares, reach, overlap_weight = class_values(
-        settings.classes, ClassSettings, predicted.label, "gate", "max_distance", "overlap_weight"
-    )
+    names = ("max_distance", "overlap_weight")
+    reach, overlap_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
+    gates = np.array([gate(class_settings(settings.classes, ClassSettings, c).gate) for c in classes])[of_track]
     x, y = (observed.boxes.position[:, k] - predicted.position[:, k, None] for k in (0, 1))
     near = same[of_track[:, None], of_detection] & (x * x + y * y < (reach**2)[:, None])
     t, d = near.nonzero()
     innovation, S = np.stack([x[near], y[near]], axis=-1), P[t] + observed.R[d, :2, :2]
     d2, log_det = mahalanobis_of_pairs(innovation, S)
-    gates = {share: gate(share) for share in set(shares.tolist())}
     of_class = 0.0 if said is None else said.costs(t, d)
-    inside = (d2 + of_class < np.array([gates[share] for share in shares.tolist()])[t]).nonzero()[0]
+    inside = (d2 + of_class < gates[t]).nonzero()[0]
     found = Candidates(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
     found = found._replace(gain=found.gain - _overlap(found, predicted, observed.boxes, overlap_weight))
     unmatched = _unmatched(found, expected, observed.probability, of_detection, settings.association, clutter_area)
