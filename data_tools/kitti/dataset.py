@@ -56,6 +56,8 @@ class KittiTracking:
         sensor: str = "lidar",
     ) -> None:
         root = Path(dataroot)
+        if not root.is_dir():
+            raise InputError(f"{root}: expected a folder with oxts/ and calib/, there is no such folder")
         self._root = root / "training" if (root / "training").is_dir() else root
         self._detections = None if detections is None else Path(detections)
         self._ground_truth, self._sensor = ground_truth, sensor

@@ -52,7 +52,7 @@ def _nuscenes(path: Path) -> Scan:
 def _records(path: Path, columns: int) -> FloatArray:
     content = _bytes(path)
     size = 4 * columns
-    if len(content) % size:
+    if not content or len(content) % size:
         raise InputError(f"expected records of {size} bytes ({columns} float32 a point), got {len(content)} bytes")
     with np.errstate(invalid="ignore"):  # numbers that are none are refused by the scan
         return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)

@@ -6,6 +6,7 @@ together, by the settings that are there; what is learned so replaces these sett
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +34,10 @@ from saga_fg.node import ConstantVelocity
 from saga_fg.sensor import NoiseModel, Sensor, sensor_model
 from saga_fg.tracking import ClassSettings, Tracker
 
+log = logging.getLogger(__name__)
+
 ROUNDS = 2  # of following by what the round before learned
+FEW_DETECTIONS = 200  # of a sensor, that a standard deviation is known to 5 %
 FEWEST_TRAILS = 5  # a class with fewer has the noise of all trails together
 
 
@@ -60,6 +64,10 @@ def learn_noise(
         learned = _from_truth(reported, learned.config) if with_truth else _from_trails(reported, learned.config)
     if not any(learned.detections.values()):
         raise InputError(f"{', '.join(scenes)}: expected detections to learn from, there is none")
+    for name, count in learned.detections.items():
+        if count < FEW_DETECTIONS:
+            enough = f"from {FEW_DETECTIONS} on, a deviation is known to 5 %"
+            log.warning("%s: learned from %d detections only; %s", name, count, enough)
     return learned
 
 

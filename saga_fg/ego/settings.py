@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from saga_fg.by_class import DEFAULT
 from saga_fg.edge_rules import VEHICLES
 from saga_fg.ego.odometry import OdometryNoise
 from saga_fg.errors import InputError
@@ -35,8 +37,10 @@ class JointSettings:
     odometry: OdometryNoise = settings_group(OdometryNoise, "how good the odometry is")
     start_noise: float = setting(1e-3, "standard deviation of the first pose, m and rad")
     standing_window: float = setting(3.0, "time over which an object is judged to stand or to move, s")
-    moving_speed: float = setting(5.0, "deviation of a velocity component of objects that move, m/s")
-    walking_speed: float = setting(1.0, "the same of pedestrians, m/s")
+    moving_speed: Mapping[str, float] = field(
+        default_factory=lambda: {DEFAULT: 5.0, "pedestrian": 1.0},
+        metadata={"comment": "deviation of a velocity component of objects that move, by class, m/s"},
+    )
     standing_drift: float = setting(0.05, "how far an object that stands may wander, m after one second")
     standing_speed: float = setting(0.1, "standard deviation of the velocity of an object that stands, m/s")
     motion_noise: float = setting(1000.0, "factor on the noise of the objects' motion: traffic brakes and turns as one")
@@ -50,10 +54,12 @@ class JointSettings:
     max_iterations: int = setting(30, "linearisations at most, in each round")
 
     def __post_init__(self) -> None:
-        require_positive(
-            self, "start_noise", "standing_window", "moving_speed", "walking_speed", "standing_drift", "standing_speed"
-        )
+        require_positive(self, "start_noise", "standing_window", "standing_drift", "standing_speed")
         require_positive(self, "motion_noise", "landmark_reach")
+        if DEFAULT not in self.moving_speed or not all(0 < speed < math.inf for speed in self.moving_speed.values()):
+            raise InputError(
+                f"moving_speed: expected positive numbers by class, {DEFAULT} among them, got {dict(self.moving_speed)}"
+            )
         require_positive(self, "outlier_scale", infinite=True)
         require_between(self, 0, math.inf, "keyframe_period")
         for name in ("rounds", "max_iterations"):

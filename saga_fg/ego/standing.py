@@ -8,7 +8,7 @@ has D ~ N(0, S): noise of the detections and of the odometry over the T seconds 
 
 where shift and turn are the variances that the increments in between add up to in translation and in heading; scale,
 bias and course the odometry's deviations as known so far. One that moves has D ~ N(0, S + (u T)^2), with the speed u
-usual for its class: `walking_speed` for pedestrians, `moving_speed` for all others. By Bayes, with even odds before,
+usual for its class (`moving_speed`). By Bayes, with even odds before,
 
     P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (u T)^2))
 
@@ -18,11 +18,13 @@ they do the speed: who walks far away is not taken for a car that stands.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import FloatArray, IntArray, StrArray, distinct
+from saga_fg.by_class import DEFAULT
 from saga_fg.ego.record import EgoMoment, motion_covariances
 from saga_fg.ego.settings import JointSettings
 from saga_fg.geometry import transform_points
@@ -131,11 +133,8 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
     place = [transform_points(pose, moment.seen.z)[:, :2] for moment, pose in zip(record, path, strict=True)]
     variance = np.concatenate([np.trace(moment.seen.R, axis1=1, axis2=2) / 2 for moment in record])
     distance = np.concatenate([np.hypot(moment.seen.z[:, 0], moment.seen.z[:, 1]) for moment in record])
-    walks = np.concatenate(
-        [
-            np.array(moment.objects.label)[np.isin(moment.objects.id, moment.seen.id)] == "pedestrian"
-            for moment in record
-        ]
+    label = np.concatenate(
+        [np.array(moment.objects.label)[np.isin(moment.objects.id, moment.seen.id)] for moment in record]
     )
     driven = np.array([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in record])
     P = motion_covariances(record, settings)
@@ -151,6 +150,12 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
         np.concatenate(place)[order],
         variance[order],
         distance[order],
-        np.where(walks, settings.walking_speed, settings.moving_speed)[order],
+        _usual_speed(label, settings.moving_speed)[order],
         drift[moments][order],
     )
+
+
+def _usual_speed(label: StrArray, moving_speed: Mapping[str, float]) -> FloatArray:
+    """The speed (n,) of the class of each label (n,), m/s."""
+    classes, index = distinct(label)
+    return np.array([moving_speed.get(c, moving_speed[DEFAULT]) for c in classes], dtype=np.float64)[index]

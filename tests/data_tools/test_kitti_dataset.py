@@ -87,6 +87,8 @@ def test_missing_file(root: Path, folder: str) -> None:
 def test_missing_folders(root: Path) -> None:
     with pytest.raises(InputError, match="oxts: expected GPS/IMU records"):
         KittiTracking(root / "found")
+    with pytest.raises(InputError, match=r"nowhere: expected a folder .* there is no such folder"):
+        KittiTracking(root / "nowhere")
     with pytest.raises(InputError, match="none: expected a folder with Car/"):
         KittiTracking(root, root / "none")
     (root / "empty").mkdir()

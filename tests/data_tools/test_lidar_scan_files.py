@@ -83,6 +83,7 @@ def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
     ("name", "content", "expected"),
     [
         ("a.bin", b"123456", r"a\.bin: expected records of 16 bytes .* got 6 bytes"),
+        ("a.bin", b"", r"a\.bin: expected records of 16 bytes .* got 0 bytes"),
         ("a.pcd.bin", b"0" * 16, r"a\.pcd\.bin: expected records of 20 bytes"),
         ("a.bin", np.array([np.nan, 0, 0, 0], "<f4").tobytes(), r"a\.bin: points\[0, 0\]: expected a finite number"),
         ("a.npy", b"no array", r"a\.npy: expected NumPy's format, with plain arrays and no pickled"),

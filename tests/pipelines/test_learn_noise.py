@@ -11,6 +11,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from data_tools.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.settings import SensorSettings
 from pipelines.cli.main import app
@@ -135,3 +136,11 @@ def test_where_nothing_was_detected_nothing_is_learned(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "expected detections to learn from" in result.output
     assert not (tmp_path / "noise.yaml").exists()
+
+
+def test_few_detections_are_worth_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = [f"{k / 10},{0.8 * k},0.0" for k in range(4)]
+    (tmp_path / "few.csv").write_text("\n".join(["timestamp,x,y", *rows]))
+    dataset = read_detections(tmp_path / "few.csv")
+    learn_noise(dataset, dataset.scenes, load_config("file"), with_truth=False)
+    assert "learned from 4 detections only" in caplog.text

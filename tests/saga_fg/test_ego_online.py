@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from test_ego_joint import POOR, worse
 
 from saga_fg import InputError
+from saga_fg.by_class import DEFAULT
 from saga_fg.ego import JointSettings, OnlineEstimator, estimate_jointly, estimate_online
 from saga_fg.geometry import inverse_transform
 from saga_fg.landmarks import Observation, PoleLandmark
@@ -53,7 +54,7 @@ def test_what_leaves_the_window_stays_in_the_prior() -> None:
     """Where everything is nearly linear, a short window gives the newest pose of a long one, and its covariance."""
     frames, odometry, poses, _ = drive(n=14, parked=0, moving=3)
     reported = worse(odometry, np.random.default_rng(2))
-    linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed=1e-6)  # nobody stands, no robust loss
+    linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed={DEFAULT: 1e-6})  # nobody stands, no robust loss
     _, seen = seen_poles(poses, np.random.default_rng(4))
     short, long = (estimate_online(frames, reported, new_tracker(), lag, linear, poses[0], seen) for lag in (0.5, 60.0))
     sigma = np.sqrt(np.diag(long.covariances[-1]))[3:5]
