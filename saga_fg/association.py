@@ -14,9 +14,9 @@ from typing import Self
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.chi_square import chi_square_quantile
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def mahalanobis_of_pairs(innovation: FloatArray, S: FloatArray) -> tuple[FloatAr
 @lru_cache
 def gate(probability: float, dim: int = 2) -> float:
     """The chi-square gate that lets `probability` of the true pairs through."""
-    return float(chi2.ppf(probability, dim))
+    return chi_square_quantile(probability, dim)
 
 
 def assign(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray) -> tuple[IntArray, IntArray]:

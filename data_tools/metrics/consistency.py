@@ -2,8 +2,8 @@
 
     nees = (x_hat - x)^T P^-1 (x_hat - x)        chi-squared with dim(x) degrees of freedom if P is right
 
-so its mean is dim(x), and the share of samples with nees <= chi2_quantile(p, dim) is p: the p-ellipse of the estimate
-holds the truth with probability p.
+so its mean is dim(x), and the share of samples with nees <= chi_square_quantile(p, dim) is p: the p-ellipse of the
+estimate holds the truth with probability p.
 
 Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2.
 """
@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
 
 from saga_fg.arrays import FloatArray
+from saga_fg.chi_square import chi_square_quantile
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -32,14 +32,14 @@ def coverage(nees_values: FloatArray, probability: float, dimension: int = 2) ->
     """Share of errors inside the ellipse that should hold `probability` of them; NaN without values."""
     if len(nees_values) == 0:
         return float("nan")
-    return float(np.mean(nees_values <= chi2.ppf(probability, dimension)))
+    return float(np.mean(nees_values <= chi_square_quantile(probability, dimension)))
 
 
 def nees_band(count: int, dimension: int = 2, probability: float = 0.999) -> tuple[float, float]:
     """Two-sided band that holds the mean NEES of `count` independent consistent estimates with `probability`."""
     tail = (1 - probability) / 2
     degrees = dimension * count
-    return float(chi2.ppf(tail, degrees)) / count, float(chi2.ppf(1 - tail, degrees)) / count
+    return chi_square_quantile(tail, degrees) / count, chi_square_quantile(1 - tail, degrees) / count
 
 
 def coverages(nees_values: FloatArray, probabilities: Sequence[float] = (0.5, 0.9, 0.99)) -> dict[float, float]:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from data_tools.metrics.error_figures import BANDS, calibration, errors_by_class
 from data_tools.metrics.label_errors import LabelErrors
+from saga_fg.chi_square import chi_square_quantile
 
 
 def calibration_plot(errors: LabelErrors) -> Any:
@@ -22,10 +22,11 @@ def calibration_plot(errors: LabelErrors) -> Any:
     figure = Figure(figsize=(6.5, 6.0), layout="constrained")
     ax = figure.subplots()
     probability = np.linspace(0.01, 0.99, 99)
+    ellipses = [chi_square_quantile(p, 2) for p in probability]
     for label, of_class in errors_by_class(errors).items():
         values = of_class.nees[np.isfinite(of_class.nees)]
         if len(values):
-            share = np.searchsorted(np.sort(values), chi2.ppf(probability, 2), side="right") / len(values)
+            share = np.searchsorted(np.sort(values), ellipses, side="right") / len(values)
             style = "-" if calibration(of_class).judged else ":"
             ax.plot(probability, share, style, label=f"{label} ({len(values)})", linewidth=1.4)
     ax.plot([0, 1], [0, 1], color="black", linewidth=0.8)
