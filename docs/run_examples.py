@@ -8,6 +8,7 @@ Every fenced block of bash or Python is preceded by a comment that says what bec
     <!-- not run: REASON -->        it is not run
 
 The blocks of a page run in order in one temporary folder, bash with `set -euo pipefail`, Python in a fresh interpreter.
+With `--jobs N`, so many pages run at a time, and a block's output is printed when it has ended.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,16 +58,18 @@ def examples(page: Path) -> list[Example]:
     return found
 
 
-def run(example: Example, folder: Path, environment: dict[str, str]) -> int:
-    """Run one block in a folder; its exit code."""
+def run(example: Example, folder: Path, environment: dict[str, str], capture: bool) -> tuple[int, str]:
+    """Run one block in a folder; its exit code, and what it printed if that is captured."""
     if example.language == "bash":
         command = ["bash", "-euo", "pipefail", "-c", example.code]
     else:
         command = [sys.executable, "-W", "error", "-c", example.code]
-    return subprocess.run(command, cwd=folder, env=environment, check=False).returncode
+    out, error = (subprocess.PIPE, subprocess.STDOUT) if capture else (None, None)
+    done = subprocess.run(command, cwd=folder, env=environment, check=False, stdout=out, stderr=error, text=True)
+    return done.returncode, done.stdout or ""
 
 
-def run_page(page: Path, wanted: Iterable[str], environment: dict[str, str]) -> list[str]:
+def run_page(page: Path, wanted: Iterable[str], environment: dict[str, str], capture: bool) -> list[str]:
     """Run the wanted blocks of a page in one folder; one line for each that failed."""
     failed = []
     with tempfile.TemporaryDirectory() as temporary:
@@ -75,9 +80,13 @@ def run_page(page: Path, wanted: Iterable[str], environment: dict[str, str]) -> 
             if example.mark == "run with recordings" and "SAGA_FG_DATA" not in environment:
                 print(f"--- {where}: skipped, SAGA_FG_DATA is not set to a folder with recordings", flush=True)
                 continue
-            print(f"--- {where}", flush=True)
+            if not capture:
+                print(f"--- {where}", flush=True)
             folder = ROOT if example.mark == "ci" else Path(temporary)
-            code = run(example, folder, environment)
+            start = time.monotonic()
+            code, output = run(example, folder, environment, capture)
+            if capture:
+                print(f"--- {where} ({time.monotonic() - start:.1f} s)\n{output}", end="", flush=True)
             if code:
                 failed.append(f"{where}: exit code {code}")
     return failed
@@ -88,13 +97,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Run the examples of the documentation.")
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--mark", choices=MARKS, help="only blocks marked so (default: all but ci)")
+    parser.add_argument("--jobs", type=int, default=1, help="pages to run at a time (default: 1)")
     arguments = parser.parse_args()
     environment = dict(os.environ)
     beside = ROOT.parent / "shared" / "data"
     if "SAGA_FG_DATA" in environment or beside.is_dir():  # as an absolute path: examples run in other folders
         environment["SAGA_FG_DATA"] = str(Path(environment.get("SAGA_FG_DATA", beside)).resolve())
     wanted = (arguments.mark,) if arguments.mark else MARKS[:2]
-    failed = [line for page in arguments.pages for line in run_page(page, wanted, environment)]
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        results = pool.map(lambda page: run_page(page, wanted, environment, arguments.jobs > 1), arguments.pages)
+        failed = [line for of_page in results for line in of_page]
     for line in failed:
         print(f"FAILED {line}", flush=True)
     return 1 if failed else 0

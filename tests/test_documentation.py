@@ -89,6 +89,17 @@ def test_examples_that_fail_or_are_not_marked_are_reported(tmp_path: Path) -> No
     assert f"{page}:1: expected a mark such as <!-- run --> before the block" in run.stderr
 
 
+def test_pages_run_at_the_same_time_are_told_apart(tmp_path: Path) -> None:
+    pages = [tmp_path / f"{name}.md" for name in ("good", "bad")]
+    for page, ending in zip(pages, ("true", "false"), strict=True):
+        page.write_text(f"<!-- run -->\n```bash\necho from {page.stem}\n{ending}\n```\n")
+    run = run_examples("--jobs", "2", *pages)
+    assert run.returncode == 1
+    assert "FAILED" not in run.stdout.replace(f"FAILED {pages[1]}:2: exit code 1", "")
+    for page in pages:
+        assert re.search(rf"^--- {re.escape(str(page))}:2 \([0-9.]+ s\)\nfrom {page.stem}$", run.stdout, re.M)
+
+
 def test_ci_runs_the_commands_of_the_readme() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert re.findall(r"<!-- ci -->\n```bash\n(.*?)\n```", text) == [
