@@ -12,12 +12,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.interactions import NodeTable
-from saga_fg.settings import require_between, setting
+from saga_fg.settings import require_between, setting, settings_group
+
+
+def news_setting() -> Any:
+    """The field `news` of an edge rule."""
+    return settings_group(lambda: None, "edges count by what they have to tell; null: whatever is known of their ends")
+
+
+def counted(news: News | None, rate: FloatArray, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+    """Rates (E,) of edges source[k] -> target[k] (rows of `nodes`) as far as they have something to tell."""
+    return rate if news is None else rate * news.shares(nodes, target, source)
 
 
 @dataclass(frozen=True)

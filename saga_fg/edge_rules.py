@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
 from saga_fg.edge_features import EdgeFeatures, features_of
-from saga_fg.edge_news import News
+from saga_fg.edge_news import News, counted, news_setting
 from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.node import distinct_types
@@ -61,9 +61,7 @@ class Neighbours:
     max_distance: float = setting(20.0, "no edge beyond this distance, m")
     min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
     max_degree: int = setting(4, "edges kept per influenced node, strongest first")
-    news: News | None = settings_group(
-        lambda: None, "edges count by what they have to tell; null: whatever is known of their ends"
-    )
+    news: News | None = news_setting()
     parked: bool = setting(
         False,
         "couples objects never seen moving whose velocity is known to within speed_scale, and no others; the "
@@ -94,9 +92,7 @@ class Neighbours:
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
-        rate = self.strength(features_of(nodes, target, source))
-        if self.news is not None:
-            rate = rate * self.news.shares(nodes, target, source)
+        rate = counted(self.news, self.strength(features_of(nodes, target, source)), nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
 
@@ -112,9 +108,7 @@ class Following:
     gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
     lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
-    news: News | None = settings_group(
-        lambda: None, "edges count by what they have to tell; null: whatever is known of their ends"
-    )
+    news: News | None = news_setting()
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
     leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
     cones: ConeGeometry | None = settings_group(
@@ -149,9 +143,7 @@ class Following:
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
         target, source = close_pairs(seen.position, able, self.max_gap)
         features = features_of(seen, target, source)
-        rate = self.strength(features)
-        if self.news is not None:
-            rate = rate * self.news.shares(nodes, target, source)
+        rate = counted(self.news, self.strength(features), nodes, target, source)
         nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
 

@@ -5,8 +5,9 @@ an object is predicted at the end of a gap and where it reappears. All methods s
 
     kf            independent objects (their joint filter falls apart into one of each)
     hand-crafted  the edge rules that the configuration of the kind of data ships
-    learned       `fit_interactions` on the other recordings
-    network       `fit_networks` on them, where it is asked for (extra [learn])
+    learned       `fit_by_held_out` on the other recordings
+    noise alone   the process noise that goes with these interactions, without edges: what is not the neighbours' doing
+    network       networks (`fit_networks`) fitted alike, where they are asked for (extra [learn])
 
 The process noise of kf, by class, and the noise of the positions are the most likely ones, by the same likelihood of
 reappearances and on the same recordings as the learned interactions; hand-crafted has those of kf. Recordings are dealt
@@ -36,6 +37,7 @@ from saga_fg.learning import (
     OwnMotion,
     OwnMotionLikelihood,
     Trajectories,
+    fit_by_held_out,
     fit_interactions,
     fit_networks,
     gap_errors,
@@ -55,6 +57,7 @@ CLASSES = {
 GAPS = (1.0, 2.0, 3.0)  # s
 Method = str
 KF, HAND_CRAFTED, LEARNED, NETWORK = "kf", "hand-crafted", "learned", "network"
+NOISE_ALONE = "noise alone"
 AVERAGES: tuple[Average, Average] = ("median", "mean")
 STRETCH = 10.0  # s
 BESIDE, ALIKE = 2.0, 0.5  # in company: another within so many m, whose velocity differs by less than so many m/s
@@ -133,18 +136,23 @@ def coasting_errors(
     for fold in range(min(folds, settings.tested_folds or folds)):
         training = [k for k in range(len(names)) if k % folds != fold]
         own = OwnMotion.most_likely([likelihoods[k] for k in training])
-        sample = GapSample.pool([_sample(recordings[names[k]], own, classes, lengths, k) for k in training])
-        if len(sample) == 0:
+        if not any(n for k in training for n in likelihoods[k].count.values()):
             taught = ", ".join(names[k] for k in training)
             wanted = f"some {' or '.join(classes)}, followed for {lengths.followed:g} s"
             raise InputError(f"recordings {taught}: expected {wanted}")
         for method, fit in methods.items():
-            learned[method].append(fit(sample, own.position_noise, own.acceleration_noise))
+            teaching = [recordings[names[k]] for k in training]
+            learned[method].append(fit_by_held_out(teaching, classes, own, fit, lengths))
+            if progress is not None:
+                progress(f"{method}, fold {fold + 1}", len(learned[method]), folds)
         for k in range(fold, len(names), folds):
             trajectories = recordings[names[k]]
-            gaps = drawn_gaps(_sample(trajectories, own, classes, lengths, k), settings.most_gaps)
+            gaps = _sample(trajectories, own, classes, lengths, k).drawn(settings.most_gaps, seed=1)
             fitted = {method: found[-1] for method, found in learned.items()}
             errors = _errors(trajectories, gaps, own, hand_crafted, fitted, lengths)
+            alone = OwnMotion(fitted[LEARNED].acceleration_noise, own.position_noise)
+            same = _sample(trajectories, alone, classes, lengths, k).drawn(settings.most_gaps, seed=1)
+            errors[NOISE_ALONE] = _alone(same)
             parts.append((gaps, trajectories.time[gaps.moment] // STRETCH, errors))
             if progress is not None:
                 progress(f"coasting {names[k]}", len(parts), len(names))
@@ -163,13 +171,6 @@ def coasting_errors(
     ), learned
 
 
-def drawn_gaps(gaps: GapSample, most: int) -> GapSample:
-    """At most so many of them, drawn at random, the same ones every time."""
-    if len(gaps) <= most:
-        return gaps
-    return gaps.select(np.sort(np.random.default_rng(1).choice(len(gaps), most, replace=False)))
-
-
 def _errors(
     trajectories: Trajectories,
     gaps: GapSample,
@@ -180,7 +181,7 @@ def _errors(
 ) -> dict[Method, FloatArray]:
     """(n, S) by method."""
     filtered = own.filtered(trajectories)
-    errors = {KF: gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0))}
+    errors = {KF: _alone(gaps)}
     joint: dict[Method, tuple[Sequence[EdgeRule], Mapping[str, float], float]]
     joint = {HAND_CRAFTED: (tuple(hand_crafted), own.acceleration_noise, 0.0)}
     joint |= {method: (f.rules, f.acceleration_noise, f.explained_noise) for method, f in learned.items()}
@@ -188,6 +189,11 @@ def _errors(
         filters = JointGaps(trajectories, filtered, noise, own.position_noise, rules, explained)
         errors[method] = filters.errors(gaps, lengths)
     return errors
+
+
+def _alone(gaps: GapSample) -> FloatArray:
+    """Errors (n, S) of what goes on as it moved when it was hidden."""
+    return np.asarray(gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0)))
 
 
 def _sample(

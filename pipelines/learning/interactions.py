@@ -10,14 +10,13 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.learning import (
-    GapSample,
     GapSettings,
     OwnMotion,
     OwnMotionLikelihood,
     Trajectories,
+    fit_by_held_out,
     fit_interactions,
     fit_networks,
-    sample_gaps,
 )
 
 
@@ -39,9 +38,8 @@ def learn_interactions(
     if not any(n for of in likelihoods for n in of.count.values()):
         raise InputError(f"{origin}: expected objects that are followed for {settings.followed:g} s and more")
     own = OwnMotion.most_likely(likelihoods)
-    samples = [sample_gaps(t, own.filtered(t), classes, settings, k) for k, t in enumerate(recordings.values())]
     fit = fit_networks if network else fit_interactions
-    fitted = fit(GapSample.pool(samples), own.position_noise, own.acceleration_noise)
+    fitted = fit_by_held_out(list(recordings.values()), classes, own, fit, settings)
     return LearnedInteractions(
         learned_from=origin,
         edges=fitted.rules,

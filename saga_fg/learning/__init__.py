@@ -5,6 +5,7 @@ from saga_fg.learning.class_confusion import learn_confusion
 from saga_fg.learning.detection_sample import DetectionSample
 from saga_fg.learning.gap_prediction import gap_errors, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments, sample_gaps
+from saga_fg.learning.held_out_fit import fit_by_held_out
 from saga_fg.learning.independent_filter import FilteredTrajectories, filter_independently
 from saga_fg.learning.interaction_fit import TEMPLATE, FittedInteractions, fit_interactions, predict_with
 from saga_fg.learning.joint_fit import fit_interactions_in_view
@@ -38,6 +39,7 @@ __all__ = [
     "filter_independently",
     "fit_acceleration_noise",
     "fit_acceleration_noise_by_class",
+    "fit_by_held_out",
     "fit_interactions",
     "fit_interactions_in_view",
     "fit_networks",

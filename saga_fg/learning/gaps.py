@@ -65,6 +65,12 @@ class GapSample:
     def select(self, rows: IntArray) -> Self:
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
+    def drawn(self, most: int, seed: int) -> Self:
+        """At most so many of them, drawn at random."""
+        if len(self) <= most:
+            return self
+        return self.select(np.sort(np.random.default_rng(seed).choice(len(self), most, replace=False)))
+
     @classmethod
     def pool(cls, samples: list[Self]) -> Self:
         """Samples of equal numbers of steps and neighbours, one after another."""

@@ -99,7 +99,7 @@ class JointGaps:
             if at >= len(self._of):
                 break
             dt = (self._of.time[at] - self._of.time[before]) / SUBSTEPS
-            for _ in range(SUBSTEPS):
+            for part in range(SUBSTEPS):
                 heading = self._filtered.heading[before].copy()
                 heading[hidden] = course[hidden]
                 v = state.mean([hidden])[0, 2:]
@@ -111,6 +111,7 @@ class JointGaps:
                     dt,
                     hidden_moved=bool(self._filtered.has_moved[k, hidden]),
                     hidden=hidden,
+                    unseen=self._of.time[before] - self._of.time[k] + part * dt,
                 )
                 new = state.mean([hidden])[0, 2:]
                 if self._filtered.has_moved[k, hidden] and v @ v > TURNS_ABOVE**2:
@@ -133,6 +134,7 @@ class JointGaps:
         dt: float,
         hidden: int = -1,
         hidden_moved: bool = False,
+        unseen: float = 0.0,
     ) -> None:
         mean = state.mean(rows)
         moved = self._filtered.has_moved[k, rows].copy()
@@ -147,6 +149,7 @@ class JointGaps:
             self._of.length[rows],
             np.trace(state.covariance(rows)[:, 2:, 2:], axis1=1, axis2=2) / 2,
             moved,
+            unseen=np.where(rows == hidden, unseen, 0.0),
         )
         state.predict(discretise(build_graph(nodes, self._rules, explained_noise=self._explained), dt))
 

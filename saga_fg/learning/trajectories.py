@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, StrArray
+from saga_fg.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.boxes import Boxes
 from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
@@ -61,7 +61,10 @@ class Trajectories:
 
     def until(self, time: float) -> Self:
         """The moments up to a time after the first, s."""
-        kept = self.time <= self.time[0] + time
+        return self.moments(self.time <= self.time[0] + time)
+
+    def moments(self, kept: BoolArray | slice) -> Self:
+        """Some of the moments."""
         return replace(self, time=self.time[kept], position=self.position[kept], heading=self.heading[kept])
 
     def __len__(self) -> int:

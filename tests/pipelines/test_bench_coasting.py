@@ -57,27 +57,26 @@ def test_who_walks_beside_another_is_in_company():
     gaps = sample_gaps(people, filtered, ("pedestrian",))
     assert (coasting_trajectories._in_company(gaps) == (gaps.row < 2)).all()
     assert len(gaps) > 10
-    few = coasting_trajectories.drawn_gaps(gaps, 5)
-    assert len(few) == 5
-    assert set(few.moment.tolist()) <= set(gaps.moment.tolist())
 
 
 def test_a_recording_is_judged_by_what_the_others_taught(monkeypatch):
     """Drawn pairs, whose cars follow as the rule says that takes the place of what is learned."""
     rule, taught_by = Following(CarFollowing(time_constant=math.inf), rate=RATE, gap_scale=100.0), []
 
-    def fit(sample, position_noise, acceleration_noise):
-        taught_by.append(set(sample.recording.tolist()))
-        return FittedInteractions((rule,), acceleration_noise, 0.0, 0.0)
+    def fit(recordings, classes, own, fit, settings):
+        taught_by.append([id(each) for each in recordings])
+        return FittedInteractions((rule,), own.acceleration_noise, 0.0, 0.0)
 
-    monkeypatch.setattr(coasting_trajectories, "fit_interactions", fit)
+    monkeypatch.setattr(coasting_trajectories, "fit_by_held_out", fit)
     recordings = {str(seed): following_pairs(pairs=2, moments=80, seed=seed) for seed in range(2)}
     errors, learned = coasting_trajectories.coasting_errors(recordings, ("car",), ())
-    assert taught_by == [{1}, {0}], "no fold is tested on what it was fitted to"
+    first, second = map(id, recordings.values())
+    assert taught_by == [[second], [first]], "no fold is tested on what it was fitted to"
     assert len(learned["learned"]) == 2
     np.testing.assert_allclose(
         errors.errors["hand-crafted"], errors.errors["kf"], atol=1e-6, err_msg="no rules: independent objects"
     )
+    np.testing.assert_allclose(errors.errors["noise alone"], errors.errors["kf"], err_msg="that of kf, here")
     _, at = errors.at(2.0)
     kf, ours = at.errors["kf"], at.errors["learned"]
     assert len(kf) > 20
@@ -93,7 +92,7 @@ def test_networks_are_judged_beside_the_rest_where_they_are_asked_for(monkeypatc
     recordings = {str(seed): following_pairs(pairs=1, moments=50, seed=seed) for seed in range(2)}
     settings = CoastingSettings(network=True, tested_folds=1)
     errors, learned = coasting_trajectories.coasting_errors(recordings, ("car",), (), settings)
-    assert list(errors.errors) == ["kf", "hand-crafted", "learned", "network"]
+    assert list(errors.errors) == ["kf", "hand-crafted", "learned", "network", "noise alone"]
     assert {method: len(found) for method, found in learned.items()} == {"learned": 1, "network": 1}
     assert set(errors.recording.tolist()) == {0}
     np.testing.assert_allclose(errors.errors["network"], errors.errors["kf"], atol=1e-6)

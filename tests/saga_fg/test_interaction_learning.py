@@ -9,6 +9,7 @@ from following_pairs import GAP, RATE, following_pairs
 
 from saga_fg import InputError
 from saga_fg.edge_features import EdgeFeatures
+from saga_fg.edge_news import News
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.interactions import CarFollowing, SharedCourse, SharedVelocity
 from saga_fg.learning import (
@@ -117,6 +118,30 @@ def test_a_gap_knows_its_neighbours_and_where_the_object_reappears():
     late = np.flatnonzero(sample.moment == 50)
     assert np.isnan(sample.measured[late][:, 1:]).all()
     assert (sample.dt[late][:, 1:] == 0).all()
+
+
+def test_of_many_gaps_some_are_drawn_the_same_every_time():
+    _, sample = gaps_of(following_pairs(pairs=2, moments=60))
+    few = sample.drawn(5, seed=1)
+    assert len(few) == 5
+    assert set(zip(few.moment, few.row, strict=True)) <= set(zip(sample.moment, sample.row, strict=True))
+    np.testing.assert_array_equal(sample.drawn(5, seed=1).moment, few.moment)
+    assert sample.drawn(len(sample), seed=1) is sample
+
+
+def test_edges_that_tell_the_hidden_alone_leave_those_in_view_to_their_measurements():
+    trajectories = following_pairs(pairs=2, moments=80)
+    filtered, sample = gaps_of(trajectories)
+
+    def errors(news):
+        rule = dataclasses.replace(FOLLOW, rate=RATE, news=news)
+        return JointGaps(trajectories, filtered, {"default": 1.5}, 0.005, (rule,)).errors(sample, GapSettings())
+
+    kf, hidden, nobody = errors(News(1e6)), errors(News(1.0, 1e6)), errors(News(1e4, 1e-3))
+    np.testing.assert_allclose(kf, nobody, atol=1e-3)
+    at_once = gap_errors(sample, predict_gaps(sample, alone, 1.5, 0.0))
+    np.testing.assert_allclose(kf, at_once, atol=1e-3)
+    assert np.nanmean(hidden[:, -1]) < 0.8 * np.nanmean(kf[:, -1])
 
 
 def test_the_noise_of_the_classical_filter_is_found_again():

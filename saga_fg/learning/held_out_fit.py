@@ -1,0 +1,154 @@
+r"""Where learned interactions act, by recordings that are held out: everywhere, on what is hidden, or not at all.
+
+Interactions are fitted (`interaction_fit`) to gaps that begin with what the classical filter knows. A joint filter
+whose edges always act treats objects in view otherwise, too. That may be right or wrong: parked cars that seem to move
+because the pose of the vehicle errs move alike; errors of labels that were set one by one have nothing in common. So
+the recordings are dealt into two parts, and what one taught is tried by the joint filter (`joint_gaps`) on the other:
+
+    everywhere           edges act as fitted, with the process noise that was fitted with them
+    hidden               edges count by what they have to tell (`News`): nothing to those in view, soon all to the rest
+    hidden, own noise    the same with the process noise of the classical filter
+    nowhere              the classical filter
+
+The form with the least ratio of errors to those of the classical filter, which has 1, is given to what all recordings
+taught. The ratio is the mean over the lengths of the gaps of the larger of two ratios, of the means and of the medians,
+so that neither the many small errors nor the few large ones pay for the others. Each group of classes between which
+there are edges has its own form. Who is in no group keeps the noise of the classical filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.edge_network import EdgeNetwork
+from saga_fg.edge_news import News
+from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.learning.gap_prediction import gap_errors, predict_gaps
+from saga_fg.learning.gaps import GapSample, GapSettings, sample_gaps
+from saga_fg.learning.interaction_fit import MOST_GAPS, FittedInteractions, fit_interactions
+from saga_fg.learning.joint_gaps import JointGaps
+from saga_fg.learning.own_motion_fit import OwnMotion
+from saga_fg.learning.trajectories import Trajectories
+
+TRIED_GAPS = 40  # of a recording
+HIDDEN = News(spread=0.5, unseen_acceleration=2.0)
+
+
+class Form(NamedTuple):
+    """How fitted interactions act: what makes edges count, if anything, and whether the fitted noise is taken."""
+
+    news: News | None
+    fitted_noise: bool
+
+
+FORMS = {"everywhere": Form(None, True), "hidden": Form(HIDDEN, True), "hidden, own noise": Form(HIDDEN, False)}
+CLASSICAL = "classical"
+Rules = tuple[Following | Neighbours | EdgeNetwork, ...]
+Fit = Callable[[GapSample, float, Mapping[str, float]], FittedInteractions]
+Trial = tuple[StrArray, dict[str, FloatArray]]
+"""Labels (n,) of gaps, and their errors (n, S) by form and of the classical filter, m."""
+
+
+def fit_by_held_out(
+    recordings: Sequence[Trajectories],
+    classes: tuple[str, ...],
+    own: OwnMotion,
+    fit: Fit = fit_interactions,
+    settings: GapSettings | None = None,
+) -> FittedInteractions:
+    """What `fit` learns from all recordings, acting where that lowers errors on recordings held out.
+
+    classes     those that are hidden
+    own         process and position noise of the classical filter
+    fit         `fit_interactions` or `fit_networks`; raises `InputError` where there is nothing to learn from
+    """
+    settings = settings or GapSettings()
+    fitted = fit(_gaps(recordings, classes, own, settings), own.position_noise, own.acceleration_noise)
+    first, second = held_out_parts(recordings)
+    trials: list[Trial] = []
+    for teaching, tried in ((first, second), (second, first)):
+        sample = _gaps(teaching, classes, own, settings).drawn(MOST_GAPS // 2, seed=3)
+        if len(sample):
+            taught = fit(sample, own.position_noise, own.acceleration_noise)
+            trials += [_trial(each, taught, classes, own, settings) for each in tried]
+    rules: list[Following | Neighbours | EdgeNetwork] = []
+    noise = dict(own.acceleration_noise)
+    for group in coupled_classes(fitted.rules):
+        ratios = {form: _ratio(trials, group, form, own.position_noise) for form in FORMS}
+        form = FORMS[best := min(ratios, key=lambda each: ratios[each])]
+        if ratios[best] < 1:
+            rules += [replace(rule, news=form.news) for rule in fitted.rules if group.issuperset(rule.classes)]
+            if form.fitted_noise:
+                noise |= {label: q for label, q in fitted.acceleration_noise.items() if label in group}
+    return replace(fitted, rules=tuple(rules), acceleration_noise=noise)
+
+
+def held_out_parts(recordings: Sequence[Trajectories]) -> tuple[list[Trajectories], list[Trajectories]]:
+    """Every other recording and the rest; the halves of a single one."""
+    if len(recordings) > 1:
+        return list(recordings[0::2]), list(recordings[1::2])
+    (only,) = recordings
+    half = len(only) // 2
+    return [only.moments(slice(half))], [only.moments(slice(half, None))]
+
+
+def coupled_classes(rules: Rules) -> list[set[str]]:
+    """Groups of classes; there are no edges between one and another."""
+    groups: list[set[str]] = []
+    for rule in rules:
+        mine = set(rule.classes)
+        touched = [group for group in groups if group & mine]
+        groups = [group for group in groups if group not in touched] + [mine.union(*touched)]
+    return groups
+
+
+def _gaps(
+    recordings: Sequence[Trajectories], classes: tuple[str, ...], own: OwnMotion, settings: GapSettings
+) -> GapSample:
+    return GapSample.pool(
+        [sample_gaps(each, own.filtered(each), classes, settings, k) for k, each in enumerate(recordings)]
+    )
+
+
+def _trial(
+    of: Trajectories, taught: FittedInteractions, classes: tuple[str, ...], own: OwnMotion, settings: GapSettings
+) -> Trial:
+    filtered = own.filtered(of)
+    gaps = sample_gaps(of, filtered, classes, settings).drawn(TRIED_GAPS, seed=2)
+    errors = {CLASSICAL: gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0))}
+    for name, form in FORMS.items():
+        rules = [replace(rule, news=form.news) for rule in taught.rules]
+        noise = taught.acceleration_noise if form.fitted_noise else own.acceleration_noise
+        joint = JointGaps(of, filtered, noise, own.position_noise, rules, taught.explained_noise)
+        errors[name] = joint.errors(gaps, settings)
+    return gaps.label, errors
+
+
+def _ratio(trials: Sequence[Trial], group: set[str], form: str, position_noise: float) -> float:
+    """Errors of a form against the classical filter's, see the module; 1 where nothing was tried."""
+    ratios = []
+    for step in range(max((errors[form].shape[1] for _, errors in trials), default=0)):
+        pairs = [
+            (errors[form][known, step], errors[CLASSICAL][known, step])
+            for label, errors in trials
+            if (known := _known(label, errors, group, form, step)).any()
+        ]
+        if pairs:
+            mine, classical = (np.concatenate(each) for each in zip(*pairs, strict=True))
+            ratios.append(
+                max(  # what is smaller than the noise of the places is no difference
+                    float((average(mine) + position_noise) / (average(classical) + position_noise))
+                    for average in (np.mean, np.median)
+                )
+            )
+    return float(np.mean(ratios)) if ratios else 1.0
+
+
+def _known(label: StrArray, errors: Mapping[str, FloatArray], group: set[str], form: str, step: int) -> BoolArray:
+    finite = np.isfinite(errors[form][:, step]) & np.isfinite(errors[CLASSICAL][:, step])
+    return np.asarray(finite & np.isin(label, list(group)))
