@@ -124,7 +124,8 @@ class KittiSet:
                 f = kitti_tracking_figures([pairs[row] for row in rows], label, iou)
                 if f is not None:
                     name = label if iou == 0.25 else f"{label} at {iou:g}"
-                    figures |= {f"{name} sAMOTA": f.samota, f"{name} MOTA": f.mota, f"{name} IDS": float(f.ids)}
+                    figures |= {f"{name} sAMOTA": f.samota, f"{name} AMOTA": f.amota}
+                    figures |= {f"{name} MOTA": f.mota, f"{name} IDS": float(f.ids)}
             return figures
 
         def of_cars() -> Sequence[HotaRow]:

@@ -60,7 +60,7 @@ def _stages(result: SetResult) -> FigureTable:
 def _headline(name: str, value: float) -> str:
     if name.endswith("IDS") or name == "FRAG":
         return cell(value, 0)
-    return cell(100 * value, 2) if name.endswith((" MOTA", " sAMOTA")) else cell(value)  # KITTI: in %
+    return cell(100 * value, 2) if name.endswith((" MOTA", " AMOTA", " sAMOTA")) else cell(value)  # KITTI: in %
 
 
 def _differences(result: SetResult) -> list[FigureTable]:

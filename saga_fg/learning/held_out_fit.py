@@ -136,7 +136,7 @@ def _ratio(trials: Sequence[Trial], group: set[str], form: str, position_noise: 
         pairs = [
             (errors[form][known, step], errors[CLASSICAL][known, step])
             for label, errors in trials
-            if (known := _known(label, errors, group, form, step)).any()
+            if step < errors[form].shape[1] and (known := _known(label, errors, group, form, step)).any()
         ]
         if pairs:
             mine, classical = (np.concatenate(each) for each in zip(*pairs, strict=True))

@@ -14,6 +14,7 @@ from saga_fg.learning import (
     GapSettings,
     OwnMotion,
     fit_by_held_out,
+    gap_moments,
 )
 from saga_fg.learning.held_out_fit import HIDDEN, coupled_classes, held_out_parts
 
@@ -62,6 +63,15 @@ def test_a_single_recording_is_held_out_by_halves():
     parts = held_out_parts([first, second, only])
     assert [[id(each) for each in part] for part in parts] == [[id(first), id(only)], [id(second)]]
     assert len(fitted(teaches(FOLLOW), seeds=(0,)).rules) == 1
+
+
+def test_halves_whose_gaps_have_other_steps_are_tried_as_far_as_they_go():
+    often = following_pairs(pairs=2, moments=90)
+    k = np.arange(90)
+    recording = often.moments((k < 30) | (k % 4 == 0))  # steps of 0.5 s, then of 0.4 s
+    parts = [half for (half,) in held_out_parts([recording])]
+    assert [gap_moments(half, SHORT)[2] for half in parts] == [3, 4]
+    assert len(fit_by_held_out([recording], ("car",), OWN, teaches(FOLLOW), SHORT).rules) == 1
 
 
 def test_without_anything_to_try_on_nothing_is_believed():
