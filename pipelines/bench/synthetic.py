@@ -54,6 +54,7 @@ LABEL_NOISE = 0.005  # standard deviation of the true positions, which are exact
 TEMPLATE = Neighbours(
     rate=0.7, distance_scale=10.0, heading_scale=1.0, speed_scale=1.5, max_distance=30.0, max_degree=8, classes=(LABEL,)
 )
+DEGREES = (3, 5)
 """From where interactions are learned: no value is a true one, and more objects may interact than do."""
 
 Sums = Callable[[SceneMetrics], tuple[float, float]]
@@ -72,7 +73,7 @@ def _independent(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfi
 def _learned(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfig:
     """Interactions and process noise fitted to the truth of some scenes of the cell."""
     recordings = [Trajectories.of_truth(scene).until(LEARNED_SECONDS) for scene in scenes[:LEARNED_SCENES]]
-    fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,))
+    fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,), DEGREES)
     config = drawn_config(settings, fitted.rules).with_acceleration_noise(fitted.acceleration_noise)
     return replace(config, tracker=replace(config.tracker, explained_noise=fitted.explained_noise))
 
