@@ -10,6 +10,7 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.learning import (
+    FORMS_OF_TRACKERS,
     GapSettings,
     OwnMotion,
     OwnMotionLikelihood,
@@ -23,7 +24,7 @@ from saga_fg.learning import (
 def learn_interactions(
     recordings: Mapping[str, Trajectories], origin: str, network: bool = False, progress: Progress | None = None
 ) -> LearnedInteractions:
-    """Learn from recordings of one kind; `origin` says in the file where from.
+    """Learn from recordings of one kind, for a tracker; `origin` says in the file where from.
 
     network: train networks (extra [learn]) in place of fitting kernels. Raises `InputError` where no object is followed
     for long enough.
@@ -39,7 +40,7 @@ def learn_interactions(
         raise InputError(f"{origin}: expected objects that are followed for {settings.followed:g} s and more")
     own = OwnMotion.most_likely(likelihoods)
     fit = fit_networks if network else fit_interactions
-    fitted = fit_by_held_out(list(recordings.values()), classes, own, fit, settings)
+    fitted = fit_by_held_out(list(recordings.values()), classes, own, fit, settings, FORMS_OF_TRACKERS)
     return LearnedInteractions(
         learned_from=origin,
         edges=fitted.rules,

@@ -5,7 +5,7 @@ from saga_fg.learning.class_confusion import learn_confusion
 from saga_fg.learning.detection_sample import DetectionSample
 from saga_fg.learning.gap_prediction import gap_errors, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments, sample_gaps
-from saga_fg.learning.held_out_fit import fit_by_held_out
+from saga_fg.learning.held_out_fit import FORMS_OF_TRACKERS, fit_by_held_out
 from saga_fg.learning.independent_filter import FilteredTrajectories, filter_independently
 from saga_fg.learning.interaction_fit import TEMPLATE, FittedInteractions, fit_interactions, predict_with
 from saga_fg.learning.joint_fit import fit_interactions_in_view
@@ -22,6 +22,7 @@ from saga_fg.learning.trajectories import Trajectories
 from saga_fg.learning.truth_matches import GATE, MatchedFrame, match_to_truth, sample_with_truth
 
 __all__ = [
+    "FORMS_OF_TRACKERS",
     "GATE",
     "TEMPLATE",
     "DetectionSample",

@@ -14,6 +14,9 @@ The form with the least ratio of errors to those of the classical filter, which 
 taught. The ratio is the mean over the lengths of the gaps of the larger of two ratios, of the means and of the medians,
 so that neither the many small errors nor the few large ones pay for the others. Each group of classes between which
 there are edges has its own form. Who is in no group keeps the noise of the classical filter.
+
+A tracker has a process noise of its own, which suits its detections, not the one fitted to true positions. What is
+right in view with one is not with the other: it is given edges that leave what is in view alone.
 """
 
 from __future__ import annotations
@@ -47,6 +50,7 @@ class Form(NamedTuple):
 
 
 FORMS = {"everywhere": Form(None, True), "hidden": Form(HIDDEN, True), "hidden, own noise": Form(HIDDEN, False)}
+FORMS_OF_TRACKERS = {"hidden, own noise": FORMS["hidden, own noise"]}
 CLASSICAL = "classical"
 Rules = tuple[Following | Neighbours | EdgeNetwork, ...]
 Fit = Callable[[GapSample, float, Mapping[str, float]], FittedInteractions]
@@ -60,12 +64,14 @@ def fit_by_held_out(
     own: OwnMotion,
     fit: Fit = fit_interactions,
     settings: GapSettings | None = None,
+    forms: Mapping[str, Form] = FORMS,
 ) -> FittedInteractions:
     """What `fit` learns from all recordings, acting where that lowers errors on recordings held out.
 
     classes     those that are hidden
     own         process and position noise of the classical filter
     fit         `fit_interactions` or `fit_networks`; raises `InputError` where there is nothing to learn from
+    forms       to choose from, besides nowhere; `FORMS_OF_TRACKERS` for those that keep a process noise of their own
     """
     settings = settings or GapSettings()
     fitted = fit(_gaps(recordings, classes, own, settings), own.position_noise, own.acceleration_noise)
@@ -75,12 +81,12 @@ def fit_by_held_out(
         sample = _gaps(teaching, classes, own, settings).drawn(MOST_GAPS // 2, seed=3)
         if len(sample):
             taught = fit(sample, own.position_noise, own.acceleration_noise)
-            trials += [_trial(each, taught, classes, own, settings) for each in tried]
+            trials += [_trial(each, taught, classes, own, settings, forms) for each in tried]
     rules: list[Following | Neighbours | EdgeNetwork] = []
     noise = dict(own.acceleration_noise)
     for group in coupled_classes(fitted.rules):
-        ratios = {form: _ratio(trials, group, form, own.position_noise) for form in FORMS}
-        form = FORMS[best := min(ratios, key=lambda each: ratios[each])]
+        ratios = {form: _ratio(trials, group, form, own.position_noise) for form in forms}
+        form = forms[best := min(ratios, key=lambda each: ratios[each])]
         if ratios[best] < 1:
             rules += [replace(rule, news=form.news) for rule in fitted.rules if group.issuperset(rule.classes)]
             if form.fitted_noise:
@@ -116,12 +122,17 @@ def _gaps(
 
 
 def _trial(
-    of: Trajectories, taught: FittedInteractions, classes: tuple[str, ...], own: OwnMotion, settings: GapSettings
+    of: Trajectories,
+    taught: FittedInteractions,
+    classes: tuple[str, ...],
+    own: OwnMotion,
+    settings: GapSettings,
+    forms: Mapping[str, Form],
 ) -> Trial:
     filtered = own.filtered(of)
     gaps = sample_gaps(of, filtered, classes, settings).drawn(TRIED_GAPS, seed=2)
     errors = {CLASSICAL: gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0))}
-    for name, form in FORMS.items():
+    for name, form in forms.items():
         rules = [replace(rule, news=form.news) for rule in taught.rules]
         noise = taught.acceleration_noise if form.fitted_noise else own.acceleration_noise
         joint = JointGaps(of, filtered, noise, own.position_noise, rules, taught.explained_noise)
