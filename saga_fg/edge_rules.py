@@ -19,6 +19,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked, checked_row
 from saga_fg.edge_features import EdgeFeatures, features_of
 from saga_fg.edge_news import News, counted, news_setting
 from saga_fg.errors import InputError
+from saga_fg.intelligent_driver import IntelligentDriver
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.node import distinct_types
 from saga_fg.road.cone_geometry import ConeGeometry, anticipated
@@ -100,7 +101,7 @@ class Neighbours:
 class Following:
     """A vehicle is led by the nearest vehicle ahead in its lane, as far as headings tell the lane."""
 
-    interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
+    interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
     rate: float = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
@@ -110,14 +111,21 @@ class Following:
     heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
     news: News | None = news_setting()
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
+    apart: float = setting(
+        0.0,
+        "leaders are ahead by at least this share of half of both lengths: nearer is itself, tracked twice",
+    )
     leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
     cones: ConeGeometry | None = settings_group(
         lambda: None, "vehicles that cones push aside lead, and are led, where they will be then; null: where they are"
     )
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    towed: tuple[str, ...] = setting(
+        (), "those among them that lead and are not led: a trailer goes where its truck does"
+    )
 
     def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate", "max_gap")
+        require_between(self, 0, math.inf, "rate", "max_gap", "apart")
         require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
         require_one_of(self, "leaders", get_args(Leaders))
 
@@ -143,7 +151,9 @@ class Following:
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
         target, source = close_pairs(seen.position, able, self.max_gap)
         features = features_of(seen, target, source)
-        rate = counted(self.news, self.strength(features), nodes, target, source)
+        near = self.apart * (nodes.length[target] + nodes.length[source]) / 2
+        led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
+        rate = counted(self.news, np.where(led, self.strength(features), 0.0), nodes, target, source)
         nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
 

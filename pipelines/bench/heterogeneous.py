@@ -10,12 +10,14 @@ in two seconds:
 
 *Affected* are the moving objects that a closed light, cones or a coupling concerns at the moment of the question,
 whatever they do later; all other moving objects are the *others*, whom the additional nodes must not harm. Compared are
-objects that have been in view for a while and that all trackers follow. Intervals are paired bootstraps over scenes.
+objects that have been in view for a while and that all trackers follow. *Hidden* are parts of coupled pairs that were
+not seen for two seconds while the other part was (`pipelines.bench.hidden_parts`). Intervals are paired bootstraps over
+scenes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +28,7 @@ from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import build_world
+from pipelines.bench.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, without_parts
 from pipelines.bench.predictions import Asked, prediction_errors
 from pipelines.config import TrackConfig, load_config
 from pipelines.figures import FigureTable, cell
@@ -39,7 +42,7 @@ FIRST, EVERY = 2.0, 0.5  # s: the first question, and from one to the next
 RATE = 5.0  # frames a second of either sensor
 MOVING = 0.5  # m/s
 FOLLOWED = 1.5  # s in view before the question: sooner, nobody knows a velocity
-GROUPS = ("affected", "others")
+GROUPS = ("affected", "others", "hidden")
 BASELINES = ("cars", "shipped", "kf")
 
 
@@ -130,11 +133,23 @@ def _errors_of_scene(
         name: prediction_errors(scene, method.new_tracker("saga"), HORIZON, rows, moving.__getitem__)
         for name, method in methods.items()
     }
-    common: list[Asked] = sorted(set.intersection(*(set(found) for found in answers.values())))
-    groups: dict[str, list[Asked]] = {group: [] for group in GROUPS}
-    for object_id, row in common:
-        groups["affected" if object_id in concerned[row] else "others"].append((object_id, row))
-    return {group: {name: [answers[name][q] for q in asked] for name in methods} for group, asked in groups.items()}
+    affected_ones: set[Asked] = {(name, row) for row in rows for name in concerned[row]}
+    hidden: dict[str, Mapping[Asked, float]] = {name: {} for name in methods}
+    if kind in COUPLED:
+        times = hidings(scene, COUPLED[kind])
+        frames = without_parts(scene, world, times)
+        hidden = {name: hidden_errors(scene, frames, cfg.new_tracker("saga"), times) for name, cfg in methods.items()}
+    return {
+        "affected": _of_all(answers, lambda asked: asked in affected_ones),
+        "others": _of_all(answers, lambda asked: asked not in affected_ones),
+        "hidden": _of_all(hidden, lambda asked: True),
+    }
+
+
+def _of_all(answers: Mapping[str, Mapping[Asked, float]], wanted: Callable[[Asked], bool]) -> dict[str, list[float]]:
+    """The errors of the wanted questions that all methods answer, in one order."""
+    common = sorted(filter(wanted, set.intersection(*(set(found) for found in answers.values()))))
+    return {name: [found[q] for q in common] for name, found in answers.items()}
 
 
 def _followed(moments: Sequence[Annotations]) -> StrArray:
@@ -183,7 +198,8 @@ def tables(results: Sequence[KindFigures]) -> list[FigureTable]:
                 means = (cell(figures.mean[name], 2) for name in ("full", *BASELINES))
                 changes = (_percent(figures.change[name]) for name in BASELINES)
                 rows.append((result.kind, str(figures.count), *means, *changes))
-        title = f"{group}: mean error of predictions over {HORIZON:g} s, m; change with its 95 % interval"
+        what = f"predictions over {HORIZON:g} s" if group != "hidden" else f"places after {HIDDEN:g} s unseen"
+        title = f"{group}: mean error of {what}, m; change with its 95 % interval"
         if rows:
             found.append(FigureTable(title, columns, tuple(rows)))
     return found

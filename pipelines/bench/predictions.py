@@ -40,7 +40,7 @@ def prediction_errors(
             later = int(np.argmin(np.abs(scene.timestamps - time - horizon)))
             now, then = scene.ground_truth[row], scene.ground_truth[later]
             wanted = np.flatnonzero(now.visible & np.isin(now.id, asked(row)))
-            track_id = _own_tracks(tracker.tracks(time), now.boxes.select(wanted))
+            track_id = own_tracks(tracker.tracks(time), now.boxes.select(wanted))
             predicted = tracker.tracks(float(scene.timestamps[later]))
             for name, track in zip(now.id[wanted].tolist(), track_id.tolist(), strict=True):
                 at, true = np.flatnonzero(predicted.id == track), np.flatnonzero(then.id == name)
@@ -50,7 +50,7 @@ def prediction_errors(
     return errors
 
 
-def _own_tracks(tracks: Tracks, objects: Boxes) -> IntArray:
+def own_tracks(tracks: Tracks, objects: Boxes) -> IntArray:
     """(n,) ids of the tracks of n objects of the same moment, -1 for none."""
     offset = objects.position[:, None, :2] - tracks.boxes.position[:, :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])

@@ -14,7 +14,8 @@ The rule: of the vehicles that come to a line, the first of each lane that can s
 
 since nobody brakes for a line far away; who would have to brake harder than `hardest` to stop before it goes on. Those
 behind follow by other interactions. Lanes of the map tell who comes to the line; without them, straight on along the
-heading.
+heading. Or the vehicle comes to the line as a driver does, the line being a leader that stands
+(`saga_fg.intelligent_driver`): late and harder rather than evenly, and on to the line who is slow.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ import numpy as np
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.edge_rules import VEHICLES, Pairs
 from saga_fg.geometry import wrap_angle
+from saga_fg.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.node import NodeType
 from saga_fg.road.polyline import feet, on_it
 from saga_fg.road.road_map import LANE, STOP_LINE
 from saga_fg.settings import require_between, require_positive, setting, settings_group
 
-LEAST_GAP = 0.5  # m; nearer, v^2 / (2 g) is all noise
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
 
 
@@ -95,26 +96,58 @@ class Stopping:
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         ways = approach(nodes, target, source)
-        u, g = ways.direction, self.gap(nodes, target, ways.way)
-        v = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], u), 0.0)
-        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-        p_j = nodes.types[source[0]].index(POSITION)
-        along = self.time_constant * u[:, :, None] * u[:, None, :]
-        slower, nearer = v / g, v**2 / (2 * g**2)
-        straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
-        triples = no_triples(nodes, target, source)
-        triples.A_self[:, v_i[:, None], v_i] = -along * slower[:, None, None]
-        triples.A_self[:, v_i[:, None], p_i] = -along * nearer[:, None, None]
-        triples.A_other[:, v_i[:, None], p_j] = along * nearer[:, None, None]
-        triples.b[:, v_i] = self.time_constant * u * (v**2 / (2 * g) - nearer * straight)[:, None]
-        return triples
+        g, v = self.gap(nodes, target, ways.way), _speed_along(nodes, target, ways)
+        braking = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), np.zeros_like(v))
+        return _along_the_lane(nodes, target, source, ways, v, braking, self.time_constant)
+
+
+@dataclass(frozen=True)
+class DriverStopping:
+    """Coming to a line as to the end of a queue; the source is the line."""
+
+    driver: IntelligentDriver = settings_group(IntelligentDriver, "how he drives; his standstill gap is to the line")
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(POSITION + VELOCITY) and source.has(POSITION)
+
+    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
+        """Gap (E,), m, for ways (E,) from the centres to the line."""
+        return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        ways = approach(nodes, target, source)
+        v = _speed_along(nodes, target, ways)
+        f = self.driver.stopping(v, self.gap(nodes, target, ways.way))
+        return _along_the_lane(nodes, target, source, ways, v, f, self.driver.time_constant)
+
+
+def _speed_along(nodes: NodeTable, target: IntArray, ways: Approach) -> FloatArray:
+    """(E,) speeds along the lane, m/s, not below 0."""
+    return np.asarray(np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0))
+
+
+def _along_the_lane(
+    nodes: NodeTable, target: IntArray, source: IntArray, ways: Approach, v: FloatArray, f: Linearised, tau: float
+) -> Triples:
+    """The triples of an acceleration along the lane, linearised at the speeds v (E,) and the ways to the line."""
+    u = ways.direction
+    p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+    p_j = nodes.types[source[0]].index(POSITION)
+    along = tau * u[:, :, None] * u[:, None, :]
+    straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
+    triples = no_triples(nodes, target, source)
+    triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
+    triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
+    triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
+    triples.b[:, v_i] = tau * u * (f.value - f.by_speed * v - f.by_gap * straight)[:, None]
+    return triples
 
 
 @dataclass(frozen=True)
 class RedLight:
     """The first vehicle that comes to a closed stop line, and can stop, does."""
 
-    interaction: Stopping = settings_group(Stopping, "interaction function of the edges")
+    interaction: Stopping | DriverStopping = settings_group(Stopping, "interaction function of the edges")
     rate: float = setting(1.0, "strength of an edge of a vehicle that brakes for a line surely closed, 1/s")
     max_distance: float = setting(100.0, "nobody brakes for a line further away, m")
     noticed: float = setting(0.3, "needed deceleration from which drivers begin to react, m/s^2")
@@ -135,7 +168,7 @@ class RedLight:
         near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= self.max_distance
         target, source = target[near], source[near]
         ways = approach(nodes, target, source)
-        v = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0)
+        v = _speed_along(nodes, target, ways)
         front = ways.way - nodes.length[target] / 2  # of the vehicle, before the line
         stops = np.flatnonzero(ways.comes & (front > 0) & (v**2 <= 2 * self.hardest * front))
         preceded = _in_one_lane(source[stops], ways.crossing[stops]) & (ways.way[stops] < ways.way[stops, None])
