@@ -105,12 +105,21 @@ class Traffic:
         turn = smooth_step_slope(q) / self._change_length
         return d0 + weight * (d - d0), slope0 + weight * (slope - slope0) + turn * (d - d0)
 
+    def react(self) -> None:
+        """Everybody does already what he wants now, as who has had his reaction time to look around."""
+        wish = self._wish(self.order(), self._metric())
+        self._pending = [wish] * len(self._pending)
+
+    def _metric(self) -> FloatArray:
+        """Length over ground per unit of s (N,)."""
+        d, slope = self.lateral()
+        return self._lanes.metric(self.lane, self.s, d, slope)
+
     def step(self) -> None:
         """Move everybody by one step of time."""
         h = self._step
         order = self.order()
-        d, slope = self.lateral()
-        metric = self._lanes.metric(self.lane, self.s, d, slope)
+        metric = self._metric()
         wish = self._wish(order, metric)
         if self._steps % max(1, round(CHANGE_INTERVAL / h)) == 0:
             self._start_changes(wish, order)

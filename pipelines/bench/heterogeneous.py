@@ -7,6 +7,8 @@ in two seconds:
     cars     the same settings without the edges that cones, the roadside and couplings take part in
     shipped  the graph of cars as shipped for simulated traffic
     kf       no edges
+    floor    at junctions and road works: the estimates of `full`, predicted by who knows how drivers drive, when the
+             lights change, and who is hidden (`pipelines.bench.foreseeing`)
 
 *Affected* are the moving objects that a closed light, cones or a coupling concerns at the moment of the question,
 whatever they do later; all other moving objects are the *others*, whom the additional nodes must not harm. Compared are
@@ -28,11 +30,12 @@ from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import build_world
+from pipelines.bench.foreseeing import Foreseeing
 from pipelines.bench.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, without_parts
 from pipelines.bench.predictions import Asked, prediction_errors
 from pipelines.config import TrackConfig, load_config
 from pipelines.figures import FigureTable, cell
-from pipelines.tracking import Progress
+from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.arrays import FloatArray, StrArray
 from saga_fg.dataset import Annotations
 from saga_fg.edge_rules import Following, Neighbours
@@ -53,6 +56,7 @@ class GroupFigures:
     count    predictions
     mean, rmse, median  errors by method, m
     change   of the mean error of `full` against each baseline, less 1
+    floor    of the mean error of the floor against `cars`, less 1; None where there is no floor
     """
 
     count: int
@@ -60,6 +64,7 @@ class GroupFigures:
     rmse: Mapping[str, float]
     median: Mapping[str, float]
     change: Mapping[str, Interval]
+    floor: Interval | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +134,11 @@ def _errors_of_scene(
     concerned = {row: set(affected(world, float(scene.timestamps[row]) - offset).tolist()) for row in rows}
     back = round(FOLLOWED * settings.keyframe_rate)
     moving = {row: _followed(scene.ground_truth[row - back : row + 1]) for row in rows}
+    trackers: dict[str, OnlineTracker] = {name: method.new_tracker("saga") for name, method in methods.items()}
+    if kind not in COUPLED:
+        trackers["floor"] = Foreseeing(methods["full"].new_tracker("saga"), world, settings, offset)
     answers = {
-        name: prediction_errors(scene, method.new_tracker("saga"), HORIZON, rows, moving.__getitem__)
-        for name, method in methods.items()
+        name: prediction_errors(scene, tracker, HORIZON, rows, moving.__getitem__) for name, tracker in trackers.items()
     }
     affected_ones: set[Asked] = {(name, row) for row in rows for name in concerned[row]}
     hidden: dict[str, Mapping[Asked, float]] = {name: {} for name in methods}
@@ -162,7 +169,7 @@ def _followed(moments: Sequence[Annotations]) -> StrArray:
 
 
 def _figures(scenes: Sequence[Mapping[str, Sequence[float]]]) -> GroupFigures:
-    names = ("full", *BASELINES)
+    names = tuple(scenes[0])
     pooled = {name: np.concatenate([np.asarray(scene[name], dtype=np.float64) for scene in scenes]) for name in names}
     sums = {name: np.array([[sum(scene[name]), len(scene[name])] for scene in scenes], dtype=float) for name in names}
     count = len(pooled["full"])
@@ -171,7 +178,8 @@ def _figures(scenes: Sequence[Mapping[str, Sequence[float]]]) -> GroupFigures:
         return {name: float(figure(errors)) if count else float("nan") for name, errors in pooled.items()}
 
     change = {name: paired_bootstrap(sums["full"], sums[name], ratio_of_sums) for name in BASELINES}
-    return GroupFigures(count, each(np.mean), each(_rms), each(np.median), change)
+    floor = paired_bootstrap(sums["floor"], sums["cars"], ratio_of_sums) if "floor" in names else None
+    return GroupFigures(count, each(np.mean), each(_rms), each(np.median), change, floor)
 
 
 def _rms(errors: FloatArray) -> float:
@@ -190,6 +198,7 @@ def tables(results: Sequence[KindFigures]) -> list[FigureTable]:
             "shipped",
             "kf",
             *(f"full / {name} - 1" for name in BASELINES),
+            "floor / cars - 1",
         )
         rows = []
         for result in results:
@@ -197,7 +206,8 @@ def tables(results: Sequence[KindFigures]) -> list[FigureTable]:
             if figures.count:
                 means = (cell(figures.mean[name], 2) for name in ("full", *BASELINES))
                 changes = (_percent(figures.change[name]) for name in BASELINES)
-                rows.append((result.kind, str(figures.count), *means, *changes))
+                floor = "" if figures.floor is None else _percent(figures.floor)
+                rows.append((result.kind, str(figures.count), *means, *changes, floor))
         what = f"predictions over {HORIZON:g} s" if group != "hidden" else f"places after {HIDDEN:g} s unseen"
         title = f"{group}: mean error of {what}, m; change with its 95 % interval"
         if rows:

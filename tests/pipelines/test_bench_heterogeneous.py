@@ -76,7 +76,8 @@ def test_the_command_prints_and_writes_its_figures(tmp_path):
     (kind,) = json.loads(path.read_text())
     assert kind["seeds"] == [0, 1]
     assert kind["groups"]["others"]["count"] > 0
-    assert set(kind["groups"]["others"]["mean"]) == {"full", "cars", "shipped", "kf"}
+    assert set(kind["groups"]["others"]["mean"]) == {"full", "cars", "shipped", "kf", "floor"}
+    assert kind["groups"]["others"]["floor"]["estimate"] < 0
 
 
 def test_an_unknown_kind_is_refused():
