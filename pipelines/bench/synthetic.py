@@ -71,9 +71,11 @@ def _independent(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfi
 
 
 def _learned(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfig:
-    """Interactions and process noise fitted to the truth of some scenes of the cell."""
+    """Interactions and process noise fitted to the truth of some scenes of the cell; as kf where nothing is shared."""
     recordings = [Trajectories.of_truth(scene).until(LEARNED_SECONDS) for scene in scenes[:LEARNED_SCENES]]
     fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,), DEGREES)
+    if not fitted.rules:
+        return _independent(settings, scenes)
     config = drawn_config(settings, fitted.rules).with_acceleration_noise(fitted.acceleration_noise)
     return replace(config, tracker=replace(config.tracker, explained_noise=fitted.explained_noise))
 
@@ -152,7 +154,9 @@ def synthetic(
             progress(name, done + 1, len(cells))
     interacting = [cell for cell in measured if cells[cell.name].coupling > 0]
     dense = [cell for cell in measured if cell.name in DENSE]
-    return SyntheticResult(tuple(measured), _pooled("interacting", interacting), _pooled("dense, hidden", dense))
+    return SyntheticResult(
+        tuple(measured), _pooled("all interacting", interacting), _pooled("both dense, hidden", dense)
+    )
 
 
 def _cell(name: str, settings: DrawnSettings, seeds: Sequence[int]) -> Cell:

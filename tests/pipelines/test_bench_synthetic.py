@@ -82,7 +82,7 @@ def test_the_command_writes_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     result = CliRunner().invoke(app, ["bench", "synthetic", "--seeds", "2", "--json", str(figures)])
     assert result.exit_code == 0, result.output
     read = json.loads(figures.read_text())
-    assert set(read) == {"base", "interacting"}
+    assert set(read) == {"base", "all interacting"}
     assert set(read["base"]["figures"]) == set(bench.CONTENDERS)
     refused = CliRunner().invoke(app, ["bench", "synthetic", "--cells", "nothing"])
     assert refused.exit_code != 0
