@@ -103,6 +103,8 @@ class SeparateGraphTracking:
         seen = self._seen
         rows = seen.nodes
         self._x, self._P = self._x.copy(), self._P.copy()
+        if len(rows) == 0:
+            return
         self._x[rows], self._P[rows] = _updated(self._x[rows], self._P[rows], seen.z, seen.H[0], seen.R)
         i, j = rows[:, None], rows[None]
         z, R = seen.z[None] - seen.z[:, None], seen.R[None] + seen.R[:, None]

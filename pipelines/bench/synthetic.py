@@ -42,10 +42,10 @@ CELLS: Mapping[str, DrawnSettings] = {
     "often hidden": replace(BASE, hidden=0.4),
     "sparse": replace(BASE, spacing=8.0),
     "dense": replace(BASE, spacing=2.5),
-    "dense, hidden": replace(OCCLUDED, coupling=4.0, acceleration_noise=1.0),
-    "dense, hidden, lively": replace(OCCLUDED, coupling=8.0, acceleration_noise=2.0),
+    "dense hidden": replace(OCCLUDED, coupling=4.0, acceleration_noise=1.0),
+    "dense hidden lively": replace(OCCLUDED, coupling=8.0, acceleration_noise=2.0),
 }
-DENSE = ("dense, hidden", "dense, hidden, lively")
+DENSE = ("dense hidden", "dense hidden lively")
 KF, SAGA, GRAPH, LEARNED = "kf", "saga", "graph", "learned"
 FIGURES = ("MOTA", "MOTP", "IDS")
 FIT_SCENES, FIRST_FIT_SEED = 4, 10_000
@@ -155,7 +155,7 @@ def synthetic(
     interacting = [cell for cell in measured if cells[cell.name].coupling > 0]
     dense = [cell for cell in measured if cell.name in DENSE]
     return SyntheticResult(
-        tuple(measured), _pooled("all interacting", interacting), _pooled("both dense, hidden", dense)
+        tuple(measured), _pooled("all interacting", interacting), _pooled("both dense hidden", dense)
     )
 
 

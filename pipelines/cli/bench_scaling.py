@@ -39,7 +39,7 @@ def scaling(
     from pipelines.bench.scaling import ScalingSettings, bench_scaling, write_picture
     from pipelines.figures import FigureTable, cell, write_figures
 
-    sizes = counts("--objects", objects)
+    sizes = counts("--objects", objects, least=2)  # one has no neighbours
     for path in (json_file, output):
         if path is not None:
             check_writable(path)

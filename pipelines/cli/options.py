@@ -86,9 +86,9 @@ def names(option: str, value: str) -> tuple[str, ...]:
     return entries
 
 
-def counts(option: str, value: str) -> tuple[int, ...]:
-    """The entries of a comma-separated option as whole numbers > 0, each once."""
+def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
+    """The entries of a comma-separated option as whole numbers from `least` on, each once."""
     entries = names(option, value)
-    if not all(entry.isdecimal() and int(entry) > 0 for entry in entries):
-        raise InputError(f"{option}: expected whole numbers > 0 with commas between them, got {value!r}")
+    if not all(entry.isdecimal() and int(entry) >= least for entry in entries):
+        raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value!r}")
     return tuple(map(int, entries))

@@ -30,4 +30,4 @@ def test_a_row_for_every_method_and_size(tmp_path: Path) -> None:
 def test_a_number_that_is_none_is_refused(command: str, objects: str) -> None:
     result = CliRunner().invoke(app, ["bench", command, f"--objects={objects}"])
     assert result.exit_code == 2
-    assert "--objects: expected whole numbers > 0" in result.output
+    assert "--objects: expected whole numbers >= " in result.output

@@ -56,3 +56,16 @@ def test_the_command_writes_figures_and_a_picture(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert len(json.loads(figures.read_text())["rows"]) == 8
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_frames_in_which_nobody_is_seen_are_predictions() -> None:
+    """Of two objects the one is hidden, and the other is missed now and then."""
+    rows = {row.contender: row for row in bench_scaling(ScalingSettings((2,), 2, frames=60))}
+    assert rows[JOINT].largest_difference < 1e-9
+    assert all(np.isfinite(row.rmse) for row in rows.values())
+
+
+def test_one_object_has_no_neighbours() -> None:
+    result = CliRunner().invoke(app, ["bench", "scaling", "--objects", "1,5"])
+    assert result.exit_code != 0
+    assert "--objects: expected whole numbers >= 2" in result.output

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from pipelines.bench import synthetic as bench
 from pipelines.bench.drawn_scenes import INTERVAL, DrawnSettings, drawn_scene
 from pipelines.cli.main import app
+from pipelines.cli.options import names
 from saga_fg.edge_rules import Neighbours
 
 SHORT = DrawnSettings(groups=2, members=3, seconds=6.0)
@@ -87,6 +88,16 @@ def test_the_command_writes_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     refused = CliRunner().invoke(app, ["bench", "synthetic", "--cells", "nothing"])
     assert refused.exit_code != 0
     assert "expected some of base" in refused.output
+
+
+def test_every_cell_can_be_asked_for_and_no_pool_has_the_name_of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert names("--cells", ",".join(bench.CELLS)) == tuple(bench.CELLS)
+    monkeypatch.setattr(
+        bench, "_cell", lambda name, settings, seeds: bench.Cell(name, {c: [] for c in bench.CONTENDERS})
+    )
+    result = bench.synthetic(range(2))
+    shown = [part.name for part in (*result.cells, result.interacting, result.dense)]
+    assert len(set(shown)) == len(bench.CELLS) + 2
 
 
 def test_learned_interactions_are_from_scenes_of_other_seeds_and_near_the_true_ones(
