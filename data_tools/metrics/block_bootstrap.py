@@ -45,11 +45,17 @@ def relative_change_of_errors(
     share = np.full(blocks, 1 / blocks)
     weight = np.random.default_rng(seed).multinomial(blocks, share, size=draws)[:, of_row].astype(np.float64)
     ones = np.ones((1, len(first)))
-    estimate = _weighted(first, ones, average)[0] / _weighted(second, ones, average)[0] - 1
-    changes = _weighted(first, weight, average) / _weighted(second, weight, average) - 1
+    (estimate,) = _ratio(_weighted(first, ones, average), _weighted(second, ones, average)) - 1
+    changes = _ratio(_weighted(first, weight, average), _weighted(second, weight, average)) - 1
     tail = (1 - confidence) / 2
     low, high = np.quantile(changes, [tail, 1 - tail])
     return Interval(float(estimate), float(low), float(high), confidence)
+
+
+def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a / b (n,), of numbers >= 0; 1 where neither errs."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((a == 0) & (b == 0), 1.0, a / b)
 
 
 def _weighted(errors: FloatArray, weight: FloatArray, average: Average) -> FloatArray:

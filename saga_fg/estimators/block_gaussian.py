@@ -102,6 +102,26 @@ class BlockGaussian:
         """Joint covariance of the nodes at `rows`, in this order, of any sizes."""
         return joint_block(self.blocks, self.partition, rows)
 
+    def correlated(self, rows: IntArray) -> tuple[IntArray, IntArray]:
+        """Pairs of the nodes `rows` (k,), distinct, that share a component: first < second (E,), places in `rows`."""
+        label = self.partition.label[rows]
+        order = np.argsort(label, kind="stable")
+        count = np.bincount(label, minlength=self.partition.count)
+        later = (np.cumsum(count) - 1)[label[order]] - np.arange(len(rows))  # of the component, after each of them
+        first = np.repeat(np.arange(len(rows)), later)
+        second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
+        return order[first], order[second]
+
+    def between(self, first: IntArray, second: IntArray) -> FloatArray:
+        """Covariances (E, a, b) of nodes `first` (E,) of size a with `second` of size b, of the same components."""
+        dims, old = self.layout.dims, self.partition
+        a, b = (int(dims[rows[0]]) if len(rows) else 0 for rows in (first, second))
+        result = np.empty((len(first), a, b))
+        for number, mine, at in old.members(first, a):
+            rows, columns = old.row[first[mine]], old.offset[second[mine]][:, None] + np.arange(b)
+            result[mine] = self.blocks[number][rows[:, None, None], at[:, :, None], columns[:, None, :]]
+        return result
+
     def variances(self) -> FloatArray:
         """(D,)"""
         variances = np.empty(len(self.mean))

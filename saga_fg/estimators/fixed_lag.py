@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from factors import Robust
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.motion import Motion, NodeMotion
 from saga_fg.estimators.protocol import Measurements
@@ -102,6 +103,10 @@ class FixedLagSmoother:
     def smoothed(self, covariances: bool = True) -> tuple[Smoothed, ...]:
         """Every moment in the window, oldest first; without `covariances` means only, which costs much less."""
         return smoothed_moments(self._recording, covariances, joint=True)
+
+    def posterior(self) -> BlockGaussian:
+        """The filter's, of the nodes that are there now, and perhaps of some that just went."""
+        return self._recording.newest()
 
     def graph(self) -> FactorGraph:
         """The window as a GTSAM graph: a prior at its start, all factors since, the smoothed means as values."""

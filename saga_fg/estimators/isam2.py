@@ -158,6 +158,10 @@ class IncrementalFilter:
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         return self._newest().joint_covariance(nodes)
 
+    def posterior(self) -> BlockGaussian:
+        """The filter's, of the nodes that are there now, and perhaps of some that just went."""
+        return self._newest().x
+
     def graph(self) -> FactorGraph:
         """The last interval: what was known before it as prior, its factors, and everything seen since."""
         self._held, x = _solved(self._held)

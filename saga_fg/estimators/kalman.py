@@ -97,6 +97,10 @@ class JointKalmanFilter:
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         return self._state.joint(self._state.layout.rows(nodes))
 
+    def posterior(self) -> BlockGaussian:
+        """All that the filter knows."""
+        return self._state
+
     def graph(self) -> FactorGraph:
         """One joint prior a component: the filter keeps nothing of the past but this."""
         return prior_graph(self._state)

@@ -13,7 +13,7 @@ import numpy as np
 from factors import RangeRate
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import Estimator, FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators import FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
@@ -32,7 +32,10 @@ class Kinematics(NamedTuple):
     P_velocity: FloatArray
 
 
-def new_estimator(name: EstimatorName, lag: float) -> Estimator:
+TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother
+
+
+def new_estimator(name: EstimatorName, lag: float) -> TrackEstimator:
     """A fresh estimator; `lag` (s) is the fixed-lag smoother's."""
     if name == "isam2":
         return IncrementalFilter()
@@ -42,7 +45,7 @@ def new_estimator(name: EstimatorName, lag: float) -> Estimator:
 class JointTrackState:
     """Tracks by id and label over one estimator. `motion` gives the own motion of a class."""
 
-    def __init__(self, estimator: Estimator, motion: Callable[[str], Motion]) -> None:
+    def __init__(self, estimator: TrackEstimator, motion: Callable[[str], Motion]) -> None:
         self._estimator = estimator
         self._motion = motion
         self._types: dict[str, NodeType] = {}  # by class; classes that move alike share one
@@ -165,22 +168,19 @@ class JointTrackState:
     def cross_covariances_before(self, ids: IntArray, label: StrArray, delay: float) -> CrossCovariances:
         """Of the positions `delay` s ago, by own motion, of all pairs of tracks that are correlated (rows of `ids`)."""
         groups = self._by_type(label, moving=True)
-        group, start = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
-        for number, (node_type, rows) in enumerate(groups):
-            group[rows], start[rows] = number, node_type.dim
-        start = np.cumsum(start) - start
-        joint = self._estimator.joint_covariance(ids)
-        x, y = (start + np.array([node_type.index(POSITION)[k] for node_type, _ in groups])[group] for k in (0, 1))
-        tied = (joint[np.ix_(x, x)] != 0) | (joint[np.ix_(y, y)] != 0)
-        first, second = np.nonzero(np.triu(tied, 1))
+        group = np.zeros(len(ids), dtype=np.int64)
+        for number, (_, rows) in enumerate(groups):
+            group[rows] = number
+        x = self._estimator.posterior()
+        nodes = x.layout.rows(ids)
+        first, second = x.correlated(nodes)
         past = [_position_before(node_type, delay) for node_type, _ in groups]
         C = np.zeros((len(first), 2, 2))
         for a, H_a in enumerate(past):
             for b, H_b in enumerate(past):
                 mine = np.flatnonzero((group[first] == a) & (group[second] == b))
-                rows = start[first[mine], None] + np.arange(H_a.shape[1])
-                columns = start[second[mine], None] + np.arange(H_b.shape[1])
-                C[mine] = H_a @ joint[rows[:, :, None], columns[:, None, :]] @ H_b.T
+                if len(mine):
+                    C[mine] = H_a @ x.between(nodes[first[mine]], nodes[second[mine]]) @ H_b.T
         return CrossCovariances(first, second, C)
 
     def snapshot(self) -> Any:
@@ -207,7 +207,7 @@ class JointTrackState:
             H, R = _moved_to_present(node_type, H, R, delay)
         estimator.update(Measurements(ids, z, H, R))
 
-    def _changed(self) -> Estimator:
+    def _changed(self) -> TrackEstimator:
         self._kinematics = None
         return self._estimator
 

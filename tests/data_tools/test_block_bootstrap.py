@@ -24,6 +24,13 @@ def test_equal_errors_do_not_change():
     assert (found.estimate, found.low, found.high) == (0.0, 0.0, 0.0)
 
 
+def test_where_neither_errs_nothing_changes():
+    """What stands is annotated at one place, and predicted there."""
+    a, b = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 2.0])
+    found = relative_change_of_errors(a, b, [0, 0, 1], "median")
+    assert (found.estimate, found.low, found.high) == (0.0, -0.5, 0.0)
+
+
 def test_errors_that_come_in_blocks_are_worth_less():
     rng = np.random.default_rng(1)
     b = np.ones(400)

@@ -76,3 +76,24 @@ def test_packing_joins_small_components_of_rare_sizes_and_nothing_else():
     assert parts == [[0, 1, 2, 3, 4, 7, 8], [5], [6], list(range(9, 23))]
     assert np.array_equal(dense(x.over(packed)), dense(x))
     assert packed.packed is packed
+
+
+def test_pairs_of_one_component_are_all_that_is_correlated(gaussian):
+    """Node by node as in the dense matrix, in any order of the nodes."""
+    rng, x = gaussian
+    nodes = rng.permutation(9)[:7]
+    places = [x.layout.places(np.array([row])) for row in nodes.tolist()]
+    P = dense(x)
+    first, second = x.correlated(nodes)
+    found = {tuple(sorted(pair)) for pair in zip(first.tolist(), second.tolist(), strict=True)}
+    assert len(found) == len(first)
+    assert found == {(i, j) for i in range(7) for j in range(i + 1, 7) if P[np.ix_(places[i], places[j])].any()}
+    for i, j in zip(first.tolist(), second.tolist(), strict=True):
+        assert np.array_equal(x.between(nodes[[i]], nodes[[j]])[0], P[np.ix_(places[i], places[j])])
+
+
+def test_nobody_is_correlated_with_nobody():
+    x = BlockGaussian.empty()
+    none = np.empty(0, dtype=np.int64)
+    assert [len(rows) for rows in x.correlated(none)] == [0, 0]
+    assert x.between(none, none).shape == (0, 0, 0)
