@@ -11,6 +11,7 @@ from pipelines.bench.heterogeneous import _figures, cars_alone, contenders, tabl
 from pipelines.bench.predictions import prediction_errors
 from pipelines.cli.main import app
 from pipelines.config import load_config
+from saga_fg import Detection, Detections, Frame
 from saga_fg.track import Tracks
 
 
@@ -56,6 +57,17 @@ def test_the_baselines_differ_in_their_edges():
     assert kinds["kf"] == []
     assert cars_alone(found["full"]).tracker.classes == found["full"].tracker.classes
     assert all(edge.cones is None for edge in found["cars"].tracker.edges if type(edge).__name__ == "Following")
+
+
+def test_a_bicycle_is_not_expected_to_speed_up_behind_a_car():
+    """It rides at 5 m/s, 6 m behind a car at 8 m/s, and is predicted to go on as it does."""
+    tracker = load_config("heterogeneous").new_tracker("saga")
+    for k in range(30):
+        car = Detection("car", (5.75 + 0.8 * k, 0.0, 0.8), (4.5, 1.8, 1.5), 0.0, (8.0, 0.0), score=0.9)
+        bicycle = Detection("bicycle", (0.5 * k, 0.0, 0.6), (1.75, 0.6, 1.1), 0.0, (5.0, 0.0), score=0.9)
+        tracker.step(Frame(k / 10, "lidar", Detections.of([car, bicycle])))
+    (rider,) = (track for track in tracker.tracks(2.9 + 2.0) if track.label == "bicycle")
+    assert rider.velocity[0] == pytest.approx(5.0, abs=0.3)
 
 
 def test_figures_are_pooled_over_scenes():
