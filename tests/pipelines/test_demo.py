@@ -86,7 +86,7 @@ def test_the_demo_writes_a_picture_and_a_page(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("data_tools.simulator.scene.SimulatorSettings", lambda: SHORT)
+    monkeypatch.setattr("data_tools.simulator.scenarios.scenario_settings", lambda scenario: SHORT)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["demo", "--output", str(tmp_path / "out"), "--scenes", "1"])
     assert result.exit_code == 0, result.output
     for text in (*COLUMNS, *METHODS, "picture: ", "page: "):
