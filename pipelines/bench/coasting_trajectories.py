@@ -120,10 +120,10 @@ def coasting_errors(
 ) -> tuple[CoastingErrors, dict[Method, list[FittedInteractions]]]:
     """Fit and measure on some recordings of one kind, fold by fold; returns what each fold learned, too.
 
-    Raises `InputError` where the recordings of a fold have nothing to learn from.
+    Raises `InputError` where the recordings of a fold have nothing to learn from, or not all have one rate.
     """
     settings, lengths = settings or CoastingSettings(), GapSettings()
-    names = list(recordings)
+    names, ends = list(recordings), _ends(recordings, lengths)
     folds = min(settings.folds, len(names))
     likelihoods = []
     for done, name in enumerate(names):
@@ -158,17 +158,29 @@ def coasting_errors(
                 progress(f"coasting {names[k]}", len(parts), len(names))
     recording = np.concatenate([gaps.recording for gaps, _, _ in parts])
     stretch = np.unique(np.stack([recording, np.concatenate([s for _, s, _ in parts])]), axis=1, return_inverse=True)[1]
-    first = next(iter(recordings.values()))
-    _, stride, steps = gap_moments(first, lengths)
-    step = stride * float(np.median(np.diff(first.time)))
     return CoastingErrors(
         recording,
         stretch,
         np.concatenate([gaps.label for gaps, _, _ in parts]),
         np.concatenate([_in_company(gaps) for gaps, _, _ in parts]),
-        np.asarray(step * np.arange(1, steps + 1), dtype=np.float64),
+        ends,
         {method: np.concatenate([errors[method] for _, _, errors in parts]) for method in parts[0][2]},
     ), learned
+
+
+def _ends(recordings: Mapping[str, Trajectories], lengths: GapSettings) -> FloatArray:
+    """Times (S,) from the beginning of a gap to the ends of its steps, s, which all recordings have in common."""
+    ends: dict[str, FloatArray] = {}
+    for name, trajectories in recordings.items():
+        _, stride, steps = gap_moments(trajectories, lengths)
+        dt = float(np.median(np.diff(trajectories.time))) if len(trajectories) > 1 else lengths.step
+        ends[name] = stride * dt * np.arange(1, steps + 1, dtype=np.float64)
+    first = next(iter(ends))
+    for name, its in ends.items():
+        if len(its) != len(ends[first]) or not np.allclose(its, ends[first], rtol=0.1):
+            told = f"{ends[first][0]:.3g} s as in {first}, got {its[0]:.3g} s"
+            raise InputError(f"recording {name}: expected moments that allow steps of {told}")
+    return ends[first]
 
 
 def _errors(

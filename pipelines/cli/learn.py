@@ -92,7 +92,8 @@ def interactions(
     with progress_bar(unit="recordings") as progress:
         learned = learn_interactions(found, origin, network, progress)
     write_text(output, write_settings(learned))
-    typer.echo(f"{output}: {counted(len(learned.edges), 'edge rule')} learned from {origin}")
+    why = "" if learned.edges else "; no interaction that was tried lowered errors on what was held out"
+    typer.echo(f"{output}: {counted(len(learned.edges), 'edge rule')} learned from {origin}{why}")
 
 
 @noise_app.callback()

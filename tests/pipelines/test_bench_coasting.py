@@ -1,5 +1,6 @@
 """`saga-fg bench coasting` on simulated traffic."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -102,6 +103,13 @@ def test_recordings_in_which_nobody_is_followed_are_named():
     recordings = {name: following_pairs(pairs=1, moments=5) for name in ("first", "second")}
     with pytest.raises(InputError, match="recordings second: expected some car, followed for 1 s"):
         coasting_trajectories.coasting_errors(recordings, ("car",), ())
+
+
+def test_recordings_of_unlike_rates_are_refused():
+    slow = following_pairs(pairs=1, moments=60)
+    slow = dataclasses.replace(slow, time=7 * slow.time)
+    with pytest.raises(InputError, match=r"recording slow: expected .* steps of 0\.5 s as in quick, got 0\.7 s"):
+        coasting_trajectories.coasting_errors({"quick": following_pairs(pairs=1), "slow": slow}, ("car",), ())
 
 
 def test_the_command_refuses_what_it_cannot_judge_by(tmp_path):
