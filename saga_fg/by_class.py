@@ -20,6 +20,12 @@ def class_settings(classes: Mapping[str, S], plain: Callable[[], S], label: str)
     return plain() if found is None else found
 
 
+def class_numbers(numbers: Mapping[str, float], plain: Callable[[], float], label: StrArray) -> FloatArray:
+    """The number of the class of each label (n,), found as settings are: (n,)."""
+    occurring, index = distinct(label)
+    return np.array([class_settings(numbers, plain, c) for c in occurring], dtype=np.float64)[index]
+
+
 def class_values(classes: Mapping[str, S], plain: Callable[[], S], label: StrArray, *names: str) -> FloatArray:
     """The numbers of these names, of the class of each label (n,): a row (n,) for every name."""
     occurring, index = distinct(label)

@@ -112,21 +112,36 @@ class IntelligentDriver:
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
-        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-        p_j, v_j = (nodes.types[source[0]].index(names) for names in (POSITION, VELOCITY))
-        v, w = (
-            np.maximum(np.einsum("ei,ei->e", nodes.velocity[rows], u), 0.0)
-            for rows, u in ((target, u_i), (source, u_j))
-        )
+        v_i, v_j = (nodes.types[rows[0]].index(VELOCITY) for rows in (target, source))
+        v, w = speed_along(nodes, target, u_i), speed_along(nodes, source, u_j)
         distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u_i)
         f = self.following(v, distance - (nodes.length[target] + nodes.length[source]) / 2, w)
-        along = self.time_constant * u_i[:, :, None] * u_i[:, None, :]
+        before = f._replace(value=f.value - f.by_leader * w)  # what the leader's speed adds is added below
+        triples = accelerated(nodes, target, source, u_i, v, before, self.time_constant)
         from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :]
-        rest = f.value - f.by_speed * v - f.by_gap * distance - f.by_leader * w
-        triples = no_triples(nodes, target, source)
-        triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
-        triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
-        triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
         triples.A_other[:, v_i[:, None], v_j] = from_leader * f.by_leader[:, None, None]
-        triples.b[:, v_i] = self.time_constant * u_i * rest[:, None]
         return triples
+
+
+def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
+    """(E,) speeds of nodes `rows` along u (E, 2), m/s, not below 0."""
+    return np.asarray(np.maximum(np.einsum("ei,ei->e", nodes.velocity[rows], u), 0.0))
+
+
+def accelerated(
+    nodes: NodeTable, target: IntArray, source: IntArray, u: FloatArray, v: FloatArray, f: Linearised, tau: float
+) -> Triples:
+    """The triples of an acceleration along u (E, 2), but for what depends on the speed of the source.
+
+    Linearised at the speeds v (E,) and the distances along u.
+    """
+    p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+    p_j = nodes.types[source[0]].index(POSITION)
+    along = tau * u[:, :, None] * u[:, None, :]
+    distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
+    triples = no_triples(nodes, target, source)
+    triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
+    triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
+    triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
+    triples.b[:, v_i] = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
+    return triples

@@ -37,12 +37,11 @@ from saga_fg.learning import (
     OwnMotion,
     OwnMotionLikelihood,
     Trajectories,
+    errors_alone,
     fit_by_held_out,
     fit_interactions,
     fit_networks,
-    gap_errors,
-    gap_moments,
-    predict_gaps,
+    gap_ends,
     sample_gaps,
 )
 
@@ -140,8 +139,8 @@ def coasting_errors(
             taught = ", ".join(names[k] for k in training)
             wanted = f"some {' or '.join(classes)}, followed for {lengths.followed:g} s"
             raise InputError(f"recordings {taught}: expected {wanted}")
+        teaching = [recordings[names[k]] for k in training]
         for method, fit in methods.items():
-            teaching = [recordings[names[k]] for k in training]
             learned[method].append(fit_by_held_out(teaching, classes, own, fit, lengths))
             if progress is not None:
                 progress(f"{method}, fold {fold + 1}", len(learned[method]), folds)
@@ -152,7 +151,7 @@ def coasting_errors(
             errors = _errors(trajectories, gaps, own, hand_crafted, fitted, lengths)
             alone = OwnMotion(fitted[LEARNED].acceleration_noise, own.position_noise)
             same = _sample(trajectories, alone, classes, lengths, k).drawn(settings.most_gaps, seed=1)
-            errors[NOISE_ALONE] = _alone(same)
+            errors[NOISE_ALONE] = errors_alone(same)
             parts.append((gaps, trajectories.time[gaps.moment] // STRETCH, errors))
             if progress is not None:
                 progress(f"coasting {names[k]}", len(parts), len(names))
@@ -170,17 +169,12 @@ def coasting_errors(
 
 def _ends(recordings: Mapping[str, Trajectories], lengths: GapSettings) -> FloatArray:
     """Times (S,) from the beginning of a gap to the ends of its steps, s, which all recordings have in common."""
-    ends: dict[str, FloatArray] = {}
-    for name, trajectories in recordings.items():
-        _, stride, steps = gap_moments(trajectories, lengths)
-        dt = float(np.median(np.diff(trajectories.time))) if len(trajectories) > 1 else lengths.step
-        ends[name] = stride * dt * np.arange(1, steps + 1, dtype=np.float64)
-    first = next(iter(ends))
-    for name, its in ends.items():
-        if len(its) != len(ends[first]) or not np.allclose(its, ends[first], rtol=0.1):
-            told = f"{ends[first][0]:.3g} s as in {first}, got {its[0]:.3g} s"
+    (first, ends), *others = [(name, gap_ends(each, lengths)) for name, each in recordings.items()]
+    for name, its in others:
+        if len(its) != len(ends) or not np.allclose(its, ends, rtol=0.1):
+            told = f"{ends[0]:.3g} s as in {first}, got {its[0]:.3g} s"
             raise InputError(f"recording {name}: expected moments that allow steps of {told}")
-    return ends[first]
+    return ends
 
 
 def _errors(
@@ -193,7 +187,7 @@ def _errors(
 ) -> dict[Method, FloatArray]:
     """(n, S) by method."""
     filtered = own.filtered(trajectories)
-    errors = {KF: _alone(gaps)}
+    errors = {KF: errors_alone(gaps)}
     joint: dict[Method, tuple[Sequence[EdgeRule], Mapping[str, float], float]]
     joint = {HAND_CRAFTED: (tuple(hand_crafted), own.acceleration_noise, 0.0)}
     joint |= {method: (f.rules, f.acceleration_noise, f.explained_noise) for method, f in learned.items()}
@@ -201,11 +195,6 @@ def _errors(
         filters = JointGaps(trajectories, filtered, noise, own.position_noise, rules, explained)
         errors[method] = filters.errors(gaps, lengths)
     return errors
-
-
-def _alone(gaps: GapSample) -> FloatArray:
-    """Errors (n, S) of what goes on as it moved when it was hidden."""
-    return np.asarray(gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0)))
 
 
 def _sample(

@@ -31,6 +31,9 @@ class Foreseeing:
         self._tracker, self._world, self._settings, self._offset = tracker, world, settings, offset
         self._latest = -np.inf
         self._now: Tracks | None = None
+        ids = world.objects.id.tolist()
+        self._rows = [k for k, name in enumerate(ids) if name.startswith("vehicle-")]
+        self._number = [int(ids[k].partition("-")[2]) for k in self._rows]
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame."""
@@ -44,7 +47,7 @@ class Foreseeing:
             self._now = found
             return found
         truth, then = (self._vehicles(moment) for moment in (self._now.timestamp, timestamp))
-        number, own = self._numbers(), own_tracks(self._now, truth)
+        number, own = self._number, own_tracks(self._now, truth)
         u = unit(truth.yaw)
         believed, aside = {}, {}
         for k in np.flatnonzero(own >= 0).tolist():
@@ -52,9 +55,8 @@ class Foreseeing:
             error = self._now.boxes.position[at, :2] - truth.position[k, :2]
             believed[number[k]] = float(error @ u[k]), float(self._now.boxes.velocity[at] @ u[k])
             aside[k] = float(u[k, 0] * error[1] - u[k, 1] * error[0])
-        ahead = foreseen(
-            self._world, self._settings, self._now.timestamp - self._offset, self._ahead(timestamp), believed
-        )
+        now = self._now.timestamp
+        ahead = foreseen(self._world, self._settings, now - self._offset, timestamp - now, believed)
         position = found.boxes.position.copy()
         later = unit(then.yaw)
         for k, lateral in aside.items():
@@ -62,15 +64,5 @@ class Foreseeing:
             position[found.id == own[k], :2] = place
         return replace(found, boxes=replace(found.boxes, position=position))
 
-    def _ahead(self, timestamp: float) -> float:
-        assert self._now is not None
-        return timestamp - self._now.timestamp
-
-    def _rows(self) -> list[int]:
-        return [k for k, name in enumerate(self._world.objects.id.tolist()) if name.startswith("vehicle-")]
-
-    def _numbers(self) -> list[int]:
-        return [int(self._world.objects.id[k].partition("-")[2]) for k in self._rows()]
-
     def _vehicles(self, timestamp: float) -> Boxes:
-        return self._world.objects.at(timestamp - self._offset)[0].select(self._rows())
+        return self._world.objects.at(timestamp - self._offset)[0].select(self._rows)

@@ -32,19 +32,16 @@ from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import build_world
 from pipelines.bench.foreseeing import Foreseeing
 from pipelines.bench.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, without_parts
-from pipelines.bench.predictions import Asked, prediction_errors
+from pipelines.bench.predictions import FOLLOWED, Asked, in_view, moving, prediction_errors
 from pipelines.config import TrackConfig, load_config
 from pipelines.figures import FigureTable, cell
 from pipelines.tracking import OnlineTracker, Progress
-from saga_fg.arrays import FloatArray, StrArray
-from saga_fg.dataset import Annotations
+from saga_fg.arrays import FloatArray
 from saga_fg.edge_rules import Following, Neighbours
 
 HORIZON = 2.0  # s
 FIRST, EVERY = 2.0, 0.5  # s: the first question, and from one to the next
 RATE = 5.0  # frames a second of either sensor
-MOVING = 0.5  # m/s
-FOLLOWED = 1.5  # s in view before the question: sooner, nobody knows a velocity
 GROUPS = ("affected", "others", "hidden")
 BASELINES = ("cars", "shipped", "kf")
 
@@ -133,12 +130,14 @@ def _errors_of_scene(
     offset = float(scene.timestamps[0]) - world.start
     concerned = {row: set(affected(world, float(scene.timestamps[row]) - offset).tolist()) for row in rows}
     back = round(FOLLOWED * settings.keyframe_rate)
-    moving = {row: _followed(scene.ground_truth[row - back : row + 1]) for row in rows}
+    truth = scene.ground_truth
+    followed = {row: np.intersect1d(moving(truth[row]), in_view(truth[row - back : row + 1])) for row in rows}
     trackers: dict[str, OnlineTracker] = {name: method.new_tracker("saga") for name, method in methods.items()}
     if kind not in COUPLED:
         trackers["floor"] = Foreseeing(methods["full"].new_tracker("saga"), world, settings, offset)
     answers = {
-        name: prediction_errors(scene, tracker, HORIZON, rows, moving.__getitem__) for name, tracker in trackers.items()
+        name: prediction_errors(scene, tracker, HORIZON, rows, followed.__getitem__)
+        for name, tracker in trackers.items()
     }
     affected_ones: set[Asked] = {(name, row) for row in rows for name in concerned[row]}
     hidden: dict[str, Mapping[Asked, float]] = {name: {} for name in methods}
@@ -157,15 +156,6 @@ def _of_all(answers: Mapping[str, Mapping[Asked, float]], wanted: Callable[[Aske
     """The errors of the wanted questions that all methods answer, in one order."""
     common = sorted(filter(wanted, set.intersection(*(set(found) for found in answers.values()))))
     return {name: [found[q] for q in common] for name, found in answers.items()}
-
-
-def _followed(moments: Sequence[Annotations]) -> StrArray:
-    """Ids of the objects that were visible at all these moments and move at the last."""
-    last = moments[-1]
-    names = last.id[np.hypot(*np.nan_to_num(last.boxes.velocity).T) > MOVING]
-    for moment in moments:
-        names = np.intersect1d(names, moment.id[moment.visible])
-    return np.asarray(names)
 
 
 def _figures(scenes: Sequence[Mapping[str, Sequence[float]]]) -> GroupFigures:

@@ -14,17 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.simulator.world import World
-from pipelines.bench.predictions import Asked, own_tracks
+from pipelines.bench.predictions import FOLLOWED, Asked, fed, in_view, moving, own_tracks, position_errors
 from pipelines.process import one_thread
 from pipelines.tracking import OnlineTracker
 from saga_fg.arrays import StrArray
-from saga_fg.dataset import Annotations, Scene
+from saga_fg.dataset import Scene
 from saga_fg.frame import Frame
 
 HIDDEN = 2.0  # s
-SEEN_BEFORE = 1.5  # s in view before: sooner, nobody knows a velocity
 EVERY = 3.5  # s from one time of hiding to the next
-MOVING = 0.5  # m/s
 OWN = {"trailer": 3.0, "vehicle": 3.0, "rider": 1.2, "bicycle": 1.2}  # m from the part: its own detections
 COUPLED = {"towing": ("trailer", "vehicle"), "cycling": ("rider", "bicycle")}
 """By kind of scene, what the ids of the two parts of a pair begin with; the number that follows is the same."""
@@ -44,15 +42,14 @@ def hidings(scene: Scene, pair: tuple[str, str]) -> list[Hiding]:
     """Who is hidden when: the one and the other part of all pairs in turn."""
     assert scene.ground_truth is not None
     step = float(np.median(np.diff(scene.timestamps)))
-    before, hidden, every = (round(time / step) for time in (SEEN_BEFORE, HIDDEN, EVERY))
+    before, hidden, every = (round(time / step) for time in (FOLLOWED, HIDDEN, EVERY))
     found = []
     for turn, start in enumerate(range(before, len(scene) - hidden, every)):
         own, other = pair if turn % 2 == 0 else pair[::-1]
         moments = scene.ground_truth[start - before : start + hidden + 1]
         now = moments[before]
-        moving = now.id[np.hypot(*np.nan_to_num(now.boxes.velocity).T) > MOVING]
-        coupled, seen, partners = _numbers(now.id, own), _in_view(moments[: before + 1]), _in_view(moments)
-        asked = _numbers(seen, own) & _numbers(partners, other) & _numbers(moving, own)
+        coupled, seen, partners = _numbers(now.id, own), in_view(moments[: before + 1]), in_view(moments)
+        asked = _numbers(seen, own) & _numbers(partners, other) & _numbers(moving(now), own)
         parts = coupled & _numbers(now.id, other)
         found.append(Hiding(start, start + hidden, *(_named(own, numbers) for numbers in (parts, asked))))
     return found
@@ -65,13 +62,6 @@ def _numbers(ids: StrArray, kind: str) -> set[str]:
 
 def _named(kind: str, numbers: set[str]) -> StrArray:
     return np.array([f"{kind}-{number}" for number in sorted(numbers)], dtype=np.str_)
-
-
-def _in_view(moments: Sequence[Annotations]) -> StrArray:
-    names = moments[0].id
-    for moment in moments:
-        names = np.intersect1d(names, moment.id[moment.visible])
-    return np.asarray(names)
 
 
 def without_parts(scene: Scene, world: World, times: Sequence[Hiding]) -> tuple[Frame, ...]:
@@ -98,24 +88,14 @@ def hidden_errors(
     assert scene.ground_truth is not None
     errors: dict[Asked, float] = {}
     done = 0
-
-    def advance(row: int) -> None:
-        nonlocal done
-        while done < len(frames) and frames[done].timestamp <= scene.timestamps[row]:
-            tracker.step(frames[done])
-            done += 1
-
     with one_thread():
         for hiding in times:
-            advance(hiding.start)
             now, then = scene.ground_truth[hiding.start], scene.ground_truth[hiding.end]
-            parts = now.boxes.select(np.isin(now.id, hiding.asked))
-            own = own_tracks(tracker.tracks(float(scene.timestamps[hiding.start])), parts)
-            advance(hiding.end)
-            found = tracker.tracks(float(scene.timestamps[hiding.end]))
-            for name, track in zip(now.id[np.isin(now.id, hiding.asked)].tolist(), own.tolist(), strict=True):
-                at, true = np.flatnonzero(found.id == track), np.flatnonzero(then.id == name)
-                if len(at) and len(true):
-                    offset = found.boxes.position[at[0], :2] - then.boxes.position[true[0], :2]
-                    errors[name, hiding.end] = float(np.hypot(*offset))
+            asked = np.isin(now.id, hiding.asked)
+            begin, end = (float(scene.timestamps[row]) for row in (hiding.start, hiding.end))
+            done = fed(tracker, frames, done, begin)
+            own = own_tracks(tracker.tracks(begin), now.boxes.select(asked))
+            done = fed(tracker, frames, done, end)
+            found = position_errors(tracker.tracks(end), own, then, now.id[asked])
+            errors |= {(name, hiding.end): error for name, error in found.items()}
     return errors

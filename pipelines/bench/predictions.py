@@ -15,9 +15,12 @@ from pipelines.tracking import OnlineTracker
 from saga_fg.arrays import IntArray, StrArray
 from saga_fg.association import assign
 from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
+from saga_fg.dataset import Annotations, Scene
+from saga_fg.frame import Frame
 from saga_fg.track import Tracks
 
+MOVING = 0.5  # m/s
+FOLLOWED = 1.5  # s in view before a question: sooner, nobody knows a velocity
 MATCHED = 2.0  # m between a track and its object at most, at the moment of the prediction
 
 Asked = tuple[str, int]
@@ -34,20 +37,46 @@ def prediction_errors(
     with one_thread():
         for row in rows:
             time = float(scene.timestamps[row])
-            while done < len(scene.frames) and scene.frames[done].timestamp <= time:
-                tracker.step(scene.frames[done])
-                done += 1
+            done = fed(tracker, scene.frames, done, time)
             later = int(np.argmin(np.abs(scene.timestamps - time - horizon)))
             now, then = scene.ground_truth[row], scene.ground_truth[later]
             wanted = np.flatnonzero(now.visible & np.isin(now.id, asked(row)))
             track_id = own_tracks(tracker.tracks(time), now.boxes.select(wanted))
             predicted = tracker.tracks(float(scene.timestamps[later]))
-            for name, track in zip(now.id[wanted].tolist(), track_id.tolist(), strict=True):
-                at, true = np.flatnonzero(predicted.id == track), np.flatnonzero(then.id == name)
-                if len(at) and len(true):
-                    offset = predicted.boxes.position[at[0], :2] - then.boxes.position[true[0], :2]
-                    errors[name, row] = float(np.hypot(*offset))
+            found = position_errors(predicted, track_id, then, now.id[wanted])
+            errors |= {(name, row): error for name, error in found.items()}
     return errors
+
+
+def fed(tracker: OnlineTracker, frames: Sequence[Frame], done: int, time: float) -> int:
+    """How many frames a tracker knows that knew `done` of them and is given all up to `time`."""
+    while done < len(frames) and frames[done].timestamp <= time:
+        tracker.step(frames[done])
+        done += 1
+    return done
+
+
+def position_errors(tracks: Tracks, own: IntArray, truth: Annotations, names: StrArray) -> dict[str, float]:
+    """Errors, m, of the tracks `own` (n,), by id, of the objects `names` (n,); of those that are there."""
+    errors = {}
+    for name, track in zip(names.tolist(), own.tolist(), strict=True):
+        at, true = np.flatnonzero(tracks.id == track), np.flatnonzero(truth.id == name)
+        if len(at) and len(true):
+            errors[name] = float(np.hypot(*(tracks.boxes.position[at[0], :2] - truth.boxes.position[true[0], :2])))
+    return errors
+
+
+def moving(moment: Annotations) -> StrArray:
+    """Ids of the objects that move."""
+    return np.asarray(moment.id[np.hypot(*np.nan_to_num(moment.boxes.velocity).T) > MOVING])
+
+
+def in_view(moments: Sequence[Annotations]) -> StrArray:
+    """Ids of the objects that were visible at all these moments."""
+    names = moments[0].id
+    for moment in moments:
+        names = np.intersect1d(names, moment.id[moment.visible])
+    return np.asarray(names)
 
 
 def own_tracks(tracks: Tracks, objects: Boxes) -> IntArray:

@@ -54,8 +54,8 @@ LABEL_NOISE = 0.005  # standard deviation of the true positions, which are exact
 TEMPLATE = Neighbours(
     rate=0.7, distance_scale=10.0, heading_scale=1.0, speed_scale=1.5, max_distance=30.0, max_degree=8, classes=(LABEL,)
 )
-DEGREES = (3, 5)
 """From where interactions are learned: no value is a true one, and more objects may interact than do."""
+DEGREES = (3, 5)  # numbers of edges a node may have, tried in place of the template's
 
 Sums = Callable[[SceneMetrics], tuple[float, float]]
 

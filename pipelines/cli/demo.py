@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.cli.options import Config, Verbose
+from pipelines.cli.options import Config, Scenario, Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import counted
 
@@ -21,7 +21,7 @@ def demo(
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of simulated scenes.")] = 3,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
     scenario: Annotated[
-        Literal["traffic", "red-light", "road-works", "towing", "cycling"],
+        Scenario,
         typer.Option("--scenario", help="What the scenes are about; all but traffic by the heterogeneous settings."),
     ] = "traffic",
     config: Config = None,

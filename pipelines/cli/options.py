@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,6 +14,8 @@ from saga_fg.errors import InputError
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more on stderr.", callback=set_up_logging, show_default=False)
 ]
+Scenario = Literal["traffic", "red-light", "road-works", "towing", "cycling"]
+
 Config = Annotated[
     Path | None, typer.Option("--config", help="YAML file over the defaults; see `saga-fg config`.", metavar="FILE")
 ]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Verbose
+from pipelines.cli.options import Scenario, Verbose
 from pipelines.cli.reporting import working
 from pipelines.cli.summary import counted
 
@@ -17,7 +17,7 @@ def simulate(
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
     scenario: Annotated[
-        Literal["traffic", "red-light", "road-works", "towing", "cycling"],
+        Scenario,
         typer.Option("--scenario", help="What the scenes are about; all but traffic are written as tables."),
     ] = "traffic",
     config: Annotated[

@@ -44,6 +44,7 @@ def g2o(
       saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
     """
     from data_tools.atomic_files import check_writable_folder
+    from data_tools.located import located
     from data_tools.pose_graphs import read_g2o
     from factors import Robust
     from pipelines.slam.pose_graph import write_pose_graph
@@ -58,11 +59,8 @@ def g2o(
     check_writable_folder(output)
     loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
-    with working("optimising"):
-        try:
-            optimised = optimise_poses(graph, loss)
-        except InputError as refusal:  # of a graph that is whole and still has no optimum, as one in pieces
-            raise InputError(f"{file}: {refusal}") from refusal
+    with working("optimising"), located(str(file)):  # a graph that is whole may have no optimum, as one in pieces
+        optimised = optimise_poses(graph, loss)
     guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:

@@ -18,13 +18,12 @@ they do the speed: who walks far away is not taken for a car that stands.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray, distinct
-from saga_fg.by_class import DEFAULT
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.by_class import class_numbers
 from saga_fg.ego.record import EgoMoment, motion_covariances
 from saga_fg.ego.settings import JointSettings
 from saga_fg.geometry import transform_points
@@ -150,12 +149,6 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
         np.concatenate(place)[order],
         variance[order],
         distance[order],
-        _usual_speed(label, settings.moving_speed)[order],
+        class_numbers(settings.moving_speed, float, label)[order],
         drift[moments][order],
     )
-
-
-def _usual_speed(label: StrArray, moving_speed: Mapping[str, float]) -> FloatArray:
-    """The speed (n,) of the class of each label (n,), m/s."""
-    classes, index = distinct(label)
-    return np.array([moving_speed.get(c, moving_speed[DEFAULT]) for c in classes], dtype=np.float64)[index]

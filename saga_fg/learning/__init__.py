@@ -3,8 +3,8 @@ and interactions."""
 
 from saga_fg.learning.class_confusion import learn_confusion
 from saga_fg.learning.detection_sample import DetectionSample
-from saga_fg.learning.gap_prediction import gap_errors, negative_log_likelihood, predict_gaps
-from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments, sample_gaps
+from saga_fg.learning.gap_prediction import errors_alone, gap_errors, negative_log_likelihood, predict_gaps
+from saga_fg.learning.gaps import GapSample, GapSettings, gap_ends, gap_moments, sample_gaps
 from saga_fg.learning.held_out_fit import FORMS_OF_TRACKERS, fit_by_held_out
 from saga_fg.learning.independent_filter import FilteredTrajectories, filter_independently
 from saga_fg.learning.interaction_fit import TEMPLATE, FittedInteractions, fit_interactions, predict_with
@@ -37,6 +37,7 @@ __all__ = [
     "Sightings",
     "Trail",
     "Trajectories",
+    "errors_alone",
     "filter_independently",
     "fit_acceleration_noise",
     "fit_acceleration_noise_by_class",
@@ -49,6 +50,7 @@ __all__ = [
     "fit_sensor",
     "fit_trail_noise",
     "follow",
+    "gap_ends",
     "gap_errors",
     "gap_moments",
     "learn_confusion",

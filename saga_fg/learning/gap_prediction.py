@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from saga_fg.arrays import FloatArray
 from saga_fg.edge_features import EdgeEnds, EdgeFeatures, edge_features
 from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing, Interaction, SharedCourse, SharedVelocity
@@ -96,6 +97,11 @@ def predict_gaps(
 def gap_errors(sample: GapSample, prediction: GapPrediction) -> Any:
     """(W, S) distances, m, between where the objects are and where they were predicted; NaN where nobody knows."""
     return np.hypot(*np.moveaxis(sample.measured - prediction.position, -1, 0))
+
+
+def errors_alone(sample: GapSample) -> FloatArray:
+    """(W, S) errors, m, of the classical filter: objects go on as they moved when they were hidden."""
+    return np.asarray(gap_errors(sample, predict_gaps(sample, lambda _features, _seen: [], 0.0, 0.0)))
 
 
 def negative_log_likelihood(sample: GapSample, prediction: GapPrediction, position_noise: Any, xp: Any = np) -> Any:

@@ -79,11 +79,22 @@ class GapSample:
 
 def gap_moments(trajectories: Trajectories, settings: GapSettings) -> tuple[IntArray, int, int]:
     """Moments at which gaps start, how many moments a step has, and how many steps a gap."""
-    dt = float(np.median(np.diff(trajectories.time))) if len(trajectories) > 1 else settings.step
+    dt = _interval(trajectories, settings)
     stride = max(1, round(settings.step / dt))
     spacing = max(1, round(settings.spacing / dt))
     steps = max(1, round(settings.longest / (stride * dt)))
     return np.arange(0, len(trajectories) - 1, spacing), stride, steps
+
+
+def gap_ends(trajectories: Trajectories, settings: GapSettings) -> FloatArray:
+    """Times (S,) from the beginning of a gap to the ends of its steps, s."""
+    _, stride, steps = gap_moments(trajectories, settings)
+    return stride * _interval(trajectories, settings) * np.arange(1, steps + 1, dtype=np.float64)
+
+
+def _interval(trajectories: Trajectories, settings: GapSettings) -> float:
+    """From one moment to the next, as a rule, s."""
+    return float(np.median(np.diff(trajectories.time))) if len(trajectories) > 1 else settings.step
 
 
 def sample_gaps(

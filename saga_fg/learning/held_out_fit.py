@@ -31,7 +31,7 @@ from saga_fg.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_news import News
 from saga_fg.edge_rules import Following, Neighbours
-from saga_fg.learning.gap_prediction import gap_errors, predict_gaps
+from saga_fg.learning.gap_prediction import errors_alone
 from saga_fg.learning.gaps import GapSample, GapSettings, sample_gaps
 from saga_fg.learning.interaction_fit import MOST_GAPS, FittedInteractions, fit_interactions
 from saga_fg.learning.joint_gaps import JointGaps
@@ -131,7 +131,7 @@ def _trial(
 ) -> Trial:
     filtered = own.filtered(of)
     gaps = sample_gaps(of, filtered, classes, settings).drawn(TRIED_GAPS, seed=2)
-    errors = {CLASSICAL: gap_errors(gaps, predict_gaps(gaps, lambda _features, _seen: [], 0.0, 0.0))}
+    errors = {CLASSICAL: errors_alone(gaps)}
     for name, form in forms.items():
         rules = [replace(rule, news=form.news) for rule in taught.rules]
         noise = taught.acceleration_noise if form.fitted_noise else own.acceleration_noise

@@ -54,8 +54,11 @@ def fit_interactions_in_view(
     views = _Views(recordings, position_noise, acceleration_noise)
     own = RuleParameters.of(template)
     x = views.likeliest(own, views.start(own), iterations)
-    chosen = _fewest_edges([RuleParameters.of(_of_degree(template, k)) for k in sorted(degrees)], own, x, views)
-    if views.loss(chosen, x) < views.loss(own, x):
+    tried = [*(RuleParameters.of(_of_degree(template, k)) for k in sorted(degrees)), own]
+    logs = [views.log_likelihood(parameters, x)[0] for parameters in tried]
+    fewest = next(k for k, log in enumerate(logs) if log > max(logs) - 1)  # as likely as any, to a factor of e
+    chosen = tried[fewest]
+    if logs[fewest] > logs[-1]:
         x = views.likeliest(chosen, x, iterations)
     alone = RuleParameters.of(())
     x_alone = views.likeliest(alone, views.start(alone), iterations)
@@ -116,9 +119,3 @@ class _Views:
 
 def _of_degree(template: Sequence[Rule], degree: int) -> tuple[Rule, ...]:
     return tuple(replace(rule, max_degree=degree) if isinstance(rule, Neighbours) else rule for rule in template)
-
-
-def _fewest_edges(fewer: Sequence[RuleParameters], own: RuleParameters, x: FloatArray, views: _Views) -> RuleParameters:
-    """The first that is as likely as the likeliest, to a factor of e, at the same rates and widths."""
-    likelihoods = [views.log_likelihood(parameters, x)[0] for parameters in (*fewer, own)]
-    return next(p for p, log in zip((*fewer, own), likelihoods, strict=True) if log > max(likelihoods) - 1)

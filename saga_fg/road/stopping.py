@@ -29,8 +29,8 @@ import numpy as np
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.edge_rules import VEHICLES, Pairs
 from saga_fg.geometry import wrap_angle
-from saga_fg.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised
-from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
+from saga_fg.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised, accelerated, speed_along
+from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, unit
 from saga_fg.node import NodeType
 from saga_fg.road.polyline import feet, on_it
 from saga_fg.road.road_map import LANE, STOP_LINE
@@ -96,9 +96,9 @@ class Stopping:
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         ways = approach(nodes, target, source)
-        g, v = self.gap(nodes, target, ways.way), _speed_along(nodes, target, ways)
+        g, v = self.gap(nodes, target, ways.way), speed_along(nodes, target, ways.direction)
         braking = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), np.zeros_like(v))
-        return _along_the_lane(nodes, target, source, ways, v, braking, self.time_constant)
+        return accelerated(nodes, target, source, ways.direction, v, braking, self.time_constant)
 
 
 @dataclass(frozen=True)
@@ -116,31 +116,9 @@ class DriverStopping:
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         ways = approach(nodes, target, source)
-        v = _speed_along(nodes, target, ways)
+        v = speed_along(nodes, target, ways.direction)
         f = self.driver.stopping(v, self.gap(nodes, target, ways.way))
-        return _along_the_lane(nodes, target, source, ways, v, f, self.driver.time_constant)
-
-
-def _speed_along(nodes: NodeTable, target: IntArray, ways: Approach) -> FloatArray:
-    """(E,) speeds along the lane, m/s, not below 0."""
-    return np.asarray(np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0))
-
-
-def _along_the_lane(
-    nodes: NodeTable, target: IntArray, source: IntArray, ways: Approach, v: FloatArray, f: Linearised, tau: float
-) -> Triples:
-    """The triples of an acceleration along the lane, linearised at the speeds v (E,) and the ways to the line."""
-    u = ways.direction
-    p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-    p_j = nodes.types[source[0]].index(POSITION)
-    along = tau * u[:, :, None] * u[:, None, :]
-    straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
-    triples = no_triples(nodes, target, source)
-    triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
-    triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
-    triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
-    triples.b[:, v_i] = tau * u * (f.value - f.by_speed * v - f.by_gap * straight)[:, None]
-    return triples
+        return accelerated(nodes, target, source, ways.direction, v, f, self.driver.time_constant)
 
 
 @dataclass(frozen=True)
@@ -168,7 +146,7 @@ class RedLight:
         near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= self.max_distance
         target, source = target[near], source[near]
         ways = approach(nodes, target, source)
-        v = _speed_along(nodes, target, ways)
+        v = speed_along(nodes, target, ways.direction)
         front = ways.way - nodes.length[target] / 2  # of the vehicle, before the line
         stops = np.flatnonzero(ways.comes & (front > 0) & (v**2 <= 2 * self.hardest * front))
         preceded = _in_one_lane(source[stops], ways.crossing[stops]) & (ways.way[stops] < ways.way[stops, None])

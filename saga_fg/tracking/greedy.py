@@ -14,7 +14,7 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
-from saga_fg.by_class import DEFAULT
+from saga_fg.by_class import DEFAULT, class_numbers
 from saga_fg.frame import Frame
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
@@ -117,9 +117,7 @@ class GreedyTracker:
             return match
         projected = memory.position[:, :2] + memory.velocity * (now - memory.last_seen)[:, None]
         distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - projected[None], -1, 0))
-        limits = self.settings.max_distance
-        otherwise = limits.get(DEFAULT, GreedySettings().max_distance[DEFAULT])
-        limit = np.array([limits.get(str(label), otherwise) for label in boxes.label])
+        limit = class_numbers(self.settings.max_distance, lambda: GreedySettings().max_distance[DEFAULT], boxes.label)
         possible = (boxes.label[:, None] == memory.label[None]) & (distance <= limit[:, None])
         distance = np.where(possible, distance, np.inf)
         for d in np.argsort(-p, kind="stable"):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from data_tools.simulator.trajectories import Trajectories
-from pipelines.bench.hidden_parts import COUPLED, HIDDEN, SEEN_BEFORE, hidden_errors, hidings, without_parts
+from pipelines.bench.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, without_parts
+from pipelines.bench.predictions import FOLLOWED
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.dataset import Annotations, Scene
 from saga_fg.track import Tracks
@@ -69,7 +70,7 @@ def test_the_parts_of_pairs_are_hidden_in_turn():
     first, second = hidings(scene, COUPLED["towing"])
     assert (first.parts.tolist(), second.parts.tolist()) == (["trailer-003"], ["vehicle-003"])
     assert first.asked.tolist() == first.parts.tolist()
-    assert first.start == round(SEEN_BEFORE * RATE)
+    assert first.start == round(FOLLOWED * RATE)
     assert first.end - first.start == second.end - second.start == round(HIDDEN * RATE)
     assert second.start > first.end
 
