@@ -33,6 +33,7 @@ from factors.polar import Radar, RangeBearing, RangeRate
 from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
 from factors.relative_detection import relative_detection_factors
+from factors.relative_polar import relative_range_bearing_factors
 from factors.robust import Robust
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
@@ -100,5 +101,6 @@ __all__ = [
     "prior_factors",
     "range_factor",
     "relative_detection_factors",
+    "relative_range_bearing_factors",
     "solve",
 ]

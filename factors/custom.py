@@ -14,13 +14,14 @@ The guard hands over nothing that has not been checked, so whatever goes wrong i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import gtsam
+import numpy as np
 
 from factors.errors import FactorError
-from factors.validation import FloatArray
+from factors.validation import FloatArray, format_keys
 from factors.variables import Variable
 
 
@@ -80,6 +81,27 @@ def tolerant_custom_factor(
         return moved
 
     return gtsam.CustomFactor(factor.noise_model(), list(factor.keys), evaluate)
+
+
+def custom_factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
+    """The factors of a graph that call back to Python, ours or not."""
+    factors = (graph.at(i) for i in range(graph.size()) if graph.exists(i))
+    return [factor for factor in factors if isinstance(factor, gtsam.CustomFactor)]
+
+
+def check_jacobians(factors: Iterable[gtsam.CustomFactor], values: gtsam.Values) -> None:
+    """Raise `FactorError` for a factor whose Jacobians at `values` would crash GTSAM: unset or of a wrong shape."""
+    dims: dict[int, int] = {}
+    for factor in factors:
+        keys, dims = factor.keys(), dims or values.dims()
+        H = gtsam.JacobianVector([np.empty((0, 0)) for _ in keys])
+        rows = len(factor.unwhitenedError(values, H))
+        for key, jacobian in zip(keys, H, strict=True):
+            shape = (rows, dims[key])
+            if jacobian.shape != shape or not np.isfinite(jacobian).all():
+                where = f"CustomFactor of {format_keys(keys)}: Jacobian by {format_keys([key])}"
+                got = f"shape {jacobian.shape}" if jacobian.size else "none"
+                raise FactorError(f"{where}: expected finite numbers of shape {shape} in H, got {got}")
 
 
 def _hand_over(jacobians: Sequence[FloatArray], H: gtsam.JacobianVector) -> None:

@@ -26,6 +26,7 @@ from typing import Literal
 import gtsam
 import numpy as np
 
+from factors.custom import check_jacobians, custom_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import check_dimensions, native_factor
 from factors.marginal import marginal_moments
@@ -79,6 +80,17 @@ class Solution:
         """Return the joint covariance (D, D) of `keys`, in this order, in the limit of small errors."""
         return marginal_moments(self.linear, keys)[1]
 
+    def marginal(self, key: int) -> FloatArray:
+        """Return the covariance (d, d) of one variable; all is eliminated once, for all that are asked for."""
+        try:
+            return np.asarray(self._tree.marginalCovariance(key))
+        except RuntimeError:  # Cholesky squares the condition number, which objects hardly seen make large
+            return marginal_moments(self.linear, [key], "qr")[1]
+
+    @cached_property
+    def _tree(self) -> gtsam.GaussianBayesTree:
+        return self.linear.eliminateMultifrontal()
+
 
 def solve(
     graph: gtsam.NonlinearFactorGraph,
@@ -89,7 +101,8 @@ def solve(
     """Return the minimum of GTSAM's factors in `graph` and ours in `factors` together, from `start`.
 
     Linear factors go into the graph by `nonlinear_graph`. Not converging is no exception: look at `Solution.converged`.
-    Raises `FactorError` when variables and factors do not fit together or a factor fails at `start`, and
+    Raises `FactorError` when variables and factors do not fit together, a factor fails at `start`, or a
+    `gtsam.CustomFactor` leaves a Jacobian unset, and
     `SingularSystemError`, naming the variables, when the factors do not determine the solution.
     """
     settings = settings or SolverSettings()
@@ -99,8 +112,9 @@ def solve(
         raise FactorError(f"the error at the start is {error}: a factor holds a number that is not finite")
     damping = 0.0
     ordering = None
+    custom = custom_factors(graph)
     for iteration in range(1, settings.max_iterations + 1):
-        linear = linearised(graph, factors, values)
+        linear = _linearised(graph, custom, factors, values)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         move = _move(graph, factors, linear, ordering, values, error, damping, settings)
@@ -117,7 +131,20 @@ def solve(
 def linearised(
     graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values
 ) -> gtsam.GaussianFactorGraph:
-    """Return all factors linearised at `values`, on increments from there."""
+    """Return all factors linearised at `values`, on increments from there.
+
+    Raises `FactorError` for a `gtsam.CustomFactor` that leaves a Jacobian unset, which GTSAM would not survive.
+    """
+    return _linearised(graph, custom_factors(graph), factors, values)
+
+
+def _linearised(
+    graph: gtsam.NonlinearFactorGraph,
+    custom: Iterable[gtsam.CustomFactor],
+    factors: Iterable[Linearisable],
+    values: gtsam.Values,
+) -> gtsam.GaussianFactorGraph:
+    check_jacobians(custom, values)
     linear = graph.linearize(values)
     for factor in factors:
         linear.push_back(factor.linearise(values))

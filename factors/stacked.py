@@ -14,7 +14,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from factors.differences import stacked_differences, wrap_angles
 from factors.errors import FactorError
@@ -32,6 +32,8 @@ from factors.validation import (
     whiteners,
 )
 from factors.variables import PlanarPose, SpatialPose, Variable, Vector
+
+IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +88,15 @@ class ResidualFactors:
         """All keys, each once."""
         return tuple(np.unique(self.rows).tolist())
 
-    def states(self, values: gtsam.Values) -> list[FloatArray]:
-        """Return the states of each column, (N, d_k) or (N, 3, 3) or (N, 4, 4)."""
-        return [self._column(values, k) for k in range(len(self.dims))]
+    def states(self, values: gtsam.Values, chosen: IntArray | None = None) -> list[FloatArray]:
+        """Return the states of each column, (N, d_k) or (N, 3, 3) or (N, 4, 4); of the rows `chosen` (n,) if given."""
+        rows = self.rows if chosen is None else self.rows[chosen]
+        return [self._column(values, rows[:, k], variable) for k, variable in enumerate(self._variables)]
 
-    def errors(self, values: gtsam.Values) -> FloatArray:
-        """Return the cost rho(|| r_i ||) of each factor, (N,)."""
-        distances = self._distances(self._residuals(self.states(values)))
+    def errors(self, values: gtsam.Values, chosen: IntArray | None = None) -> FloatArray:
+        """Return the cost rho(|| r_i ||) of each factor, (N,), or of the rows `chosen` (n,)."""
+        residuals = self._residuals(self._filled(self.states(values, chosen), chosen))
+        distances = _of(self._distances(residuals), chosen)
         return 0.5 * distances**2 if self.robust is None else self.robust.cost(distances)
 
     def error(self, values: gtsam.Values) -> float:
@@ -101,16 +105,24 @@ class ResidualFactors:
 
     def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """Return the factors on the increments from `values`, weighted by the robust loss there."""
-        states = self.states(values)
+        W, jacobians, residuals = self.linearisation(values)
+        return gaussian_graph(whitened_factors(self.rows, W, jacobians, -residuals))
+
+    def linearisation(
+        self, values: gtsam.Values, chosen: IntArray | None = None
+    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+        """Return whiteners (N, m, m), weighted by the robust loss, Jacobians, one (N, m, d_k) a column, and residuals
+        (N, m), all at `values`; or of the rows `chosen` (n,), whose variables are then the only ones asked for.
+        """
+        states = self._filled(self.states(values, chosen), chosen)
         residuals = self._residuals(states)
-        W = self._whiteners
+        W = np.broadcast_to(self._whiteners, (len(self.rows), *self._whiteners.shape[1:]))
         if self.robust is not None:
             W = W * np.sqrt(self.robust.weight(self._distances(residuals)))[:, None, None]
-        return gaussian_graph(whitened_factors(self.rows, W, self._jacobians(states), -residuals))
+        return _of(W, chosen), [_of(J, chosen) for J in self._jacobians(states)], _of(residuals, chosen)
 
-    def _column(self, values: gtsam.Values, k: int) -> FloatArray:
-        variable = self._variables[k]
-        keys, index = np.unique(self.rows[:, k], return_inverse=True)
+    def _column(self, values: gtsam.Values, keys_of_rows: KeyArray, variable: Variable) -> FloatArray:
+        keys, index = np.unique(keys_of_rows, return_inverse=True)
         states = []
         for key in keys.tolist():
             try:
@@ -124,6 +136,18 @@ class ResidualFactors:
         column: FloatArray = np.stack(states)[index] if states else np.empty(shape)
         column.flags.writeable = False
         return column
+
+    def _filled(self, states: Sequence[FloatArray], chosen: IntArray | None) -> list[FloatArray]:
+        """States of all rows, the functions' shapes: those that are not chosen stand where the first chosen one is."""
+        if chosen is None or not len(chosen):
+            return list(states)
+        filled = []
+        for column in states:
+            everywhere = np.repeat(column[:1], len(self.rows), axis=0)
+            everywhere[chosen] = column
+            everywhere.flags.writeable = False
+            filled.append(everywhere)
+        return filled
 
     def _distances(self, residuals: FloatArray) -> FloatArray:
         whitened = (self._whiteners @ residuals[:, :, None])[:, :, 0]
@@ -157,3 +181,7 @@ class ResidualFactors:
             return checked(name, value, shape)
         except FactorError as error:
             raise FactorError(f"{self} on {format_keys(self.rows[:, 0])}: {error}") from error
+
+
+def _of(array: FloatArray, chosen: IntArray | None) -> FloatArray:
+    return array if chosen is None else array[chosen]

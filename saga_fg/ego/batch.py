@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import gtsam
 import numpy as np
 
-from factors import ERROR_DIM, SolverSettings, solve
+from factors import ERROR_DIM, SolverSettings, nonlinear_graph, solve
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.estimate import JointEstimate, read_estimate
 from saga_fg.ego.graph import Keyed, error_key, linear_graph, nonlinear_factors, object_key, pose_key, start_graph
@@ -104,7 +104,7 @@ def _solved(
         values = solution.values
     if settings.lanes is None or not lanes:
         return read_estimate(record, solution)
-    graph.push_back(lane_priors(lanes))
+    graph.push_back(nonlinear_graph(lane_priors(lanes), {lane_key(lane.number): 1 for lane in lanes}))
     for lane in lanes:
         values.insert(lane_key(lane.number), np.zeros(1))
     for _ in range(settings.lanes.rounds):

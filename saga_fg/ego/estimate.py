@@ -8,11 +8,12 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from factors import Solution, marginal_moments
+from factors import Solution
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.ego.graph import Keyed, error_key, object_key, pose_key
 from saga_fg.ego.record import EgoMoment
 from saga_fg.ego.standing import SlowErrors
+from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.interactions import POSITION, VELOCITY
 
 
@@ -43,7 +44,7 @@ class JointEstimate:
     errors: FloatArray
     objects: tuple[ObjectStates, ...]
     converged: bool
-    solution: Solution
+    solution: Solution | GraphSolution
     _record: Keyed
 
     @cached_property
@@ -68,17 +69,10 @@ class JointEstimate:
         return SlowErrors(*np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)).tolist())
 
     def _covariance(self, key: int) -> FloatArray:
-        try:
-            return np.asarray(self._tree.marginalCovariance(key))
-        except RuntimeError:  # Cholesky squares the condition number, which objects hardly seen make large
-            return marginal_moments(self.solution.linear, [key], "qr")[1]
-
-    @cached_property
-    def _tree(self) -> gtsam.GaussianBayesTree:
-        return self.solution.linear.eliminateMultifrontal()
+        return self.solution.marginal(key)
 
 
-def read_estimate(record: Keyed, solution: Solution) -> JointEstimate:
+def read_estimate(record: Keyed, solution: Solution | GraphSolution) -> JointEstimate:
     """The estimate at the moments of a record."""
     values = solution.values
     return JointEstimate(

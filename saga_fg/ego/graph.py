@@ -37,57 +37,67 @@ from saga_fg.ego.settings import JointSettings
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
+from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, key_of
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import NodeType
 
 _LIKELY = 0.9  # an object that stands with less than this probability is taken to move
 _SURELY_MOVING = 4.0  # standard deviations from standing at which the loss gives up an object
 _ANY_SPEED = 100.0  # m/s, deviation of a velocity of which nothing is known
-_OBJECTS = 1 << 32  # keys of objects: moment times this, plus the id
 Keyed = list[tuple[int, EgoMoment]]
 
 
 def pose_key(moment: int) -> int:
     """Key of the vehicle's pose at a moment."""
-    return int(gtsam.symbol("x", moment))
+    return key_of(EGO_POSE, 0, moment)
 
 
 def error_key(moment: int) -> int:
     """Key of the odometry's slow errors (scale, bias of the yaw rate, course) at a moment."""
-    return int(gtsam.symbol("e", moment))
+    return key_of(EGO_ERROR, 0, moment)
 
 
 def object_key(moment: int, name: int) -> int:
     """Key of an object's state at a moment."""
-    return int(gtsam.symbol("o", moment * _OBJECTS + name))
+    return key_of(OBJECT, name, moment)
+
+
+def start_factors(
+    moment: int, world_T_ego: FloatArray, settings: JointSettings
+) -> tuple[gtsam.JacobianFactor, gtsam.NonlinearFactor]:
+    """Priors of the odometry's errors and of the first pose, which says where the world lies."""
+    noise = settings.odometry
+    slow = prior_factor(error_key(moment), np.zeros(ERROR_DIM), np.diag([noise.scale, noise.bias, noise.course]) ** 2)
+    sigma = gtsam.noiseModel.Isotropic.Sigma(6, settings.start_noise)
+    return slow, gtsam.PriorFactorPose3(pose_key(moment), gtsam.Pose3(world_T_ego), sigma)
 
 
 def start_graph(moment: int, world_T_ego: FloatArray, settings: JointSettings) -> gtsam.NonlinearFactorGraph:
-    """What is known of the vehicle at the first moment: its pose, which says where the world lies, and its errors."""
-    noise = settings.odometry
-    slow = prior_factor(error_key(moment), np.zeros(ERROR_DIM), np.diag([noise.scale, noise.bias, noise.course]) ** 2)
+    """The same as a graph."""
+    slow, first = start_factors(moment, world_T_ego, settings)
     graph = nonlinear_graph([slow], {error_key(moment): ERROR_DIM})
-    sigma = gtsam.noiseModel.Isotropic.Sigma(6, settings.start_noise)
-    graph.add(gtsam.PriorFactorPose3(pose_key(moment), gtsam.Pose3(world_T_ego), sigma))
+    graph.add(first)
     return graph
 
 
-def linear_graph(record: Keyed, known: set[int] | None = None) -> gtsam.NonlinearFactorGraph:
-    """The linear factors of consecutive moments of a record: births and interactions.
-
-    known: ids of the objects that were there before the first of them
-    """
-    births, motions = [], []
+def linear_graph(record: Keyed) -> gtsam.NonlinearFactorGraph:
+    """The linear factors of consecutive moments of a record: births and interactions."""
+    factors: list[gtsam.JacobianFactor] = []
     dims: dict[int, int] = {}
-    before = np.array(sorted(known or ()), dtype=np.int64)
-    for (k, moment), earlier in zip(record, [None, *(m for _, m in record)], strict=False):
-        names = moment.objects.id
-        dims.update({object_key(k, int(name)): t.dim for name, t in zip(names, moment.objects.types, strict=True)})
-        births += _births(k, moment, np.flatnonzero(~np.isin(names, before)))
-        if earlier is not None and moment.transition is not None:
-            motions += _motions(k, moment)
-        before = names
-    return nonlinear_graph([*births, *motions], dims)
+    known: set[int] = set()
+    for k, moment in record:
+        names = moment.objects.id.tolist()
+        dims.update({object_key(k, name): t.dim for name, t in zip(names, moment.objects.types, strict=True)})
+        factors += linear_factors(k, moment, known)
+        known = set(names)
+    return nonlinear_graph(factors, dims)
+
+
+def linear_factors(k: int, moment: EgoMoment, known: set[int]) -> list[gtsam.JacobianFactor]:
+    """Births and interactions of one moment; known: ids of the objects of the moment before, none at the first one."""
+    new = np.flatnonzero(~np.isin(moment.objects.id, np.array(sorted(known), dtype=np.int64)))
+    births = _births(k, moment, new)
+    return births + _motions(k, moment) if known and moment.transition is not None else births
 
 
 def nonlinear_factors(
@@ -97,18 +107,22 @@ def nonlinear_factors(
 
     standing: for each moment the probabilities that its objects stand; None if none is taken to
     """
-    factors: list[Linearisable] = []
-    if len(record) > 1:
-        pairs = [(j, k) for (j, _), (k, _) in pairwise(record)]
-        rows = np.array([[pose_key(j), pose_key(k), error_key(j), error_key(k)] for j, k in pairs], dtype=np.uint64)
-        steps = np.stack([moment.a_T_b for _, moment in record[1:]])
-        dt = np.diff([moment.time for _, moment in record])
-        noise = motion_covariances([moment for _, moment in record], settings)
-        factors.append(odometry_factors(rows, steps, dt, noise))
-    factors += _detections(record, settings)
+    factors = [*odometry(record, settings), *detections(record, settings)]
     if standing is not None:
-        factors += _standing(record, standing, settings)
+        factors += standing_factors(record, standing, settings)
     return factors
+
+
+def odometry(record: Keyed, settings: JointSettings) -> list[Linearisable]:
+    """Poses and slow errors of consecutive moments."""
+    if len(record) < 2:
+        return []
+    pairs = [(j, k) for (j, _), (k, _) in pairwise(record)]
+    rows = np.array([[pose_key(j), pose_key(k), error_key(j), error_key(k)] for j, k in pairs], dtype=np.uint64)
+    steps = np.stack([moment.a_T_b for _, moment in record[1:]])
+    dt = np.diff([moment.time for _, moment in record])
+    noise = motion_covariances([moment for _, moment in record], settings)
+    return [odometry_factors(rows, steps, dt, noise)]
 
 
 def _births(k: int, moment: EgoMoment, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> list[gtsam.JacobianFactor]:
@@ -142,7 +156,8 @@ def _motions(k: int, moment: EgoMoment) -> list[gtsam.JacobianFactor]:
     return motion_factors(Motion(moment.transition), layout, np.zeros(layout.size), before, now)[0]
 
 
-def _detections(record: Keyed, settings: JointSettings) -> list[Linearisable]:
+def detections(record: Keyed, settings: JointSettings) -> list[Linearisable]:
+    """Objects seen from the vehicle."""
     collected: dict[NodeType, _Rows] = {}
     for k, moment in record:
         types = dict(zip(moment.objects.id.tolist(), moment.objects.types, strict=True))
@@ -166,7 +181,7 @@ class _Rows:
     R: list[FloatArray]
 
 
-def _standing(record: Keyed, standing: Sequence[FloatArray], settings: JointSettings) -> list[Linearisable]:
+def standing_factors(record: Keyed, standing: Sequence[FloatArray], settings: JointSettings) -> list[Linearisable]:
     """Between two moments of an object that probably stands at both."""
     collected: dict[NodeType, _Rows] = {}
     told = list(zip(record, standing, strict=True))

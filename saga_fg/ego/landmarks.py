@@ -16,6 +16,7 @@ import numpy as np
 from factors import Linearisable
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.graph import pose_key
+from saga_fg.graph import LANDMARK, key_of
 from saga_fg.landmarks import LandmarkType, Observation, sighting_factors
 
 Observations = Sequence[Sequence[Observation]]
@@ -36,7 +37,7 @@ class LandmarkPart:
 
 def landmark_key(number: int) -> int:
     """Key of a landmark."""
-    return int(gtsam.symbol("l", number))
+    return key_of(LANDMARK, number, None)
 
 
 def landmark_part(observations: Observations, path: FloatArray, reach: float) -> LandmarkPart:

@@ -27,13 +27,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors import Linearisable, Robust, lane_keeping_factors, nonlinear_graph, prior_factor
+from factors import Linearisable, Robust, lane_keeping_factors, prior_factor
 from factors.rotations import cross_matrix
 from saga_fg.arrays import FloatArray, IntArray, of_classes
 from saga_fg.ego.estimate import ObjectStates
 from saga_fg.ego.graph import Keyed, by_type, object_key
 from saga_fg.ego.settings import LaneSettings
 from saga_fg.geometry import yaw_transform
+from saga_fg.graph import MAP_NODE, key_of
 from saga_fg.interactions import POSITION
 from saga_fg.node import NodeType
 from saga_fg.road.polyline import feet, on_it
@@ -45,7 +46,7 @@ _LEAVING = 3.0  # times the spread: farther from the centre line a vehicle is dr
 
 def lane_key(number: int) -> int:
     """Key of how far a lane lies to the left of where the map has it."""
-    return int(gtsam.symbol("c", number))
+    return key_of(MAP_NODE, number, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +153,9 @@ def lane_factors(record: Keyed, kept: Sequence[Keeping], settings: LaneSettings)
     return factors
 
 
-def lane_priors(lanes: Iterable[KnownLane]) -> gtsam.NonlinearFactorGraph:
-    """What the map says of where the lanes are."""
-    factors = [prior_factor(lane_key(lane.number), np.zeros(1), np.array([[lane.deviation**2]])) for lane in lanes]
-    return nonlinear_graph(factors, {lane_key(lane.number): 1 for lane in lanes})
+def lane_priors(lanes: Iterable[KnownLane]) -> list[gtsam.JacobianFactor]:
+    """The knowledge of a map of where its lanes are."""
+    return [prior_factor(lane_key(lane.number), np.zeros(1), np.array([[lane.deviation**2]])) for lane in lanes]
 
 
 def _shift(place: FloatArray, world_T_ego: FloatArray, P: FloatArray) -> FloatArray:

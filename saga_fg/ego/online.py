@@ -1,8 +1,8 @@
-"""Path, landmarks and objects as they come: the factor graph of the last seconds, and a joint prior for all before.
+"""Path, landmarks and objects as they come: the running graph of the last seconds, and a joint prior for all before.
 
 Each frame adds a moment to the window. Which objects stand is judged over the window, which observation is of which
 landmark by the joint Gaussian of the new pose and the landmarks (`saga_fg.landmarks.associate`), which vehicle keeps
-which lane by the pose as known then (`saga_fg.ego.lanes`), and everything in the window is solved anew. Moments older
+which lane by the pose as known then (`saga_fg.ego.lanes`), and iSAM2 solves the window with what is new. Moments older
 than `lag` leave, and landmarks last seen from them (`saga_fg.ego.window`). With a lag longer than the recording it is
 the batch estimate, up to what is told apart online.
 """
@@ -15,18 +15,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import Solution
 from saga_fg.arrays import FloatArray, checked_covariances
 from saga_fg.ego.estimate import JointEstimate, read_estimate
-from saga_fg.ego.record import Registration
+from saga_fg.ego.record import EgoMoment, Registration
 from saga_fg.ego.settings import JointSettings
 from saga_fg.ego.standing import SlowErrors, standing_probabilities
 from saga_fg.ego.window import Window
 from saga_fg.ego.window_landmarks import WindowLandmarks
 from saga_fg.ego.window_lanes import WindowLanes
 from saga_fg.errors import InputError
+from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.frame import Frame
 from saga_fg.geometry import checked_transform
+from saga_fg.graph import FactorProvider
 from saga_fg.landmarks import Landmark, MapperSettings, Observation
 from saga_fg.tracking import Tracker
 
@@ -72,7 +73,7 @@ class OnlineEstimator:
         self._lanes = WindowLanes(self._settings.lanes, tracker.settings.road_map)
         self._standing: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
-        self._solution: Solution | None = None
+        self._solution: GraphSolution | None = None
 
     def step(
         self,
@@ -97,14 +98,18 @@ class OnlineEstimator:
             covariance = None if covariance is None else checked_covariances("covariance", [covariance], 1, 6)[0]
             pose = window.predicted(frame.timestamp, increment)
         moment = self._registration.add(frame, pose, increment, covariance)
-        k = window.add(moment, pose)
         self._lanes.learn(frame.road_map)
-        solution = self._solved()
+        before = [] if not window.record else list(window.path)
+        self._standing = self._judged([*(one for _, one in window.record), moment], np.stack([*before, pose]))
+        solution = window.add(moment, pose, self._standing)
         if observations:
-            self._landmarks.observe(k, window, solution, observations)
-        kept = self._lanes.keep(window, solution, self._standing[-1])
-        if observations or kept:
-            solution = self._solved()
+            self._landmarks.observe(window.record[-1][0], solution, observations)
+        kept = self._lanes.keep(window.record, solution, self._standing[-1])
+        more: list[FactorProvider] = [*([self._landmarks] if observations else []), *([self._lanes] if kept else [])]
+        if more:
+            self._standing = self._judged([one for _, one in window.record], window.path)
+            solution = window.extend(self._standing, more)
+        self._solution = solution
         settled = self._slide(solution)
         newest = read_estimate(window.record[-1:], solution)
         self._slow = newest.slow_errors
@@ -120,15 +125,11 @@ class OnlineEstimator:
         """All landmarks so far: those in the window as they are, others as they were when they left it."""
         return self._landmarks.all(self._solution)
 
-    def _solved(self) -> Solution:
-        window = self._window
-        moments = [moment for _, moment in window.record]
-        self._standing = standing_probabilities(moments, window.path, self._slow, self._settings)
-        native, factors = self._landmarks.factors()
-        self._solution = window.solve(self._standing, native, [*factors, *self._lanes.factors(window)])
-        return self._solution
+    def _judged(self, moments: list[EgoMoment], path: FloatArray) -> list[FloatArray]:
+        """For each moment the probabilities that its objects stand, along a path (n, 4, 4)."""
+        return standing_probabilities(moments, path, self._slow, self._settings)
 
-    def _slide(self, solution: Solution) -> JointEstimate | None:
+    def _slide(self, solution: GraphSolution) -> JointEstimate | None:
         """Let moments leave that are older than the lag; returns their estimate."""
         window = self._window
         count = window.older_than(window.record[-1][1].time - self._lag)
@@ -136,5 +137,5 @@ class OnlineEstimator:
             return None
         settled = read_estimate(window.record[:count], solution)
         first = window.record[count][0]
-        window.leave(count, [*self._landmarks.leave(first, solution), *self._lanes.leave(first)], solution)
+        window.leave(count, [*self._landmarks.leave(first, solution), *self._lanes.leave(first)])
         return settled

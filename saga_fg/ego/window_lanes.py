@@ -8,20 +8,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from factors import Linearisable, Solution
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.estimate import read_estimate
+from saga_fg.ego.graph import Keyed
 from saga_fg.ego.lanes import Keeping, KnownLane, keepings, known_lanes, lane_factors, lane_key, lane_priors
 from saga_fg.ego.settings import LaneSettings
-from saga_fg.ego.window import Window
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.graph import MAP_NODE, Additions, GraphView, NewVariable
 from saga_fg.road.road_map import RoadMap
 
 
 class WindowLanes:
     """The lanes of the maps so far, and who keeps them."""
 
+    name = "lanes"
+
     def __init__(self, settings: LaneSettings | None, road_map: RoadMap | None) -> None:
         self._settings = settings
+        self._new = Additions()
         self._maps = [road_map]
         self._lanes: list[KnownLane] = known_lanes(self._maps)
         self._kept: list[Keeping] = []
@@ -32,24 +36,23 @@ class WindowLanes:
             self._maps.append(road_map)
             self._lanes = known_lanes(self._maps)
 
-    def keep(self, window: Window, solution: Solution, standing: FloatArray) -> bool:
+    def factors(self, view: GraphView) -> Additions:
+        """Lanes that are new in the window, and the vehicles of the newest moment that keep one, as last assigned."""
+        return self._new
+
+    def keep(self, record: Keyed, solution: GraphSolution, standing: FloatArray) -> bool:
         """Assign the vehicles of the newest moment, which stand with these probabilities, to lanes; whether any is."""
         if self._settings is None or not self._lanes:
             return False
-        newest, (k, moment) = read_estimate(window.record[-1:], solution), window.record[-1]
+        newest, (k, moment) = read_estimate(record[-1:], solution), record[-1]
         pose = newest.world_T_ego[-1], newest.pose_covariances[-1]
         found = keepings(k, newest.objects[-1], moment.seen.id, standing, pose, self._lanes, self._settings)
         there = {one.lane for one in self._kept}
         fresh = [lane for lane in self._lanes if lane.number in {one.lane for one in found} - there]
-        for lane in fresh:
-            window.values.insert(lane_key(lane.number), np.zeros(1))
-        window.assume(lane_priors(fresh))
+        lanes = [NewVariable(MAP_NODE, lane.number, np.zeros(1), static=True, label="lane") for lane in fresh]
         self._kept += found
+        self._new = Additions(lanes, [*lane_priors(fresh), *lane_factors(record, found, self._settings)])
         return bool(found)
-
-    def factors(self, window: Window) -> list[Linearisable]:
-        """The factors of all who keep a lane in the window."""
-        return [] if self._settings is None else lane_factors(window.record, self._kept, self._settings)
 
     def leave(self, first: int) -> list[int]:
         """Forget who kept a lane before the moment `first`; returns the keys of lanes that nobody keeps any more."""

@@ -5,6 +5,11 @@ from saga_fg.estimators.bounded import BoundedKalmanFilter
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.graduated import GraduatedNonConvexity
+from saga_fg.estimators.graph_engine import RelinearisationSettings
+from saga_fg.estimators.graph_filter import GraphFilter
+from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.kalman import JointKalmanFilter
 from saga_fg.estimators.motion import NodeMotion
@@ -17,6 +22,7 @@ from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 
 __all__ = [
     "BatchSmoother",
+    "Births",
     "BoundedKalmanFilter",
     "Estimator",
     "FactorGraph",
@@ -24,11 +30,17 @@ __all__ = [
     "GaussNewtonSettings",
     "Gaussian",
     "GraduatedNonConvexity",
+    "GraphFilter",
+    "GraphSolution",
     "IncrementalFilter",
+    "IncrementalSmoother",
+    "Interactions",
     "JointKalmanFilter",
+    "LinearDetections",
     "Measurements",
     "NodeMotion",
     "Observations",
+    "RelinearisationSettings",
     "Smoothed",
     "WindowSettings",
     "WindowedSmoother",

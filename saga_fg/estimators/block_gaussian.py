@@ -134,6 +134,8 @@ def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray)
     """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
     d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
     result = np.empty((len(rows), d, d))
+    if len(rows) == 0:
+        return result
     if partition.size:
         own = np.empty((len(partition.layout), d, d))
         for (nodes, row, slot), block in zip(partition.homes, blocks, strict=True):

@@ -30,7 +30,7 @@ from factors import (
     nonlinear_graph,
     prior_factors,
 )
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
@@ -40,7 +40,7 @@ from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.sighting import Sighting
 from saga_fg.transition import Blocks
 
-_SINGULAR = 1e-13  # share of the largest variance below which a direction has none
+_SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +162,7 @@ def motion_factors(
     regular = np.zeros(len(layout), dtype=bool)  # native factors need noise in all directions
     for blocks in dynamics.Q:
         noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
-        variances = np.linalg.eigvalsh(blocks.values)
-        regular[blocks.target] = variances[:, 0] > _SINGULAR * variances[:, -1]
+        regular[blocks.target] = _is_regular(blocks.values)
     regular[layout.rows(list(special))] = False
     kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
     for blocks in dynamics.F:
@@ -192,6 +191,13 @@ def motion_factors(
     return native, nonlinear
 
 
+def _is_regular(Q: FloatArray) -> BoolArray:
+    """Which of the covariances (..., d, d) have variance in all directions, in units in which those of axes are 1."""
+    deviation = np.sqrt(np.diagonal(Q, axis1=-2, axis2=-1))
+    scale = np.where(deviation > 0, deviation, 1.0)
+    return np.asarray(np.linalg.eigvalsh(Q / scale[..., :, None] / scale[..., None, :])[..., 0] > _SINGULAR)
+
+
 def _of_row(blocks: Blocks, row: int) -> list[tuple[int, FloatArray]]:
     """Source rows and blocks of one node."""
     mine = np.flatnonzero(blocks.target == row)
@@ -210,9 +216,9 @@ def _interaction_factor(
     next_key: int, keys: list[int], F: list[FloatArray], b: FloatArray, Q: FloatArray
 ) -> gtsam.JacobianFactor:
     """|| x' - sum_j F_j x_j - b ||_Q, with hard constraints where Q has no variance."""
-    variances, directions = np.linalg.eigh(Q)
-    if variances[0] > _SINGULAR * variances[-1]:
+    if _is_regular(Q):
         return interaction_factor(next_key, keys, F, b, Q)
+    variances, directions = np.linalg.eigh(Q)
     sigmas = np.sqrt(np.where(variances > _SINGULAR * variances[-1], variances, 0.0))
     terms = [(next_key, directions.T), *((key, -directions.T @ block) for key, block in zip(keys, F, strict=True))]
     model = gtsam.noiseModel.Constrained.MixedSigmas(1.0, sigmas)

@@ -13,6 +13,7 @@ filter and smoother, by components (`saga_fg.estimators.backward`). The newest s
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -46,6 +47,11 @@ class FixedLagSmoother:
             raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._lag = float(lag)
         self._recording = Recording(settings)
+
+    def __copy__(self) -> FixedLagSmoother:
+        twin = FixedLagSmoother(self._lag)
+        twin._recording = copy.copy(self._recording)
+        return twin
 
     @property
     def lag(self) -> float:

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids
+from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
 from saga_fg.errors import InputError, UnknownNodeError
 
 
+@dataclass(frozen=True, eq=False)
 class Layout:
-    """Ids of the nodes in order, the sizes of their states, and their places in the joint state. Immutable."""
+    """Ids of the nodes (n,) in order, the sizes of their states (n,), and their places in the joint state (n + 1,)."""
 
-    def __init__(self, nodes: ArrayLike = (), dims: ArrayLike = ()) -> None:
-        self.nodes: IntArray = checked_ids("nodes", nodes)
-        self.dims: IntArray = np.asarray(dims, dtype=np.int64)
-        self.offsets: IntArray = np.concatenate([[0], np.cumsum(self.dims)]).astype(np.int64)
+    nodes: IntArray = ()  # type: ignore[assignment]  # arrays from construction on
+    dims: IntArray = ()  # type: ignore[assignment]
+    offsets: IntArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        nodes, dims = checked_ids("nodes", self.nodes), checked_rows("dims", self.dims, len(self.nodes))
+        for name, array in (("nodes", nodes), ("dims", dims), ("offsets", np.concatenate([[0], np.cumsum(dims)]))):
+            object.__setattr__(self, name, array.astype(np.int64, copy=False))
 
     @cached_property
     def _row(self) -> dict[int, int]:

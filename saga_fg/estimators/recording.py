@@ -84,6 +84,11 @@ class Recording:
         nothing = BlockGaussian.empty()
         self.restore(RecordingState(nothing, (Moment(0.0),), (nothing.layout,), (arrival(nothing),), True))
 
+    def __copy__(self) -> Recording:
+        twin = Recording(self._settings, self._lazy)
+        twin.restore(self.snapshot())
+        return twin
+
     def snapshot(self) -> RecordingState:
         return RecordingState(
             self._prior, tuple(self._moments), tuple(self._layouts), tuple(self._passes), self._converged

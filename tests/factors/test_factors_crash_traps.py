@@ -39,6 +39,9 @@ TRAPS = {
     "marginal of a free variable": "marginal_factors(gaussian_graph([loose]), [1])",
     "covariance of a free variable": "marginal_moments(gaussian_graph([loose]), [1, 2])",
     "solving with a free variable": "solve(nonlinear_graph([loose], {1: 3, 2: 2}), [], values)",
+    "custom factor without Jacobians": "solve(graph_of(lambda this, values, H: values.atVector(1)), [], values)",
+    "custom factor with a Jacobian too small": "solve(graph_of(narrow), [], values)",
+    "linearising a custom factor without Jacobians": "linearised(graph_of(lambda *_: np.zeros(3)), [], values)",
     "solving with another type of variable": "solve(nonlinear_graph([flat], {1: 2}), [], posed)",
 }
 
@@ -53,6 +56,17 @@ values, posed = gtsam.Values(), gtsam.Values()
 values.insert(1, np.zeros(3))
 values.insert(2, np.zeros(2))
 posed.insert(1, gtsam.Pose2())
+
+def graph_of(evaluate):
+    graph = nonlinear_graph([gaussian_factor([2], [I2], np.zeros(2))], {{2: 2}})
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(3, 0.5), [1], evaluate))
+    return graph
+
+def narrow(this, values, H):
+    if H is not None:
+        H[0] = np.eye(2)
+    return values.atVector(1)
+
 for name, call in {TRAPS!r}.items():
     print(name, end=": ", flush=True)  # so that a crash tells where
     try:

@@ -136,3 +136,20 @@ def test_missing_or_mistyped_variables_are_named():
         factors.error(values)
     with pytest.raises(FactorError, match="1 occurs twice"):
         ResidualFactors(np.array([[1, 1]]), (2, 2), difference, np.eye(2))
+
+
+def test_some_rows_need_the_variables_of_those_rows_alone():
+    """Of others they do not even have to be there."""
+    offsets = np.arange(6.0).reshape(3, 2)
+    batch = ResidualFactors([[1], [2], [3]], (2,), lambda x: x - offsets, np.eye(2), robust=Robust("cauchy", 1.0))
+    values = gtsam.Values()
+    for key in (1, 3):
+        values.insert(key, np.array([key, 1.0]))
+    chosen = np.array([0, 2])
+    W, (J,), r = batch.linearisation(values, chosen)
+    np.testing.assert_allclose(r, np.array([[1.0, 1.0], [3.0, 1.0]]) - offsets[chosen])
+    np.testing.assert_allclose(J, np.broadcast_to(np.eye(2), (2, 2, 2)), atol=1e-8)
+    values.insert(2, np.zeros(2))
+    everything = batch.linearisation(values)
+    np.testing.assert_allclose(W, everything[0][chosen])
+    np.testing.assert_allclose(batch.errors(values, chosen), batch.errors(values)[chosen])

@@ -1,0 +1,161 @@
+"""`gtsam.ISAM2` as the engine of a running graph: any factors, one variable a node and epoch, fluid relinearisation.
+
+iSAM2 is told linear factors on increments from the base of every variable (`saga_fg.graph.point`) and never
+linearises itself: no callback runs inside it, and a factor that raises does so before. When a variable has moved by
+more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
+anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
+2012). Robust losses are weighted anew with it (iteratively reweighted least squares). Where that does not
+settle, as after a poor start, Levenberg-Marquardt solves the whole graph, and iSAM2 begins anew from there.
+
+Epochs older than `lag` are marginalised: their factors go out, the prior that they leave on their neighbours comes in,
+and iSAM2 drops the variables that nothing speaks of. Between the two they need not be leaves of the Bayes tree, which
+GTSAM's `marginalizeLeaves` asks for, and the prior is a factor of the graph like any other.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+from saga_fg.estimators.graph_engine import Engine, RelinearisationSettings
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.point import Point
+from saga_fg.graph.providers import FactorProvider, GraphView, ask
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+
+
+class IncrementalSmoother:
+    """The running graph of some providers, solved after every frame.
+
+    providers   asked once a frame, in this order
+    lag         s; epochs leave but for the last that is at least so old: 0 is a filter, None keeps everything. What has
+                one variable for all time stays until it is marginalised by hand
+    settings    of relinearisation
+
+    Every method raises `GraphError`, for what the graph does not take, and then the smoother is as it was before.
+    """
+
+    def __init__(
+        self,
+        providers: Sequence[FactorProvider] = (),
+        lag: float | None = 0.0,
+        settings: RelinearisationSettings | None = None,
+    ) -> None:
+        if lag is not None and not (math.isfinite(lag) and lag >= 0):
+            raise InputError(f"lag: expected a finite number of seconds >= 0, or None, got {lag!r}")
+        self.providers = tuple(providers)
+        self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
+        self._lag, self._settings = lag, settings or RelinearisationSettings()
+        self._graph = SceneFactorGraph()
+        self._engine: Engine | None = None
+        self._times: list[float] = []
+
+    @property
+    def time(self) -> float:
+        """Time of the newest epoch, s."""
+        return self._graph.time
+
+    def graph(self) -> SceneFactorGraph:
+        """The running graph itself: its variables, factors and values. To be read, not changed."""
+        return self._graph
+
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None) -> None:
+        """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve."""
+        unchanged = self._graph
+        graph = unchanged.copy()
+        graph.advance(time)
+        self._asked(graph, self.providers if providers is None else providers)
+        times = [*self._times, graph.time]
+        first = 0 if self._lag is None else sum(t <= time - self._lag for t in times[1:])
+        try:
+            self.marginalise(graph.older_than(times[first]))
+        except GraphError:
+            self._graph, self._engine = unchanged, None
+            raise
+        self._times = times[first:]
+
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Ask some more providers at the present epoch, and solve again."""
+        self._asked(self._graph.copy(), providers)
+
+    def marginalise(self, keys: Iterable[int]) -> None:
+        """Integrate variables out; what they knew of others stays."""
+        graph = self._graph.copy()
+        graph.marginalise(keys)
+        self._graph = graph
+
+    def state(self, key: int) -> object:
+        """Where a variable is: a vector, or a pose."""
+        return self._graph.state(key)
+
+    def covariance(self, key: int) -> FloatArray:
+        """Marginal covariance (d, d) of a variable; of a pose in its own frame, as GTSAM's."""
+        self._graph.variable(key)
+        root = np.asarray(np.linalg.inv(self._ready().root(key)))
+        D = self._graph.point().transport(key)
+        root = root if D is None else D @ root
+        return root @ root.T
+
+    def joint_covariance(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of variables in the order given."""
+        for key in keys:
+            self._graph.variable(key)
+        return self.solution().covariance(keys)
+
+    def solution(self) -> GraphSolution:
+        """The present solution as a value."""
+        engine, graph = self._ready(), self._graph
+        return GraphSolution(Point(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged)
+
+    def handed_over(self) -> IncrementalSmoother:
+        """A smoother that goes on from here with the same iSAM2; this one builds another when it is asked again."""
+        twin = copy.copy(self)
+        twin._times, self._engine = list(self._times), None
+        return twin
+
+    def snapshot(self) -> SceneFactorGraph:
+        """The graph as a value, which can be pickled."""
+        return self._graph.copy()
+
+    def restore(self, graph: SceneFactorGraph) -> None:
+        """Continue from a snapshot; iSAM2 is built anew."""
+        if not isinstance(graph, SceneFactorGraph):
+            raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
+        self._graph, self._engine = graph.copy(), None
+        times = {one.time for one in graph.variables.values() if one.time is not None}
+        self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))
+
+    def _asked(self, graph: SceneFactorGraph, providers: Sequence[FactorProvider]) -> None:
+        view = GraphView(graph, self.covariance, self.origin)
+        for provider in providers:
+            ask(provider, graph, view)
+        self._engine = self._solved(graph)
+        self._graph = graph
+
+    def _ready(self) -> Engine:
+        """iSAM2 with the graph as it is."""
+        if self._engine is None:
+            graph = self._graph.copy()
+            self._engine = self._solved(graph)
+            self._graph = graph
+        return self._engine
+
+    def _solved(self, graph: SceneFactorGraph) -> Engine:
+        """iSAM2 with the graph, which moves to the solution."""
+        engine, self._engine = self._engine, None  # it is begun anew, should it fail
+        start = graph.values
+        if engine is None or engine.elimination != graph.elimination:
+            engine = Engine(graph.elimination)
+        try:
+            return engine.solved(graph, self._settings)
+        except UndeterminedError:
+            if graph.elimination == "qr":
+                raise
+        graph.moved_to(start)  # Cholesky has half the digits
+        return Engine("qr").solved(graph, self._settings)

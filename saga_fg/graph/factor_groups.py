@@ -1,0 +1,233 @@
+"""Factors as the running graph holds them: in groups of what was given together, each factor a row of its group.
+
+A group linearises any of its rows at a `Point`. What GTSAM evaluates itself is linearised by GTSAM, one factor at a
+time with the values of its own variables alone; `ResidualFactors` all at once in NumPy. A `gtsam.CustomFactor` is
+differentiated numerically: GTSAM crashes where its function leaves out a Jacobian, and does not show the function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gtsam
+import numpy as np
+
+from factors import FactorError, Linearisable, ResidualFactors
+from factors.differences import central_differences
+from factors.gaussian import native_factor, whitened_factors
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.graph.point import Point
+
+Rows = tuple[tuple[int, ...], ...]
+
+
+class FactorGroup(Protocol):
+    """Factors that are kept together; `rows`: the keys of each, `linear`: whether linearising once is enough."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def rows(self) -> Rows: ...
+    @property
+    def linear(self) -> bool: ...
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        """The rows `chosen`, on increments from the base. Raises what the factors raise."""
+
+
+class SolvableGroup(FactorGroup, Protocol):
+    """A group whose cost is known without the base."""
+
+    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+        """The cost, -log phi, of the rows `chosen` together."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearGroup:
+    """Linear factors on the variables themselves, which are vectors."""
+
+    factors: tuple[gtsam.JacobianFactor, ...]
+    rows: Rows
+    name: str = "linear factor"
+    linear: bool = True
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        result = []
+        for row in chosen.tolist():
+            keys, augmented = self.rows[row], np.array(self.factors[row].augmentedJacobian(), order="F")
+            base = np.concatenate([point.base.atVector(key) for key in keys])
+            augmented[:, -1] -= augmented[:, :-1] @ base
+            result.append(native_factor(keys, point.dims(keys), augmented))
+        return result
+
+    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+        total = 0.0
+        for row in chosen.tolist():
+            augmented = self.factors[row].augmentedJacobian()
+            x = np.concatenate([values.atVector(key) for key in self.rows[row]])
+            total += 0.5 * float(np.sum((augmented[:, :-1] @ x - augmented[:, -1]) ** 2))
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class PriorGroup:
+    """What is left of marginalised variables: linear factors on increments from the base."""
+
+    factors: tuple[gtsam.JacobianFactor, ...]
+    rows: Rows
+    name: str = "marginal"
+    linear: bool = True
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        return [self.factors[row] for row in chosen.tolist()]
+
+    def native(self, chosen: IntArray, base: gtsam.Values) -> gtsam.NonlinearFactorGraph:
+        """The same for GTSAM's solvers."""
+        linear = gtsam.GaussianFactorGraph()
+        for row in chosen.tolist():
+            linear.push_back(self.factors[row])
+        return gtsam.LinearContainerFactor.ConvertLinearGraph(linear, base)
+
+
+@dataclass(frozen=True, eq=False)
+class StackedGroup:
+    """Nonlinear factors of one shape, linearised together."""
+
+    factors: ResidualFactors
+    rows: Rows
+    linear: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.factors.name
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        W, jacobians, residuals = self.factors.linearisation(point.values, chosen)
+        keys, rhs, blocks = self.factors.rows[chosen], -residuals, []
+        states, origins = self.factors.states(point.values, chosen), self.factors.states(point.base, chosen)
+        for k, J in enumerate(jacobians):
+            column = keys[:, k].tolist()
+            if states[k].ndim == 2:  # vectors
+                delta = states[k] - origins[k]
+            else:
+                delta = np.stack([point.increment(key) for key in column])
+                D = [point.transport(key) for key in column]
+                J = np.stack([a if d is None else a @ d for a, d in zip(J, D, strict=True)])
+            rhs = rhs + (J @ delta[:, :, None])[:, :, 0]
+            blocks.append(J)
+        return whitened_factors(keys, W, blocks, rhs)
+
+    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+        return float(self.factors.errors(values, chosen).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class SingleGroup:
+    """One factor of ours or a user's, that linearises itself."""
+
+    factor: Linearisable
+    rows: Rows
+    name: str
+    linear: bool = False
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        made = self.factor.linearise(point.values)
+        (keys,) = self.rows
+        if not isinstance(made, gtsam.GaussianFactor | gtsam.GaussianFactorGraph):
+            raise FactorError(f"expected linearise to give a gtsam.GaussianFactor, got {type(made).__name__}")
+        if isinstance(made, gtsam.GaussianFactor):
+            graph = gtsam.GaussianFactorGraph()
+            graph.push_back(made)
+        else:
+            graph = made
+        if set(graph.keyVector()) != set(keys):
+            raise FactorError("expected linearise to speak of all of the factor's keys, and of no others")
+        if isinstance(made, gtsam.GaussianFactor):
+            return [point.from_base(list(made.keys()), made.augmentedJacobian())]
+        A, b = made.jacobian(gtsam.Ordering(list(keys)))
+        return [point.from_base(keys, np.column_stack([A, b]))]
+
+    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+        return self.factor.error(values)
+
+
+@dataclass(frozen=True, eq=False)
+class NativeGroup:
+    """One of GTSAM's nonlinear factors."""
+
+    factor: gtsam.NonlinearFactor
+    rows: Rows
+    name: str
+    linear: bool = False
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        made = self.factor.linearize(point.values)
+        return [point.from_base(list(made.keys()), made.augmentedJacobian())]
+
+    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+        return float(self.factor.error(values))
+
+
+@dataclass(frozen=True, eq=False)
+class CustomGroup:
+    """A `gtsam.CustomFactor`, by central differences of its residual."""
+
+    factor: gtsam.CustomFactor
+    rows: Rows
+    name: str = "custom factor"
+    linear: bool = False
+
+    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        (keys,) = self.rows
+        types = [point.variables[key].type for key in keys]
+        states = [kind.read(point.values, key) for key, kind in zip(keys, types, strict=True)]
+        noise = self.factor.noiseModel()
+
+        def residual(*moved: Any) -> FloatArray:
+            return self._residual(keys, moved)
+
+        r = residual(*states)
+        J = central_differences(residual, states, types)
+        whitener = noise.noise() if isinstance(noise, gtsam.noiseModel.Robust) else noise
+        whitened = np.column_stack([whitener.whiten(column) for column in np.column_stack([*J, -r]).T])
+        if isinstance(noise, gtsam.noiseModel.Robust):
+            whitened *= np.sqrt(noise.weight(whitened[:, -1]))
+        return [point.from_base(keys, whitened)]
+
+    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+        return float(self.factor.error(values))
+
+    def _residual(self, keys: Sequence[int], states: Sequence[Any]) -> FloatArray:
+        values = gtsam.Values()  # its own variables alone: GTSAM copies all of them for every call
+        for key, state in zip(keys, states, strict=True):
+            values.insert(key, state)
+        residual = np.asarray(self.factor.unwhitenedError(values), dtype=np.float64)
+        if len(residual) != self.factor.noiseModel().dim():
+            raise FactorError(
+                f"expected a residual of {self.factor.noiseModel().dim()} entries, as its noise, got {len(residual)}"
+            )
+        return residual
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveRows:
+    """The rows of a group that are still there, for `factors.solve`."""
+
+    group: SolvableGroup
+    chosen: IntArray
+    point: Point
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        return tuple({key for row in self.chosen.tolist() for key in self.group.rows[row]})
+
+    def error(self, values: gtsam.Values) -> float:
+        return self.group.error(self.chosen, values)
+
+    def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        graph = gtsam.GaussianFactorGraph()
+        for factor in self.group.linearised(self.chosen, Point(self.point.variables, values, values)):
+            graph.push_back(factor)
+        return graph

@@ -1,0 +1,135 @@
+"""Factor providers: how anything comes into the running graph.
+
+Once a frame each provider is asked, in the order given, what it adds: new variables, with where they are to begin with,
+and factors. What it sees is a `GraphView`, which it can read and not change; those asked after it see what it added.
+
+    class WallDistance:
+        name = "wall"
+
+        def factors(self, view):
+            rows = [[car.key] for car in view.now(OBJECT).values()]
+            return Additions(factors=[ResidualFactors(rows, (4,), lambda x: x[:, 1:2] - 3.0, [[0.25]])])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import gtsam
+
+from saga_fg.arrays import FloatArray
+from saga_fg.graph.errors import GraphError
+from saga_fg.graph.factor_checks import Factor
+from saga_fg.graph.keys import Kind, key_of
+from saga_fg.graph.parts import NewVariable
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import GraphVariable
+
+Factors = Sequence[Factor] | gtsam.NonlinearFactorGraph
+
+
+@dataclass(frozen=True, eq=False)
+class Additions:
+    """What a provider adds to the graph.
+
+    variables   new ones, of this epoch or for all time
+    factors     on variables of the graph, new ones among them
+    named       factors in place of those that the same provider gave under the same name before; none: take them out
+    """
+
+    variables: Sequence[NewVariable] = ()
+    factors: Factors = ()
+    named: Mapping[Hashable, Factors] = field(default_factory=dict)
+
+
+class FactorProvider(Protocol):
+    """Anything that adds factors; `name` is for messages."""
+
+    @property
+    def name(self) -> str: ...
+
+    def factors(self, view: GraphView) -> Additions:
+        """What to add at this epoch."""
+
+
+class GraphView:
+    """The graph at the present epoch, to read.
+
+    covariance(key): marginal (d, d), as known before this frame; origin (2,): that positions of objects are counted
+    from, in the world, m (a tracker's is near its first frame, so that no digits are lost)
+    """
+
+    def __init__(self, graph: SceneFactorGraph, covariance: Callable[[int], FloatArray], origin: FloatArray) -> None:
+        self._graph, self._covariance, self.origin = graph, covariance, origin
+
+    @property
+    def epoch(self) -> int:
+        """The number of the present epoch."""
+        return self._graph.epoch
+
+    @property
+    def time(self) -> float:
+        """Its time, s."""
+        return self._graph.time
+
+    @property
+    def dt(self) -> float:
+        """Time since the epoch before, s; 0 for the first one."""
+        return self.time - self._graph.previous_time if self.epoch > 0 else 0.0
+
+    @property
+    def variables(self) -> Mapping[int, GraphVariable]:
+        """All variables by key."""
+        return self._graph.variables
+
+    def now(self, kind: Kind) -> dict[int, GraphVariable]:
+        """The variables of a kind at this epoch, by id."""
+        return self._graph.of(kind, self.epoch)
+
+    def before(self, kind: Kind) -> dict[int, GraphVariable]:
+        """The variables of a kind at the epoch before, by id."""
+        return self._graph.of(kind, self.epoch - 1)
+
+    def static(self, kind: Kind) -> dict[int, GraphVariable]:
+        """The variables of a kind for all time, by id."""
+        return self._graph.of(kind, None)
+
+    def key(self, kind: Kind, id: int, static: bool = False) -> int:  # noqa: A002 -- an id is what it is
+        """The key of a variable of this epoch, or of one for all time; whether it is there or only to be added."""
+        return key_of(kind, id, None if static else self.epoch)
+
+    def state(self, key: int) -> Any:
+        """Where a variable is."""
+        return self._graph.state(key)
+
+    def covariance(self, key: int) -> FloatArray:
+        """Marginal covariance (d, d) of a variable, as known before this frame."""
+        return self._covariance(key)
+
+
+def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:
+    """Add what a provider gives. Raises `GraphError` that names it, and may then have added some of it."""
+    name = str(getattr(provider, "name", type(provider).__name__))
+    try:
+        additions = provider.factors(view)
+    except GraphError:
+        raise
+    except Exception as error:
+        said = " ".join((str(error) if isinstance(error, ValueError) else repr(error)).split())
+        raise GraphError(f"provider {name}: {said[:500]}") from error
+    if not isinstance(additions, Additions):
+        raise GraphError(f"provider {name}: expected Additions, got {type(additions).__name__}")
+    _checked(name, "variables", additions.variables)
+    graph.add_variables(name, additions.variables)
+    graph.add_factors(name, additions.factors)
+    if not isinstance(additions.named, Mapping):
+        raise GraphError(f"provider {name}: named: expected factors by name, got {type(additions.named).__name__}")
+    for key, factors in additions.named.items():
+        graph.add_factors(name, factors, key)
+
+
+def _checked(name: str, what: str, value: Any) -> None:
+    if isinstance(value, str | bytes) or not isinstance(value, Iterable):
+        raise GraphError(f"provider {name}: {what}: expected a list, got {type(value).__name__}")

@@ -1,0 +1,337 @@
+"""The running graph: variables over time, factors on them, and where the variables are.
+
+    minimise over x   sum_i rho_i( || r_i(x) ||_{R_i} )
+
+Objects, the vehicle and landmarks are variables of one graph, interactions, measurements and priors its factors. What
+leaves is marginalised with all factors that speak of it, linearised where everything is then,
+
+    phi(x_b) = max over x_a of prod phi(x_a, x_b)      a: what leaves, b: its neighbours that stay
+
+so that nothing it knew of the rest is lost. The graph holds values and factors, no solver, and can be pickled if its
+factors can (a `gtsam.CustomFactor` and a lambda cannot).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Hashable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
+from factors.marginal import Elimination
+from factors.validation import format_key
+from saga_fg.arrays import BoolArray, IntArray
+from saga_fg.errors import InputError
+from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.factor_checks import Factor, grouped
+from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, NativeGroup, PriorGroup
+from saga_fg.graph.keys import Kind, described, key_of
+from saga_fg.graph.parts import FactorEntry, HeldGroup, NewVariable
+from saga_fg.graph.point import Point
+from saga_fg.graph.variables import GraphVariable, insert_state, variable_type
+
+_MARGINALS = "marginals"
+_WIDE = 64  # dimensions that hang together, from which QR takes many times as long as Cholesky
+
+
+class SceneFactorGraph:
+    """Variables, factors and values. Every method raises `GraphError` and then has changed nothing."""
+
+    def __init__(self) -> None:
+        self._variables: dict[int, GraphVariable] = {}
+        self._base, self._values = gtsam.Values(), gtsam.Values()
+        self._groups: dict[int, HeldGroup] = {}
+        self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
+        self._factor_counts: dict[int, int] = {}  # number of factors on each variable
+        self.elimination: Elimination = "qr"
+        self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
+        self._count = 0
+        self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
+
+    @property
+    def variables(self) -> Mapping[int, GraphVariable]:
+        """All variables by key."""
+        return MappingProxyType(self._variables)
+
+    @property
+    def groups(self) -> Mapping[int, HeldGroup]:
+        """All factors, by the number of their group, which no other group ever has."""
+        return MappingProxyType(self._groups)
+
+    @property
+    def values(self) -> gtsam.Values:
+        """A copy of where all variables are."""
+        return gtsam.Values(self._values)
+
+    @property
+    def base(self) -> gtsam.Values:
+        """A copy of the base of all variables, from which back ends count increments."""
+        return gtsam.Values(self._base)
+
+    def state(self, key: int) -> Any:
+        """Where a variable is: a vector, a pose, or what its type reads."""
+        return self.variable(key).type.read(self._values, key)
+
+    def variable(self, key: int) -> GraphVariable:
+        """The variable of a key."""
+        if key not in self._variables:
+            raise GraphError(f"{described(key)} is not in the graph")
+        return self._variables[key]
+
+    def factors(self) -> Iterator[FactorEntry]:
+        """Every factor in words."""
+        for held in self._groups.values():
+            for row in held.rows.tolist():
+                mine = tuple(self._variables[key] for key in held.factors.rows[row])
+                yield FactorEntry(held.provider, held.factors.name, mine)
+
+    def advance(self, time: float) -> int:
+        """Begin the next epoch at `time`, s; returns its number."""
+        if not math.isfinite(time) or time <= self.time:
+            raise GraphError(f"time: expected a finite number after {self.time:.6f} s, got {time!r}")
+        self.epoch, self.previous_time, self.time = self.epoch + 1, self.time, float(time)
+        return self.epoch
+
+    def add_variables(self, provider: str, variables: Iterable[NewVariable]) -> list[int]:
+        """Add variables, of the present epoch where they are not static; returns their keys."""
+        added: dict[int, GraphVariable] = {}
+        values = gtsam.Values()
+        for new in variables:
+            if not isinstance(new, NewVariable):
+                raise GraphError(f"provider {provider}: expected NewVariable, got {type(new).__name__}")
+            if self.epoch < 0:
+                raise GraphError(f"provider {provider}: expected an epoch before variables: advance(time)")
+            epoch, time = (None, None) if new.static else (self.epoch, self.time)
+            key = key_of(new.kind, new.id, epoch)
+            kind = new.type or variable_type(f"provider {provider}: {new.kind.name} {new.id}", new.state)
+            variable = GraphVariable(key, new.kind, int(new.id), epoch, time, kind, new.label or new.kind.name)
+            if key in self._variables or key in added:
+                raise GraphError(
+                    f"provider {provider}: {variable}: expected a new variable, it is in the graph already"
+                )
+            try:
+                insert_state(values, variable, new.state)
+            except GraphError as error:
+                raise GraphError(f"provider {provider}: {error}") from error
+            added[key] = variable
+        self._variables |= added
+        self._values.insert(values)
+        self._base.insert(values)
+        self._touching |= dict.fromkeys(added, ())
+        self._factor_counts |= dict.fromkeys(added, 0)
+        return list(added)
+
+    def add_factors(
+        self, provider: str, factors: Iterable[Factor] | gtsam.NonlinearFactorGraph, name: Hashable = None
+    ) -> None:
+        """Add factors; under a `name`, in place of those that this provider gave under it before.
+
+        Each is linearised where its variables are, so that one that cannot be is refused.
+        """
+        groups = grouped(provider, factors, self._variables)
+        held = [HeldGroup(provider, name, group, np.ones(len(group.rows), dtype=bool)) for group in groups]
+        point = self.point()
+        linear = [self.linearised(one, one.rows, point) for one in held]
+        if name is not None:
+            earlier = [n for n, one in self._groups.items() if one.name == name and one.provider == provider]
+            for number in earlier:
+                self._drop(number)
+        for one, factors_there in zip(held, linear, strict=True):
+            if len(one.active):
+                self._fresh[self._hold(one)] = factors_there
+
+    def marginalise(self, keys: Iterable[int]) -> None:
+        """Integrate variables out: they go, what they knew of the others stays."""
+        gone = {key: self.variable(key) for key in keys}
+        if not gone:
+            return
+        touched, point = gtsam.GaussianFactorGraph(), self.point()
+        rest: dict[int, BoolArray] = {}
+        leaving: dict[int, list[int]] = {}
+        numbers = {number for key in gone for number in self._touching[key]}
+        for number in sorted(numbers, key=lambda number: self._groups[number].sharpness):
+            held = self._groups[number]
+            mine = [row for row in held.rows.tolist() if not gone.keys().isdisjoint(held.factors.rows[row])]
+            if not mine:
+                continue
+            for factor in self.linearised(held, np.array(mine), point):
+                touched.push_back(factor)
+            rest[number] = held.active.copy()
+            rest[number][mine] = False
+            leaving[number] = mine
+        spoken = set(touched.keyVector())
+        factors = self._eliminated(touched, sorted(gone.keys() & spoken))
+        for number, active in rest.items():
+            self._fresh.pop(number, None)
+            self._count_rows(self._groups[number].factors, leaving[number], -1)
+            self._groups[number] = replace(self._groups[number], active=active)
+            if not active.any():
+                self._drop(number)
+        if factors:
+            rows = tuple(tuple(factor.keys()) for factor in factors)
+            prior = PriorGroup(tuple(factors), rows)
+            self._hold(HeldGroup(_MARGINALS, None, prior, np.ones(len(rows), dtype=bool)))
+            self._choose(max(factor.cols() - 1 for factor in factors))
+        for key in gone:
+            del self._variables[key], self._touching[key], self._factor_counts[key]
+            self._values.erase(key)
+            self._base.erase(key)
+
+    def touching(self, key: int) -> tuple[int, ...]:
+        """Numbers of the groups with a factor on a variable, now or before."""
+        return self._touching[key]
+
+    def without_factors(self) -> list[int]:
+        """Variables without any factor."""
+        return [key for key, count in self._factor_counts.items() if count == 0]
+
+    def of(self, kind: Kind, epoch: int | None) -> dict[int, GraphVariable]:
+        """The variables of a kind and an epoch, None for those for all time, by id."""
+        return {one.id: one for one in self._variables.values() if one.kind == kind and one.epoch == epoch}
+
+    def older_than(self, time: float) -> list[int]:
+        """Keys of the variables of moments before `time`."""
+        return [key for key, one in self._variables.items() if one.time is not None and one.time < time]
+
+    def point(self) -> Point:
+        """Where everything is, to linearise factors at."""
+        return Point(self._variables, self._base, self._values)
+
+    def linearised(self, held: HeldGroup, rows: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        """Rows of a group as linear factors on increments from the base."""
+        try:
+            return held.factors.linearised(rows, point)
+        except Exception as error:
+            raise GraphError(self._failed(held, rows, error)) from error
+
+    def moved_to(self, values: gtsam.Values) -> None:
+        """Put the variables where a back end has found them."""
+        self._values = gtsam.Values(values)
+        self._fresh.clear()
+
+    def linear(self, number: int, point: Point) -> list[gtsam.JacobianFactor]:
+        """What is there of a group, as linear factors on increments from the base."""
+        if number in self._fresh:
+            return self._fresh[number]
+        held = self._groups[number]
+        return self.linearised(held, held.rows, point)
+
+    def solve(self, settings: SolverSettings | None = None) -> Solution:
+        """Minimise over everything by Levenberg-Marquardt, and put the variables there."""
+        native, ours = self.parts()
+        try:
+            solution = solve(native, ours, self._values, settings)
+        except FactorError as error:
+            raise self.undetermined(error) from error
+        self.moved_to(solution.values)
+        return solution
+
+    def parts(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
+        """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
+        native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
+        for held in self._groups.values():
+            if isinstance(held.factors, NativeGroup):
+                native.add(held.factors.factor)
+            elif isinstance(held.factors, PriorGroup):
+                native.push_back(held.factors.native(held.rows, self._base))
+            else:
+                ours.append(ActiveRows(held.factors, held.rows, point))  # type: ignore[arg-type]
+        return native, ours
+
+    def copy(self) -> SceneFactorGraph:
+        """A graph of its own with the same variables and factors, which are shared."""
+        other = SceneFactorGraph()
+        other.__dict__ |= self.__dict__
+        other._variables, other._groups = dict(self._variables), dict(self._groups)
+        other._touching, other._fresh = dict(self._touching), dict(self._fresh)
+        other._factor_counts = dict(self._factor_counts)
+        other._base, other._values = self.base, self.values
+        return other
+
+    def undetermined(self, error: Exception) -> GraphError:
+        """What a solver said, in the words of this graph."""
+        if not isinstance(error, SingularSystemError) or not error.keys:
+            return GraphError(self.worded(str(error), self._variables))
+        names = [str(self._variables[key]) if key in self._variables else described(key) for key in error.keys[:8]]
+        more = f" and {len(error.keys) - 8} more" if len(error.keys) > 8 else ""
+        first = error.keys[0]
+        its = f" (factors on {names[0]}: {self._kinds_on(first)})" if first in self._variables else ""
+        return UndeterminedError(
+            f"{', '.join(names)}{more}: not determined by the factors{its}; "
+            "expected a prior, or measurements of all components",
+            error.keys,
+        )
+
+    def worded(self, text: str, keys: Iterable[int]) -> str:
+        """A text with keys in words in place of numbers and symbols."""
+        for key in keys:
+            if format_key(key) in text:
+                text = text.replace(format_key(key), str(self._variables[key]))
+        return text
+
+    def _kinds_on(self, key: int) -> str:
+        """Which factors there are on a variable, in words."""
+        counts: dict[str, int] = {}
+        for number in self._touching[key]:
+            held = self._groups[number]
+            mine = sum(key in held.factors.rows[row] for row in held.rows.tolist())
+            if mine:
+                counts[held.factors.name] = counts.get(held.factors.name, 0) + mine
+        return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
+
+    def _failed(self, held: HeldGroup, rows: IntArray, error: Exception) -> str:
+        keys = dict.fromkeys(key for row in rows.tolist() for key in held.factors.rows[row])
+        named = [str(self._variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
+        expected = isinstance(error, FactorError | InputError)
+        said = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
+        where = f"{held.factors.name} on {', '.join(named)}: "
+        return f"provider {held.provider}: {where}{self.worded(said, keys).removeprefix(where)[:500]}"
+
+    def _hold(self, held: HeldGroup) -> int:
+        number, self._count = self._count, self._count + 1
+        self._groups[number] = held
+        for key in {key for row in held.factors.rows for key in row}:
+            self._touching[key] += (number,)
+        self._count_rows(held.factors, held.rows.tolist(), 1)
+        return number
+
+    def _count_rows(self, group: FactorGroup, rows: list[int], step: int) -> None:
+        for row in rows:
+            for key in group.rows[row]:
+                self._factor_counts[key] += step
+
+    def _eliminated(self, touched: gtsam.GaussianFactorGraph, keys: list[int]) -> list[gtsam.JacobianFactor]:
+        """What factors say of the variables that stay."""
+        if self.elimination == "cholesky":
+            with contextlib.suppress(FactorError, RuntimeError):  # it has half the digits that QR has
+                return _jacobians(marginal_factors(touched, keys, "cholesky"))
+        try:
+            return _jacobians(marginal_factors(touched, keys, "qr"))
+        except FactorError as error:
+            raise self.undetermined(error) from error
+
+    def _choose(self, widest: int) -> None:
+        """QR where what is left of marginalised variables is on few dimensions together, else Cholesky."""
+        if widest > _WIDE:
+            self.elimination = "cholesky"
+        elif widest < _WIDE // 2:
+            self.elimination = "qr"
+
+    def _drop(self, number: int) -> None:
+        held = self._groups.pop(number)
+        self._fresh.pop(number, None)
+        self._count_rows(held.factors, held.rows.tolist(), -1)
+        for key in {key for row in held.factors.rows for key in row}:
+            if key in self._touching:
+                self._touching[key] = tuple(n for n in self._touching[key] if n != number)
+
+
+def _jacobians(graph: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:
+    every = [graph.at(i) for i in range(graph.size()) if graph.at(i).size()]
+    return [one if isinstance(one, gtsam.JacobianFactor) else gtsam.JacobianFactor(one) for one in every]

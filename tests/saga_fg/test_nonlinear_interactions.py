@@ -1,0 +1,54 @@
+"""Interaction functions of the running graph: what drivers and pedestrians do."""
+
+import numpy as np
+import pytest
+
+from factors.differences import stacked_differences
+from saga_fg import InputError
+from saga_fg.intelligent_driver import IntelligentDriver
+from saga_fg.nonlinear_interactions import Following, SocialForce
+
+
+def test_the_round_corners_are_close_to_the_model_away_from_them():
+    driver = IntelligentDriver()
+    v, s, w = np.array([8.0, 10.0, 6.0]), np.array([15.0, 30.0, 20.0]), np.array([8.0, 9.0, 6.5])
+    np.testing.assert_allclose(Following(driver).acceleration(v, s, w).value, driver.alone(v, s, w).value, atol=0.02)
+    assert Following(driver).acceleration(np.array(15.0), np.array(0.1), np.array(0.0)).value > -driver.hardest - 0.01
+
+
+def test_a_follower_closes_up_to_the_gap_he_wants_and_no_farther():
+    law, leader = Following(), np.array([100.0, 0.0, 8.0, 0.0])
+    x = np.array([20.0, 0.0, 8.0, 0.0])
+    for _ in range(1200):
+        x, leader = law.predict(x, [leader], 0.1), leader + np.array([0.8, 0.0, 0.0, 0.0])
+    assert x[2] == pytest.approx(8.0, abs=0.05)
+    assert 8.0 < leader[0] - x[0] - law.length < 14.0
+
+
+def test_pedestrians_push_each_other_away_and_stacks_are_the_same():
+    law, rng = SocialForce(), np.random.default_rng(0)
+    x, others = rng.normal(size=(5, 4)), [rng.normal(size=(5, 4)) for _ in range(2)]
+    together = law.predict(x, others, 0.2)
+    for k in range(5):
+        np.testing.assert_allclose(law.predict(x[k], [other[k] for other in others], 0.2), together[k])
+    here, there = np.zeros(4), np.array([0.5, 0.0, 0.0, 0.0])
+    assert law.predict(here, [there], 0.1)[2] < 0 < law.predict(there, [here], 0.1)[2]
+    assert np.isfinite(law.predict(here, [here], 0.1)).all()
+    assert law.predict(here, [], 0.1).tolist() == here.tolist()
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InputError, match="falloff"):
+        SocialForce(falloff=0.0)
+    with pytest.raises(InputError, match="length"):
+        Following(length=-1.0)
+
+
+@pytest.mark.parametrize("law", [Following(), SocialForce()], ids=["following", "repulsion"])
+def test_jacobians_are_the_derivatives(law):
+    rng = np.random.default_rng(1)
+    x, others = 4 * rng.normal(size=(6, 4)), [8 * rng.normal(size=(6, 4)) + 3]
+    F, (G,) = law.jacobians(x, others, 0.3)
+    expected = stacked_differences(lambda a, b: law.predict(a, [b], 0.3), [x, *others])
+    np.testing.assert_allclose(F, expected[0], atol=1e-7)
+    np.testing.assert_allclose(G, expected[1], atol=1e-7)
