@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 from saga_fg.errors import InputError
 
-_LEFTOVER = re.compile(r"\.(.*)\.[0-9a-f]{12}\.tmp", re.DOTALL)
+LEFTOVER = re.compile(r"\.(.*)\.[0-9a-f]{12}\.tmp", re.DOTALL)  # temporary name of a file or folder
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -89,9 +89,10 @@ def remove_leftovers(folder: str | Path, of: str | None = None) -> None:
     of: the name of the file or folder they were to become, None for any.
     """
     for path in Path(folder).glob(".*.tmp"):
-        leftover = _LEFTOVER.fullmatch(path.name)
+        leftover = LEFTOVER.fullmatch(path.name)
         if leftover and of in (None, leftover[1]):
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+            linked = path.is_symlink() or not path.is_dir()
+            path.unlink(missing_ok=True) if linked else shutil.rmtree(path, ignore_errors=True)
 
 
 def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:
@@ -166,6 +167,9 @@ def _move_into_place(source: Path, final: Path) -> None:
             final.rmdir()
         source.rename(final)
         return
+    for folder in (final / p.relative_to(source) for p in source.rglob("*") if p.is_dir()):
+        if folder.is_symlink():
+            raise InputError(f"{folder}: not writable: expected a folder, this is a link")
     for file in sorted(p for p in source.rglob("*") if not p.is_dir()):
         target = final / file.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)

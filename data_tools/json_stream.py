@@ -12,10 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
+from data_tools.input_files import open_text
 from saga_fg.errors import InputError
 
 _SPACE = " \t\n\r"
-_decoder = json.JSONDecoder()
+_DIGITS = 19  # of a number that is read as a whole one; longer ones are floats, which may be infinite
+_decoder = json.JSONDecoder(parse_int=lambda text: int(text) if len(text) <= _DIGITS else float(text))
 
 
 class JsonStream:
@@ -113,9 +115,16 @@ class JsonStream:
         return InputError(f"{self._name}: character {here}: {what}, {got}")
 
 
+def parsed_json(text: str | bytes, where: str) -> Any:
+    """The value of a whole JSON text. Raises `InputError` that begins with `where` for broken and too deep ones."""
+    try:
+        return _decoder.decode(text if isinstance(text, str) else text.decode("utf-8"))
+    except RecursionError as error:
+        raise InputError(f"{where}: broken or truncated JSON: nested too deeply") from error
+    except ValueError as error:
+        raise InputError(f"{where}: broken or truncated JSON: {error}") from error
+
+
 def open_json(path: Path) -> TextIO:
     """Open a JSON file for a `JsonStream`; raises `InputError` if it cannot be opened."""
-    try:
-        return path.open(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    return open_text(path, encoding="utf-8-sig")

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import urlsplit
 
+from data_tools.input_files import read_text
 from saga_fg.errors import InputError, MissingExtraError
 
 
@@ -86,14 +87,21 @@ def expanded(locations: Sequence[str]) -> list[str]:
 
     A name ending in .txt is that of a list with one path, URL or pattern a line; relative paths start from here.
     Paths come back as absolute ones.
-    Raises `InputError` for a pattern or list without files.
+    Raises `InputError` for a pattern or list without files, and for a list that is in itself.
     """
+    return _expanded(locations, ())
+
+
+def _expanded(locations: Sequence[str], lists: tuple[str, ...]) -> list[str]:
+    """lists: those whose lines are being expanded."""
     found: list[str] = []
     for location in locations:
+        if location in lists:
+            raise InputError(f"{location}: expected a list of files, this one is in itself")
         if name_of(location).endswith(".txt"):
             with local_copy(location) as path:
-                lines = [line.strip() for line in _text(path, location).splitlines()]
-            found += expanded([line for line in lines if line and not line.startswith("#")])
+                lines = [line.strip() for line in read_text(path).splitlines()]
+            found += _expanded([line for line in lines if line and not line.startswith("#")], (*lists, location))
         elif is_url(location) and "*" in location:
             file_system, remote = _file_system(location)
             found += sorted(file_system.unstrip_protocol(path) for path in file_system.glob(remote))
@@ -113,13 +121,6 @@ def _called(copy: Path, location: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(str(error).replace(str(copy), location)) from error
-
-
-def _text(path: Path, location: str) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{location}: expected a readable list of files in UTF-8: {error}") from error
 
 
 def _file_system(url: str) -> tuple[Any, str]:

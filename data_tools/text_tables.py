@@ -7,8 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.input_files import read_text
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+
+LONGEST = 100  # characters of a value
+LARGEST = 1e15  # number, whose square is far from overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +23,27 @@ class TextTable:
     values: np.ndarray[tuple[int, int], np.dtype[np.str_]]
     line: np.ndarray[tuple[int], np.dtype[np.int64]]
 
+    @classmethod
+    def of(cls, path: Path, rows: list[list[str]], line: list[int], columns: int = 0) -> TextTable:
+        """A table of rows; `columns` is how many there are where there is no row. Raises `InputError` for long values.
+
+        NumPy stores all texts of an array as wide as the widest.
+        """
+        for number, row in zip(line, rows, strict=True):
+            longest = max(row, key=len, default="")
+            if len(longest) > LONGEST:
+                got = f"{longest[:20]!r}..., {len(longest)} characters"
+                raise InputError(f"{path}: line {number}: expected values of at most {LONGEST} characters, got {got}")
+        values = np.array(rows, dtype=np.str_) if rows else np.empty((0, columns), dtype=np.str_)
+        return cls(path, values, np.array(line, dtype=np.int64))
+
     def __len__(self) -> int:
         return len(self.values)
 
-    def numbers(self, columns: list[int] | slice, names: tuple[str, ...]) -> FloatArray:
-        """Some columns as finite floats (N, C). Raises `InputError` naming line and column."""
+    def numbers(
+        self, columns: list[int] | slice, names: tuple[str, ...], largest: float | tuple[float, ...] = LARGEST
+    ) -> FloatArray:
+        """Some columns as floats (N, C) of at most this size. Raises `InputError` naming line and column."""
         text = self.values[:, columns]
         try:
             numbers = text.astype(np.float64)
@@ -33,13 +53,18 @@ class TextTable:
         if bad.any():
             row, column = (int(i) for i in np.argwhere(bad)[0])
             raise self.fault(row, f"{names[column]}: expected a finite number, got {str(text[row, column])[:40]!r}")
+        large = np.abs(numbers) > largest
+        if large.any():
+            row, column = (int(i) for i in np.argwhere(large)[0])
+            most = np.broadcast_to(largest, large.shape)[row, column]
+            raise self.fault(row, f"{names[column]}: expected a number within {most:g}, got {numbers[row, column]:g}")
         return np.asarray(numbers, dtype=np.float64)
 
     def integers(
         self, column: int, name: str, smallest: int, largest: int = 2**31
     ) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         """A column as whole numbers (N,). Raises `InputError` naming the line of one out of range."""
-        numbers = self.numbers([column], (name,))[:, 0]
+        numbers = self.numbers([column], (name,), np.inf)[:, 0]
         bad = (numbers != np.round(numbers)) | (numbers < smallest) | (numbers > largest)
         if bad.any():
             row = int(np.argmax(bad))
@@ -54,12 +79,7 @@ class TextTable:
 
 def read_lines(path: Path) -> list[str]:
     """The lines of a text file. Raises `InputError` if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text: {error}") from error
+    return read_text(path).splitlines()
 
 
 def read_table(
@@ -81,8 +101,7 @@ def read_table(
             raise InputError(f"{path}: line {number}: expected {expected} columns ({what}), got {len(row)}")
         rows.append(row)
         numbers.append(number)
-    values = np.array(rows, dtype=np.str_) if rows else np.empty((0, columns[0]), dtype=np.str_)
-    return TextTable(path, values, np.array(numbers, dtype=np.int64))
+    return TextTable.of(path, rows, numbers, columns[0])
 
 
 def _number(text: str) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 from data_tools.simulator import SimulatorSettings
 from pipelines.config import TrackConfig
 from pipelines.configuration import settings_reference
+from pipelines.serving import StreamSettings
 from saga_fg.smoothing import SmoothingSettings
 
 INTRODUCTION = """\
@@ -42,6 +43,7 @@ def configuration_page() -> str:
     parts = [INTRODUCTION]
     for title, cls in (("Tracking (`saga-fg track`, `saga-fg demo`)", TrackConfig),
                        ("Smoothing (`saga-fg smooth`, below `smoothing`)", SmoothingSettings),
+                       ("Limits of the service (`saga-fg serve --limits`)", StreamSettings),
                        ("The simulator (`saga-fg simulate`)", SimulatorSettings)):  # fmt: skip
         parts += [f"# {title}\n", settings_reference(cls)]
     return "\n".join(parts)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 from pipelines.configuration import load_settings, read_settings
-from pipelines.tracking import OnlineTracker
 from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.node import ConstantVelocity
@@ -67,7 +66,7 @@ class TrackConfig:
             self, tracker=replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
         )
 
-    def new_tracker(self, method: Method, observer: Observer | None = None) -> OnlineTracker:
+    def new_tracker(self, method: Method, observer: Observer | None = None) -> Tracker | GreedyTracker:
         """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre).
 
         The `observer` watches the first two; `centerpoint` tells nothing.

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.atomic_files import atomic_file
+from data_tools.input_files import open_bytes
+from data_tools.json_stream import parsed_json
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
@@ -56,8 +58,8 @@ def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
     """
     if scene is None and "-" in track:
         scene, _, track = track.rpartition("-")
-    if not track.isdecimal():
-        raise InputError(f"--track {track}: expected the number of a track, or SCENE-NUMBER")
+    if not track.isdecimal() or len(track) > 19:
+        raise InputError(f"--track {track[:40]}: expected the number of a track, or SCENE-NUMBER")
     number = int(track)
     events = [e for e in read_events(journal) if e.get("track") == number and scene in (None, e.get("scene"))]
     if not events:
@@ -73,19 +75,23 @@ def read_events(journal: Path) -> Iterator[Event]:
     """All events. Raises `InputError` for a journal that is not there or broken."""
     if not journal.exists():
         raise InputError(f"{journal}: there is no journal; track with --explain to have one beside the result")
-    with journal.open(encoding="utf-8") as file:
+    with open_bytes(journal) as file:
         for number, line in enumerate(file, start=1):
-            try:
-                event = json.loads(line)
-            except ValueError as error:
-                raise InputError(f"{journal}: line {number}: broken or truncated JSON: {error}") from error
+            event = parsed_json(line, f"{journal}: line {number}")
             if not isinstance(event, dict):
-                raise InputError(f"{journal}: line {number}: expected an event, got {line.strip()[:40]!r}")
+                raise InputError(f"{journal}: line {number}: expected an event, got {str(event)[:40]}")
             yield event
 
 
 def story(events: Sequence[Event]) -> list[str]:
-    """A track's life in lines for people; times from its birth."""
+    """A track's life in lines for people; times from its birth. Raises `InputError` for events that nobody wrote."""
+    try:
+        return _story(events)
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise InputError(f"expected events as --explain writes them: {error!r:.80}") from error
+
+
+def _story(events: Sequence[Event]) -> list[str]:
     first, last = events[0], events[-1]
     end = "" if last["event"] == "ended" else ", then the recording ends"
     head = f"track {first['track']} of {first['scene']}, {first['label']}: {last['time'] - first['time']:.1f} s{end}"

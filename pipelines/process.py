@@ -5,6 +5,7 @@ To matrices as small as a filter's, threads cost more than they bring.
 
 from __future__ import annotations
 
+import ctypes
 import resource
 import sys
 from collections.abc import Iterator
@@ -13,12 +14,28 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
+LARGE = 2**18  # bytes
+
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Linear algebra on one thread, which also keeps sums in one order."""
     with threadpool_limits(limits=1):
         yield
+
+
+def return_large_blocks() -> None:
+    """Give memory of large blocks back to the system when they are freed.
+
+    Where the C library is glibc, which else keeps ever larger ones (mallopt(3), M_MMAP_THRESHOLD and M_TRIM_THRESHOLD).
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
+        mallopt(parameter, LARGE)
 
 
 def resident_memory() -> float:

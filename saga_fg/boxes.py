@@ -15,6 +15,7 @@ from saga_fg.geometry import transform_points, wrap_angle
 
 MAX_POSITION = 1e9  # m; beyond, distances have no digits left
 MAX_SPEED = 1e6  # m/s
+MAX_SIZE = 1e5  # m
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,11 @@ class Boxes:
             raise InputError(f"size[{row}]: expected positive length, width, height in m, got {size[row].tolist()}")
         position = checked("position", self.position, (n, 3))
         velocity = checked("velocity", self.velocity, (n, 2), "finite-or-nan")
-        for name, values, limit in (("position", position, MAX_POSITION), ("velocity", velocity, MAX_SPEED)):
+        for name, values, limit in (
+            ("size", size, MAX_SIZE),
+            ("position", position, MAX_POSITION),
+            ("velocity", velocity, MAX_SPEED),
+        ):
             if (np.abs(values) > limit).any():
                 row = int(np.argwhere(np.abs(values) > limit)[0][0])
                 raise InputError(f"{name}[{row}]: expected numbers within {limit:g}, got {values[row].tolist()}")

@@ -39,19 +39,20 @@ from saga_fg.node import NodeType, distinct_types
 from saga_fg.scene_graph import Edges, SceneGraph
 from saga_fg.transition import Blocks, Transition
 
+LONGEST = 1e12  # s; longer than any two timestamps are apart
 _TAYLOR_DEGREE = 12
 _TAYLOR_RADIUS = 0.5  # (1/2)^13 / 13! = 2e-14 of the leading term
 
 
 @np.errstate(over="ignore", invalid="ignore")  # ends in an InputError
 def discretise(graph: SceneGraph, dt: float) -> Transition:
-    """The dynamics of `graph` over `dt` >= 0 seconds.
+    """The dynamics of `graph` over `dt` seconds, from 0 to `LONGEST`.
 
-    Raises `InputError` for a dt that is negative or not finite, and for one so long that a state, driven apart by its
+    Raises `InputError` for a dt out of this range, and for one so long that a state, driven apart by its
     interactions, leaves the range of numbers.
     """
-    if not (math.isfinite(dt) and dt >= 0):
-        raise InputError(f"dt: expected a finite number of seconds >= 0, got {dt!r}")
+    if not 0 <= dt <= LONGEST:
+        raise InputError(f"dt: expected a finite number of seconds from 0 to {LONGEST:g}, got {dt!r}")
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
     kinds, kind = distinct_types(graph.types)

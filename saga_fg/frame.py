@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
-from saga_fg.boxes import Boxes
+from saga_fg.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.errors import InputError
 from saga_fg.geometry import checked_transform
 from saga_fg.road.road_map import RoadMap
@@ -58,11 +58,19 @@ class Detections:
         n = len(self.boxes)
         object.__setattr__(self, "score", checked("score", self.score, (n,)))
         rate = np.full(n, self.range_rate) if np.ndim(self.range_rate) == 0 else self.range_rate
-        object.__setattr__(self, "range_rate", checked("range_rate", rate, (n,), "finite-or-nan"))
+        rate = checked("range_rate", rate, (n,), "finite-or-nan")
+        if (np.abs(rate) > MAX_SPEED).any():
+            row = int(np.argmax(np.abs(rate) > MAX_SPEED))
+            raise InputError(f"range_rate[{row}]: expected numbers within {MAX_SPEED:g}, got {rate[row]:g}")
+        object.__setattr__(self, "range_rate", rate)
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Self:
-        """The table of some `Detection`s."""
+        """The table of some `Detection`s. Raises `InputError` for anything else."""
+        rows = detections = list(detections) if isinstance(detections, Iterable) else [detections]
+        odd = next((type(d).__name__ for d in rows if not isinstance(d, Detection)), None)
+        if odd is not None:
+            raise InputError(f"detections: expected a list of Detection, got {odd}; for arrays there is Boxes.of")
         boxes = Boxes.of(
             [d.label for d in detections],
             [d.position for d in detections],
@@ -134,7 +142,7 @@ class Frame:
     road_map     what is known of the road from now on, besides what earlier frames brought; None: nothing new
 
     Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
-    that is not rigid.
+    that is not rigid or beyond all places.
     """
 
     timestamp: float
@@ -146,12 +154,7 @@ class Frame:
     road_map: RoadMap | None = None
 
     def __post_init__(self) -> None:
-        try:
-            timestamp = float(self.timestamp)
-        except (TypeError, ValueError):
-            timestamp = NAN
-        if not math.isfinite(timestamp):
-            raise InputError(f"timestamp: expected a finite number of seconds, got {self.timestamp!r}")
+        timestamp = finite_seconds(self.timestamp)
         if abs(timestamp) > LATEST:
             raise InputError(f"timestamp: expected seconds, got {timestamp:g}: milli-, micro- or nanoseconds?")
         object.__setattr__(self, "timestamp", timestamp)
@@ -164,7 +167,11 @@ class Frame:
                 f"coordinates: expected one of {', '.join(get_args(Coordinates))}, got {self.coordinates!r}"
             )
         if self.world_T_ego is not None:
-            object.__setattr__(self, "world_T_ego", checked_transform("world_T_ego", self.world_T_ego))
+            pose = checked_transform("world_T_ego", self.world_T_ego)
+            if (np.abs(pose[:3, 3]) > MAX_POSITION).any():
+                place = pose[:3, 3].tolist()
+                raise InputError(f"world_T_ego: expected a place within {MAX_POSITION:g} m, got {place}")
+            object.__setattr__(self, "world_T_ego", pose)
         elif self.coordinates != "world":
             raise InputError(
                 f"world_T_ego: expected a pose, since the detections are in {self.coordinates} coordinates"
@@ -176,3 +183,15 @@ class Frame:
 
     def __len__(self) -> int:
         return len(self.detections)
+
+
+def finite_seconds(timestamp: Any) -> float:
+    """A timestamp as a finite number of seconds, or `InputError`."""
+    try:
+        seconds = float(timestamp)
+    except (TypeError, ValueError, OverflowError):
+        seconds = NAN
+    if not math.isfinite(seconds):
+        got = "a larger one" if isinstance(timestamp, int) else repr(timestamp)[:40]
+        raise InputError(f"timestamp: expected a finite number of seconds, got {got}")
+    return seconds

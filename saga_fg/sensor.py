@@ -24,7 +24,7 @@ import numpy as np
 from saga_fg.arrays import BoolArray, FloatArray, StrArray, distinct
 from saga_fg.by_class import DEFAULT, class_values
 from saga_fg.errors import InputError
-from saga_fg.frame import Detections, Frame
+from saga_fg.frame import LATEST, Detections, Frame
 from saga_fg.geometry import inverse_transform, wrap_angle, yaw_transform
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
@@ -115,6 +115,7 @@ class Sensor:
         metadata={"comment": "by class; the entry named default serves all others"},
     )
     use_velocity: bool = setting(True, "take in the velocity, or the range rate, where one was measured")
+    max_speed: float = setting(150.0, "velocities and range rates beyond this are errors and are not taken in, m/s")
     detection_probability: float = setting(0.9, "chance that a visible object in the field of view is detected")
     class_detection: Mapping[str, float] = settings_group(dict, "that chance by class, where it differs")
     score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
@@ -152,7 +153,8 @@ class Sensor:
         for label, chance in self.class_detection.items():
             if not 0 <= chance <= 1:
                 raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")
-        require_between(self, -math.inf, math.inf, "time_offset")
+        require_between(self, -LATEST, LATEST, "time_offset")
+        require_positive(self, "max_speed", infinite=True)
         if self.clutter_area is not None:
             require_positive(self, "clutter_area", infinite=True)
         require_one_of(self, "score", ("probability", "logit"))

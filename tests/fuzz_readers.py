@@ -1,85 +1,120 @@
 """Every reader, and the stream, against many damaged inputs: python tests/fuzz_readers.py --inputs 100000
 
-What a reader neither reads nor refuses with an `InputError` is printed, its input is kept in --keep, and the exit code
-is 1. A crash of the interpreter is found as well: each reader is tried in a process of its own.
+The inputs come in parts of 1000, each drawn from (seed, reader, part) alone and read in a process of its own, so that a
+crash of the interpreter is found as well. All readers have their first part before any has its second. What was done
+is kept in `--state`, in `seed-N.json`; a run that was stopped goes on where it was when it is started again.
+
+An input that a reader neither reads nor refuses with an `InputError` is kept in `--state` and printed. The exit code is
+1 if there are any, those of earlier runs with this state included.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import multiprocessing
 import random
 import sys
 import tempfile
-import time
 import traceback
 import warnings
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "data_tools"))
-from damage import damaged, targets
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the folders beside this script are named as the packages are
+from damage import Target, damaged, targets
 
+from data_tools.atomic_files import write_text
 from saga_fg import InputError
 
-
-def fuzz(name: str, inputs: int, seed: int, keep: Path) -> int:
-    """Number of faults of one reader."""
-    warnings.simplefilter("error")
-    logging.disable()
-    faults = refused = 0
-    with tempfile.TemporaryDirectory() as folder:
-        target = targets(Path(folder))[name]
-        originals = {path: path.read_bytes() for path in target.files}
-        rng = random.Random(f"{seed} {name}")
-        start = time.perf_counter()
-        for number in range(inputs):
-            path = rng.choice(target.files)
-            content = damaged(originals[path], rng)
-            keep_as = keep / f"{name.replace(' ', '_').replace(',', '')}-{seed}-{number}{path.suffix}"
-            keep_as.write_bytes(content)  # before it is read: the reader may take the interpreter with it
-            path.write_bytes(content)
-            try:
-                target.read()
-            except InputError:
-                refused += 1
-            except Exception:
-                faults += 1
-                print(f"{name}: {keep_as}:\n{traceback.format_exc(limit=-2)}", flush=True)
-                path.write_bytes(originals[path])
-                continue
-            keep_as.unlink()
-            path.write_bytes(originals[path])
-        rate = inputs / (time.perf_counter() - start)
-    print(f"{name}: {inputs} inputs, {refused} refused, {faults} faults, {rate:.0f} a second", flush=True)
-    return faults
+PART = 1000  # inputs
+HANGS = 600.0  # s for one input
 
 
 def main() -> int:
-    """Exit code 0 if every reader stood it."""
+    """Do the parts that are missing; exit code 0 if every reader stood all inputs."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=100_000, help="for each reader")
-    parser.add_argument("--only", help="a part of the readers' names")
+    parser.add_argument("--inputs", type=int, default=100_000, help="for each reader, in whole parts of 1000")
+    parser.add_argument("--only", default="", help="a part of the readers' names")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, default=Path("fuzz-faults"), help="folder for inputs that are faults")
+    parser.add_argument("--state", type=Path, default=Path("fuzz-state"), help="folder: counts, inputs that are faults")
     options = parser.parse_args()
-    options.keep.mkdir(exist_ok=True)
+    options.state.mkdir(exist_ok=True)
+    kept = options.state / f"seed-{options.seed}.json"
+    counts: dict[str, dict[str, int]] = json.loads(kept.read_text()) if kept.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
-        names = [name for name in targets(Path(folder)) if not options.only or options.only in name]
-    context = multiprocessing.get_context("spawn")
-    bad = []
-    for name in names:
-        process = context.Process(target=_child, args=(name, options.inputs, options.seed, options.keep))
-        process.start()
-        process.join()
-        if process.exitcode:
-            bad.append(f"{name} (exit code {process.exitcode})")
+        names = [name for name in targets(Path(folder)) if options.only in name]
+    for part in range(-(-options.inputs // PART)):
+        for name in names:
+            count = counts.setdefault(name, {"inputs": 0, "refused": 0, "faults": 0})
+            if count["inputs"] > part * PART:
+                continue
+            refused, faults = in_a_process_of_its_own(name, options.seed, part, options.state)
+            counts[name] = {
+                "inputs": count["inputs"] + PART,
+                "refused": count["refused"] + refused,
+                "faults": count["faults"] + faults,
+            }
+            write_text(kept, json.dumps(counts, indent=1) + "\n")
+            print(f"{name}: {', '.join(f'{n} {what}' for what, n in counts[name].items())}", flush=True)
+    bad = [name for name in names if counts.get(name, {}).get("faults")]
     print(f"faults in: {', '.join(bad)}" if bad else "every reader stood it")
     return 1 if bad else 0
 
 
-def _child(name: str, inputs: int, seed: int, keep: Path) -> None:
-    sys.exit(1 if fuzz(name, inputs, seed, keep) else 0)
+def in_a_process_of_its_own(name: str, seed: int, part: int, state: Path) -> tuple[int, int]:
+    """How many inputs of a part were refused, and how many were faults; a crash or hang ends the part and is one."""
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    process = context.Process(target=_child, args=(name, seed, part, state, there.send))
+    process.start()
+    there.close()
+    refused = faults = 0
+    with suppress(EOFError):
+        while here.poll(HANGS):
+            refused, faults = here.recv()
+        process.kill()
+    process.join()
+    if process.exitcode:
+        print(f"{name}: part {part} of seed {seed}: exit code {process.exitcode}, see {state}", flush=True)
+        faults += 1
+    return refused, faults
+
+
+def _child(name: str, seed: int, part: int, state: Path, tell: Callable[[tuple[int, int]], None]) -> None:
+    warnings.simplefilter("error")
+    logging.disable()
+    with tempfile.TemporaryDirectory() as folder:
+        fuzz(name, targets(Path(folder))[name], seed, part, state, tell)
+
+
+def fuzz(name: str, target: Target, seed: int, part: int, state: Path, tell: Callable[[tuple[int, int]], None]) -> None:
+    """Read the inputs of one part; `tell` is called with how many were refused and how many are faults so far."""
+    originals = {path: path.read_bytes() for path in target.files}
+    rng = random.Random(f"{seed} {name} {part}")
+    refused = faults = 0
+    for number in range(part * PART, (part + 1) * PART):
+        path = rng.choice(target.files)
+        content = damaged(originals[path], rng)
+        kept = state / f"{name.replace(' ', '_').replace(',', '')}-{seed}-{number}{path.suffix}"
+        kept.write_bytes(content)  # before it is read: the reader may take the interpreter with it
+        path.write_bytes(content)
+        fault = False
+        try:
+            target.read()
+        except InputError:
+            refused += 1
+        except Exception:
+            fault = True
+            faults += 1
+            print(f"{name}: {kept}:\n{traceback.format_exc(limit=-2)}", flush=True)
+        if not fault:
+            kept.unlink()
+        path.write_bytes(originals[path])
+        tell((refused, faults))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.central_differences import central_differences
+from data_tools.input_files import open_bytes
 from data_tools.located import located, unknown
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
@@ -55,7 +56,7 @@ class ArgoverseLogs:
         self._scenes = tuple(sorted(path.parent.name for path in self._root.glob("*/annotations.feather")))
         if not self._scenes:
             raise InputError(f"{self._root}: expected LOG/annotations.feather, there is none")
-        _feather()
+        _pyarrow()
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -114,19 +115,33 @@ def _transforms(rows: dict[str, Any]) -> FloatArray:
 
 def _columns(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
     """The named columns of a Feather file as arrays."""
+    arrow = _pyarrow()
     try:
-        table = _feather().read_table(path)
-    except (OSError, ValueError) as error:  # pyarrow's own errors are ValueErrors
+        with open_bytes(path) as file:
+            table = arrow.feather.read_table(file)
+            missing = [name for name in names if name not in table.column_names]
+            if missing:
+                there = ", ".join(table.column_names)
+                raise InputError(f"{path}: {missing[0]}: expected this column, the file has {there}")
+            table = table.select(list(names))
+            table.validate(full=True)  # its C++ trusts what it has read
+            empty = [name for name in names if table[name].null_count]
+            if empty:
+                raise InputError(f"{path}: {empty[0]}: expected a value in every row")
+            columns = {name: table[name].to_numpy() for name in names}
+    except (OSError, UnicodeDecodeError, arrow.ArrowException) as error:  # names of columns are decoded on demand
         raise InputError(f"{path}: expected a readable Feather file: {str(error).splitlines()[0]}") from error
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
-        raise InputError(f"{path}: {missing[0]}: expected this column, the file has {', '.join(table.column_names)}")
-    return {name: table[name].to_numpy() for name in names}
+    for name, column in columns.items():
+        kinds = {"timestamp_ns": "iu", "track_uuid": "OU", "category": "OU"}.get(name, "iuf")
+        if column.dtype.kind not in kinds:
+            expected = "text" if kinds == "OU" else "whole numbers" if kinds == "iu" else "numbers"
+            raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
+    return columns
 
 
-def _feather() -> Any:
+def _pyarrow() -> Any:
     try:
-        from pyarrow import feather
+        import pyarrow.feather
     except ImportError as error:
         raise MissingExtraError("Argoverse logs: Feather needs pyarrow: pip install 'saga-fg[parquet]'") from error
-    return feather
+    return pyarrow

@@ -17,6 +17,7 @@ BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score
 POSE = ("ego_x", "ego_y", "ego_z", "ego_yaw")
 TEXT = ("label", "sensor", "scene", "coordinates")
 COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, "empty")
+LONGEST_NAME = 256  # characters; NumPy stores all texts of an array as wide as the widest
 
 Values = Sequence[Any] | np.ndarray[Any, Any]
 
@@ -73,7 +74,9 @@ class RawTable:
             return np.where(values == "", default, values)
         for row, value in enumerate(values):
             if value is not None and not isinstance(value, str):
-                raise self.fault(row, f"{name}: expected a name, got {value!r}")
+                raise self.fault(row, f"{name}: expected a name, got {repr(value)[:40]}")
+            if value is not None and len(value) > LONGEST_NAME:
+                raise self.fault(row, f"{name}: expected a name of at most {LONGEST_NAME} characters, got {len(value)}")
         return np.array([value or default for value in values], dtype=np.str_)
 
     def flags(self, name: str) -> BoolArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import logging
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +15,8 @@ from typing import Any, TextIO, TypeVar
 import numpy as np
 
 from data_tools.detection_files.columns import COLUMNS, REQUIRED, RawTable, Values
+from data_tools.input_files import open_bytes, open_text
+from data_tools.json_stream import parsed_json
 from data_tools.located import located
 from data_tools.numpy_files import load_archive
 from saga_fg.errors import InputError
@@ -23,6 +24,7 @@ from saga_fg.errors import InputError
 log = logging.getLogger(__name__)
 
 Row = TypeVar("Row")
+_OPEN_QUOTE = "a quote is opened and not closed on this line"
 
 
 @dataclass(frozen=True)
@@ -64,45 +66,54 @@ def read_raw_parts(path: Path, layout: Layout | None = None, rows: int = 50_000)
         raise InputError(f"{path}: expected text in UTF-8: {error}") from error
 
 
-def _open(path: Path) -> TextIO:
-    return path.open(encoding="utf-8-sig", newline="")
-
-
 def _read_csv(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
-    with _open(path) as file:
-        reader = csv.reader(file)
+    with open_text(path, encoding="utf-8-sig", newline="") as file:
+        numbered = _csv_rows(path, file)
+        header = [name.strip() for name in next(numbered, (1, []))[1]]
+        if len(set(header)) != len(header):
+            got = ", ".join(name[:40] for name in header)
+            raise InputError(f"{path}: line 1: expected every column once, got {got}")
+        _check_names(path, set(header), layout)
+        moment = [header.index(name) for name in ("scene", "timestamp") if name in header]
+        for lines, rows in _parts(
+            _full_rows(path, numbered, len(header)), most, lambda row: [row[i].strip() for i in moment]
+        ):
+            columns: dict[str, Values] = {
+                name: [value.strip() or None for value in column]
+                for name, column in zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True)
+                if name in layout.columns
+            }
+            yield RawTable(path, columns, len(rows), partial(_line, lines), numerals=True)
+
+
+def _csv_rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers and values; a value in quotes ends on its line, so that a stray quote swallows no others."""
+    reader = csv.reader(file, strict=True)
+    while True:
+        number = reader.line_num + 1
         try:
-            header = [name.strip() for name in next(reader, [])]
-            if len(set(header)) != len(header):
-                raise InputError(f"{path}: line 1: expected every column once, got {', '.join(header)}")
-            _check_names(path, set(header), layout)
-            moment = [header.index(name) for name in ("scene", "timestamp") if name in header]
-            for lines, rows in _parts(
-                _csv_rows(path, reader, len(header)), most, lambda row: [row[i].strip() for i in moment]
-            ):
-                columns: dict[str, Values] = {
-                    name: [value.strip() or None for value in column]
-                    for name, column in zip(
-                        header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True
-                    )
-                    if name in layout.columns
-                }
-                yield RawTable(path, columns, len(rows), partial(_line, lines), numerals=True)
+            row = next(reader, None)
         except csv.Error as error:
-            raise InputError(f"{path}: line {reader.line_num}: expected comma-separated values: {error}") from error
+            reason = _OPEN_QUOTE if reader.line_num > number else str(error)
+            raise InputError(f"{path}: line {number}: expected comma-separated values: {reason}") from error
+        if row is None:
+            return
+        if reader.line_num > number:
+            raise InputError(f"{path}: line {number}: expected comma-separated values: {_OPEN_QUOTE}")
+        yield number, row
 
 
-def _csv_rows(path: Path, reader: Any, columns: int) -> Iterator[tuple[int, list[str]]]:
-    for row in reader:
+def _full_rows(path: Path, numbered: Iterator[tuple[int, list[str]]], columns: int) -> Iterator[tuple[int, list[str]]]:
+    for number, row in numbered:
         if not row:
             continue
         if len(row) != columns:
-            raise InputError(f"{path}: line {reader.line_num}: expected {columns} columns, got {len(row)}")
-        yield reader.line_num, row
+            raise InputError(f"{path}: line {number}: expected {columns} columns, got {len(row)}")
+        yield number, row
 
 
 def _read_ndjson(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
-    with _open(path) as file:
+    with open_text(path, encoding="utf-8-sig", newline="") as file:
         for lines, rows in _parts(
             _json_rows(path, file), most, lambda row: [row.get(name) for name in ("scene", "timestamp")]
         ):
@@ -122,10 +133,7 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
     for number, line in enumerate(file, start=1):
         if not line.strip():
             continue
-        try:
-            row = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: line {number}: broken or truncated JSON: {error}") from error
+        row = parsed_json(line, f"{path}: line {number}")
         if not isinstance(row, dict):
             raise InputError(f"{path}: line {number}: expected an object, got {line.strip()[:40]!r}")
         yield number, row
@@ -151,8 +159,8 @@ def _line(lines: list[int], row: int) -> str:
 
 
 def _read_npz(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
-    with located(str(path)):
-        names, arrays = load_archive(path, layout.columns)
+    with open_bytes(path) as file, located(str(path)):
+        names, arrays = load_archive(file, layout.columns)
     columns: dict[str, Values] = dict(arrays)
     _check_names(path, names, layout)
     length = len(columns["timestamp"]) if np.ndim(columns.get("timestamp", 0.0)) == 1 else 0
@@ -168,10 +176,10 @@ def _check_names(path: Path, names: set[str], layout: Layout) -> None:
     for name in unknown:
         nearest = get_close_matches(name, set(layout.columns) - names, n=1, cutoff=0.75)
         if nearest:
-            raise InputError(f"{path}: unknown column {name!r}; did you mean {nearest[0]!r}?")
+            raise InputError(f"{path}: unknown column {name[:40]!r}; did you mean {nearest[0]!r}?")
     for name in layout.required:
         if name not in names:
-            there = ", ".join(sorted(names)[:12]) or "none"
+            there = ", ".join(name[:40] for name in sorted(names)[:12]) or "none"
             raise InputError(f"{path}: expected a column {name!r}, the columns there are {there}")
     if unknown:
-        log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(unknown))
+        log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(name[:40] for name in unknown))

@@ -49,6 +49,8 @@ class EthUcy:
             raise InputError(f"{self._root}: {unknown('recording', name, self._scenes)}")
         path = self._root / name / "obsmat.txt"
         table = read_table(path, (len(_COLUMNS),), " ".join(_COLUMNS))
+        if not len(table):
+            raise InputError(f"{path}: expected rows, there are none")
         frame, person = table.integers(0, "frame", 0), table.integers(1, "person", 0)
         x, y, vx, vy = table.numbers([2, 4, 5, 7], ("x", "y", "vx", "vy")).T
         n = len(table)

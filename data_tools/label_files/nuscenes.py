@@ -27,7 +27,8 @@ from typing import Any
 import numpy as np
 
 from data_tools.atomic_files import atomic_directory, atomic_file, write_text
-from data_tools.json_stream import open_json
+from data_tools.input_files import open_bytes
+from data_tools.json_stream import open_json, parsed_json
 from data_tools.located import located
 from data_tools.nuscenes.tables import read_table, table_folder
 from saga_fg.arrays import upper_triangle
@@ -87,7 +88,7 @@ def merge_label_parts(directory: str | Path, dataroot: str | Path, version: str,
 def _read_part(path: Path) -> Iterator[LabelledObject]:
     with open_json(path) as file:
         for line in file:
-            label, records = json.loads(line)
+            label, records = parsed_json(line, str(path))
             yield label, records
 
 
@@ -112,12 +113,12 @@ def _write_tables(directory: str | Path, dataroot: str | Path, version: str, obj
         tables.mkdir()
         for path in sorted(source.glob("*.json")):
             if path.stem not in ("sample_annotation", "instance", "category"):
-                shutil.copyfile(path, tables / path.name)
+                _copy(path, tables / path.name)
         for (name,) in read_table(source, "map", ("filename",)):
             mask = Path(dataroot) / name
-            if mask.is_file() and Path(name).parts[0] == "maps":
+            if mask.is_file() and Path(name).parts[0] == "maps" and ".." not in Path(name).parts:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(mask, folder / name)
+                _copy(mask, folder / name)
         with _array(tables / "sample_annotation.json") as annotation, _array(tables / "instance.json") as instance:
             for label, records in objects:
                 name = CATEGORY_OF_CLASS[label]
@@ -125,7 +126,7 @@ def _write_tables(directory: str | Path, dataroot: str | Path, version: str, obj
                     annotation(record)
                 instance(_instance(records, categories.setdefault(name, _token("category", name))))
         with open_json(source / "category.json") as file:
-            known: list[Record] = json.load(file)
+            known: list[Record] = parsed_json(file.read(), str(source / "category.json"))
         there = {record["token"] for record in known}
         known += [
             {"token": token, "name": name, "description": ""}
@@ -133,6 +134,11 @@ def _write_tables(directory: str | Path, dataroot: str | Path, version: str, obj
             if token not in there
         ]
         write_text(tables / "category.json", json.dumps(known) + "\n")
+
+
+def _copy(source: Path, target: Path) -> None:
+    with open_bytes(source) as file, target.open("wb") as copy:
+        shutil.copyfileobj(file, copy)
 
 
 @contextmanager

@@ -24,6 +24,8 @@ _PLY_SIZES = {
     **dict.fromkeys(("double", "float64"), 8),
 }
 LONGEST_HEADER = 20_000  # bytes
+LONGEST_LINE = 1000  # of a header, bytes
+LONGEST_WORD = 100  # bytes; RPly, which reads PLY files for Open3D, writes beyond its buffer from 256 on
 MOST_VALUES = 100  # of a point
 
 
@@ -76,6 +78,8 @@ def check_ply(content: bytes) -> None:
     form = words[1][1]
     if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
         _fault("the format ascii, binary_little_endian or binary_big_endian")
+    if words[-1] != ["end_header"]:
+        _fault("a line with end_header alone")
     if len(words) < 4 or words[2][:2] != ["element", "vertex"] or len(words[2]) != 3:
         _fault("vertices as the first element")
     (points,) = _numbers("element vertex", words[2][2:], 1, 2**31 - 1, 0)
@@ -107,6 +111,8 @@ def _header(content: bytes, last: bytes) -> tuple[list[str], bytes]:
         at = end + 1
         if not line.isascii() or b"\0" in line:
             _fault("a header of plain text")
+        if len(line) > LONGEST_LINE or max(map(len, line.split()), default=0) > LONGEST_WORD:
+            _fault(f"a header with lines of at most {LONGEST_LINE} and words of at most {LONGEST_WORD} bytes")
         lines.append(line.decode("ascii").rstrip("\r"))
         if line.startswith(last):
             return lines, content[at:]
@@ -123,6 +129,8 @@ def _rows(body: bytes, points: int, values: int) -> None:
     rows = [line.split() for line in body.splitlines() if line.strip()]
     if len(rows) < points or any(len(row) != values for row in rows[:points]):
         _fault(f"{points} lines of {values} numbers after the header")
+    if any(len(word) > LONGEST_WORD for row in rows[:points] for word in row):
+        _fault(f"numbers of at most {LONGEST_WORD} bytes after the header")
     try:
         for row in rows[:points]:
             for word in row:

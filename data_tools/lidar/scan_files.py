@@ -16,9 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
+from data_tools.input_files import open_bytes
 from data_tools.lidar.cloud_headers import check_pcd, check_ply
 from data_tools.lidar.scan import Scan
 from data_tools.located import located
@@ -35,22 +37,19 @@ def read_scan(path: str | Path) -> Scan:
     ending = next((ending for ending in _READERS if name.endswith(ending)), None)
     if ending is None:
         raise InputError(f"{path}: expected a name that ends in {', '.join(_READERS)}")
-    if not path.is_file():
-        raise InputError(f"{path}: cannot be read: there is no such file")
-    with located(str(path)):
-        return _READERS[ending](path)
+    with open_bytes(path) as file, located(str(path)):
+        return _READERS[ending](file, path)
 
 
-def _kitti(path: Path) -> Scan:
-    return _of_columns(_records(path, 4))
+def _kitti(file: BinaryIO, _: Path) -> Scan:
+    return _of_columns(_records(file.read(), 4))
 
 
-def _nuscenes(path: Path) -> Scan:
-    return _of_columns(_records(path, 5))
+def _nuscenes(file: BinaryIO, _: Path) -> Scan:
+    return _of_columns(_records(file.read(), 5))
 
 
-def _records(path: Path, columns: int) -> FloatArray:
-    content = _bytes(path)
+def _records(content: bytes, columns: int) -> FloatArray:
     size = 4 * columns
     if not content or len(content) % size:
         raise InputError(f"expected records of {size} bytes ({columns} float32 a point), got {len(content)} bytes")
@@ -58,32 +57,25 @@ def _records(path: Path, columns: int) -> FloatArray:
         return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}") from error
-
-
-def _array(path: Path) -> Scan:
-    array = load_array(path)
+def _array(file: BinaryIO, _: Path) -> Scan:
+    array = load_array(file)
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
         raise InputError(f"expected numbers (N, 3) or wider, got {array.dtype} {array.shape}")
     return _of_columns(np.asarray(array, dtype=np.float64))
 
 
-def _arrays(path: Path) -> Scan:
-    _, columns = load_archive(path, ("points", "intensity", "time"))
+def _arrays(file: BinaryIO, _: Path) -> Scan:
+    columns = load_archive(file, ("points", "intensity", "time"))[1]
     if "points" not in columns:
         raise InputError("expected the array points (N, 3)")
     scan = Scan.of(columns["points"])
     return Scan(scan.points, columns.get("intensity", scan.intensity), columns.get("time"))
 
 
-def _cloud(path: Path) -> Scan:
+def _cloud(file: BinaryIO, path: Path) -> Scan:
     open3d = load_open3d()
     check = check_pcd if path.suffix.lower() == ".pcd" else check_ply
-    check(_bytes(path))
+    check(file.read())
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         try:
             cloud = open3d.t.io.read_point_cloud(str(path))
@@ -104,7 +96,7 @@ def _of_columns(columns: FloatArray) -> Scan:
     return Scan(columns[:, :3], intensity)
 
 
-_READERS: dict[str, Callable[[Path], Scan]] = {
+_READERS: dict[str, Callable[[BinaryIO, Path], Scan]] = {
     ".pcd.bin": _nuscenes,
     ".bin": _kitti,
     ".pcd": _cloud,

@@ -68,8 +68,8 @@ def _in_official_split(name: str, split: str) -> bool:
     if split.startswith("mini"):
         return (name in _MINI_VAL) == (split == "mini_val")
     number = name.removeprefix("scene-")
-    if not number.isdecimal():
-        raise InputError(f"scene {name}: expected a name scene-NNNN to find its place in split {split}")
+    if not number.isdecimal() or len(number) > 9:
+        raise InputError(f"scene {name[:40]}: expected a name scene-NNNN to find its place in split {split}")
     val = _within(int(number), _VAL)
     detect = _within(int(number), _TRAIN_DETECT)
     return {"val": val, "train": not val, "train_detect": detect, "train_track": not (val or detect)}[split]

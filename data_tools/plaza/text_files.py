@@ -52,11 +52,8 @@ def read_plaza(path: str | Path) -> BeaconRanges:
     if not separator or kind not in ("DR", "TD", "GT", "TL"):
         raise InputError(f"{file}: expected one of the files NAME_DR.txt, NAME_TD.txt, NAME_GT.txt, NAME_TL.txt")
     files = {kind: file.with_name(f"{name}_{kind}.txt") for kind in ("DR", "TD", "GT", "TL")}
-    odometry = read_table(files["DR"], (3,), "time, distance, heading change")
-    ranges = read_table(files["TD"], (4,), "time, antenna, beacon, range")
-    for table in (odometry, ranges):
-        if not len(table):
-            raise InputError(f"{table.path}: expected records, there are none")
+    odometry = _records(files["DR"], 3, "time, distance, heading change")
+    ranges = _records(files["TD"], 4, "time, antenna, beacon, range")
     rows = odometry.numbers(slice(0, 3), ("time", "distance", "heading change"))
     measured = ranges.numbers(slice(0, 4), ("time", "antenna", "beacon", "range"))
     if (measured[:, 3] <= 0).any():
@@ -68,19 +65,19 @@ def read_plaza(path: str | Path) -> BeaconRanges:
         rows[:, 1],
         rows[:, 2],
         measured[order, 0],
-        _beacons(ranges, measured[:, 2])[order],
+        ranges.integers(2, "beacon", 0)[order],
         measured[order, 3],
         _truth(files["GT"]) if files["GT"].exists() else None,
         _places(files["TL"]) if files["TL"].exists() else {},
     )
 
 
-def _beacons(table: TextTable, numbers: FloatArray) -> IntArray:
-    bad = (numbers != np.round(numbers)) | (numbers < 0)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise table.fault(row, f"beacon: expected a whole number from 0, got {numbers[row]:g}")
-    return numbers.astype(np.int64)
+def _records(file: Path, columns: int, what: str) -> TextTable:
+    """The lines of a file that has some."""
+    table = read_table(file, (columns,), what)
+    if not len(table):
+        raise InputError(f"{file}: expected records, there are none")
+    return table
 
 
 def _increasing(table: TextTable, time: FloatArray) -> FloatArray:
@@ -92,12 +89,12 @@ def _increasing(table: TextTable, time: FloatArray) -> FloatArray:
 
 
 def _truth(file: Path) -> Trajectory:
-    table = read_table(file, (4,), "time, x, y, heading")
+    table = _records(file, 4, "time, x, y, heading")
     rows = table.numbers(slice(0, 4), ("time", "x", "y", "heading"))
     return Trajectory(rows[:, 0], np.stack([yaw_transform(x, y, 0.0, yaw) for _, x, y, yaw in rows]))
 
 
 def _places(file: Path) -> dict[int, FloatArray]:
     table = read_table(file, (3,), "beacon, x, y")
-    places = table.numbers(slice(0, 3), ("beacon", "x", "y"))
-    return dict(zip(_beacons(table, places[:, 0]).tolist(), places[:, 1:], strict=True))
+    places = table.numbers(slice(1, 3), ("x", "y"))
+    return dict(zip(table.integers(0, "beacon", 0).tolist(), places, strict=True))

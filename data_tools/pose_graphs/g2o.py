@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.atomic_files import write_text
-from data_tools.text_tables import TextTable, read_lines
+from data_tools.text_tables import LARGEST, TextTable, read_lines
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.boxes import MAX_POSITION
 from saga_fg.errors import InputError
 from saga_fg.geometry import quaternion_norms, quaternion_rotation, rotation_quaternion
 from saga_fg.pose_graph import PoseGraph
@@ -47,9 +48,9 @@ _TAGS = {tag: layout for layout in (_PLANAR, _SPATIAL) for tag in (layout.vertex
 def read_g2o(path: str | Path) -> PoseGraph:
     """Read a pose graph; poses come in the order of their ids.
 
-    Raises `InputError` naming the line for an unknown record, a wrong number of columns, a number that is not finite, a
-    quaternion off the unit sphere, a pose given twice or missing, or an information matrix that is not positive
-    definite.
+    Raises `InputError` naming the line for an unknown record, a wrong number of columns, a number that is none or too
+    large, a quaternion off the unit sphere, a pose given twice or missing, or an information matrix that is not
+    positive definite.
     """
     file = Path(path)
     tables = _records(file)
@@ -122,10 +123,7 @@ def _records(file: Path) -> dict[str, TextTable]:
         rows, lines = found.setdefault(tag, ([], []))
         rows.append(row)
         lines.append(number)
-    return {
-        tag: TextTable(file, np.array(rows, dtype=np.str_), np.array(lines, dtype=np.int64))
-        for tag, (rows, lines) in found.items()
-    }
+    return {tag: TextTable.of(file, rows, lines) for tag, (rows, lines) in found.items()}
 
 
 def _rows(edges: TextTable, column: int, name: str, ids: IntArray) -> IntArray:
@@ -139,7 +137,8 @@ def _rows(edges: TextTable, column: int, name: str, ids: IntArray) -> IntArray:
 
 
 def _transforms(table: TextTable, column: int, layout: _Layout) -> FloatArray:
-    values = table.numbers(slice(column, column + len(layout.pose)), layout.pose)
+    largest = tuple(MAX_POSITION if name in ("x", "y", "z") else LARGEST for name in layout.pose)
+    values = table.numbers(slice(column, column + len(layout.pose)), layout.pose, largest)
     if layout is _PLANAR:
         c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
         T = np.tile(np.eye(3), (len(values), 1, 1))

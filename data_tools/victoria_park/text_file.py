@@ -90,9 +90,7 @@ def _records(file: Path) -> tuple[TextTable, TextTable]:
     empty = [tag for tag in _COLUMNS if not rows[tag]]
     if empty:
         raise InputError(f"{file}: expected {empty[0]} records, there are none")
-    odometry, landmarks = (
-        TextTable(file, np.array(rows[tag], dtype=np.str_), np.array(lines[tag], dtype=np.int64)) for tag in _COLUMNS
-    )
+    odometry, landmarks = (TextTable.of(file, rows[tag], lines[tag]) for tag in _COLUMNS)
     return odometry, landmarks
 
 

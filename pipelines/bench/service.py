@@ -7,8 +7,6 @@ refused.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.serving import Address, StreamClient, parse_address
+from pipelines.bench.circling_objects import INTERVAL, CirclingObjects
+from pipelines.bench.served import Served
+from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
-from saga_fg.errors import SagaError
 from saga_fg.settings import require_between, require_positive, setting
 
-INTERVAL = 0.1  # s between frames
 BROKEN = (
     b"{",
     b"[1, 2]\n",
@@ -55,7 +53,7 @@ class ServiceBench:
     taken_in: int
     broken: int
     refused: int
-    late: int
+    out_of_order: int
     sent_again: int
     memory: tuple[float, float]
     latency: dict[str, float]
@@ -68,24 +66,11 @@ class ServiceBench:
 
 def bench_service(settings: ServiceBenchSettings, progress: Callable[[int, int], None] | None = None) -> ServiceBench:
     """Run it on this machine. Raises `SagaError` when the service does not come up."""
-    with subprocess.Popen(
-        [sys.executable, "-c", "from pipelines.cli.main import main; main()", "serve", "--listen", "127.0.0.1:0"],
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as server:
-        try:
-            return _drive(_address(server), settings, progress)
-        finally:
-            server.terminate()
-            server.communicate(timeout=60)
-
-
-def _address(server: subprocess.Popen[str]) -> Address:
-    assert server.stderr is not None
-    line = server.stderr.readline().strip()
-    if not line.startswith("listening at "):
-        raise SagaError(f"the service did not come up: {line}")
-    return parse_address(line.removeprefix("listening at "))
+    server = Served("--listen", "127.0.0.1:0")
+    try:
+        return _drive(server.address, settings, progress)
+    finally:
+        server.end()
 
 
 def _drive(
@@ -120,7 +105,7 @@ def _drive(
         taken_in=final["frames"],
         broken=broken,
         refused=final["refused"],
-        late=final["late"],
+        out_of_order=final["out_of_order"],
         sent_again=again,
         memory=(early["memory_mb"], final["memory_mb"]),
         latency=final["latency_ms"],
@@ -150,16 +135,13 @@ def _send_again(client: StreamClient, unanswered: deque[bytes]) -> int:
 
 
 def _frames(settings: ServiceBenchSettings) -> Iterator[bytes]:
-    """Lines of frames: objects on circles of their own, seen with noise; a late frame changes places with the next."""
-    rng = np.random.default_rng([settings.seed, 2])
-    centre = rng.uniform(-200, 200, (settings.objects, 2))
-    phase = rng.uniform(0, 2 * np.pi, settings.objects)
+    """Lines of frames; a late frame changes places with the next."""
+    objects = CirclingObjects(settings.objects, settings.seed)
+    rng = np.random.default_rng([settings.seed, 3])
     times = np.arange(settings.frames) * INTERVAL
     late = np.flatnonzero(rng.random(settings.frames) < settings.late)
     for k in late[late < settings.frames - 1]:
         times[[k, k + 1]] = times[[k + 1, k]]
     for seq, time in enumerate(times.tolist()):
-        angle = phase + 0.3 * time
-        position = centre + 20 * np.stack([np.cos(angle), np.sin(angle)], axis=-1) + rng.normal(0, 0.2, centre.shape)
-        detections = [{"label": "car", "x": x, "y": y, "score": 0.9} for x, y in position.round(3).tolist()]
+        detections = objects.detections(time, rng)
         yield encode({"seq": seq, "timestamp": round(time, 6), "sensor": "lidar", "detections": detections})

@@ -28,13 +28,17 @@ def explain(
       saga-fg explain results --scene 0011 --track 4 --json events.json
     """
     from data_tools.atomic_files import check_writable
+    from data_tools.located import located
     from pipelines.explaining import journal_of, read_track, story
     from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)
-    events = read_track(journal_of(result), track, scene)
-    for line in story(events):
+    journal = journal_of(result)
+    events = read_track(journal, track, scene)
+    with located(str(journal)):
+        lines = story(events)
+    for line in lines:
         typer.echo(line)
     if json_file is not None:
         write_figures(json_file, events)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,9 +69,8 @@ def labelled_recordings(
 
     assert seed is not None
     traffic = load_settings(SimulatorSettings, simulator) if simulator is not None else SimulatorSettings()
-    last = max(
-        (int(name.removeprefix("scene-")) for name in scenes if name.removeprefix("scene-").isdigit()), default=1
-    )
+    numbers = (re.fullmatch(r"scene-([0-9]{4,6})", name) for name in scenes)
+    last = max((int(number[1]) for number in numbers if number), default=1)
     return LabelledRecordings(table, "simulated", SimulatedTraffic(traffic, max(last, 1), seed))
 
 

@@ -1,69 +1,22 @@
-"""The command `saga-fg` and its sub-commands."""
+"""The entry point of the installed command, which listens to SIGTERM before anything slow is imported."""
 
 from __future__ import annotations
 
-from importlib.metadata import version
-from typing import Annotated
+import sys
 
-import typer
-
-from pipelines.cli.bench import bench_app
-from pipelines.cli.config import config
-from pipelines.cli.demo import demo
-from pipelines.cli.evaluate import evaluate_app
-from pipelines.cli.explain import explain
-from pipelines.cli.learn import learn_app
-from pipelines.cli.report import report_app
-from pipelines.cli.reporting import ReportingGroup
-from pipelines.cli.serve import serve, status
-from pipelines.cli.simulate import simulate
-from pipelines.cli.slam import slam_app
-from pipelines.cli.smooth import smooth_app
-from pipelines.cli.track import track_app
-from pipelines.cli.view import view_app
-
-app = typer.Typer(
-    cls=ReportingGroup,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.add_typer(track_app, name="track")
-app.add_typer(smooth_app, name="smooth")
-app.add_typer(evaluate_app, name="evaluate")
-app.add_typer(learn_app, name="learn")
-app.add_typer(report_app, name="report")
-app.add_typer(view_app, name="view")
-app.add_typer(bench_app, name="bench")
-app.add_typer(slam_app, name="slam")
-app.command()(explain)
-app.command()(simulate)
-app.command()(demo)
-app.command()(serve)
-app.command()(status)
-app.command()(config)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"saga-fg {version('saga-fg')}")
-        raise typer.Exit
-
-
-@app.callback()
-def saga_fg(
-    show_version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
-    ] = False,
-) -> None:
-    """Track many interacting objects with a graph-aware Kalman filter.
-
-    Start with `saga-fg demo`; then `saga-fg track --help` for recordings.
-    """
+from pipelines.cli.termination import TERMINATED, Terminated, ignore_sigterm, raise_on_sigterm
 
 
 def main() -> None:
-    """Entry point of the installed command."""
-    app(prog_name="saga-fg")
+    """Run the command, which ends in `SystemExit`; after SIGTERM, when all is tidied up, with exit code 143."""
+    raise_on_sigterm()
+    try:
+        from pipelines.cli.commands import app
+
+        app(prog_name="saga-fg")
+    except Terminated:
+        pass  # and let go of its frames, so that contexts that were just being entered end as well
+    finally:
+        ignore_sigterm()
+    print("terminated: what was complete is kept", file=sys.stderr)
+    sys.exit(TERMINATED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -76,7 +77,7 @@ def chosen_scenes(dataroot: Path, version: str, split: str | None, scenes: str |
 def apart(output: Path, *inputs: Path, option: str = "--output") -> None:
     """Raise `InputError` where the output, which `option` names, would overwrite what is read."""
     for path in inputs:
-        if output.resolve() == path.resolve():
+        if os.path.realpath(output) == os.path.realpath(path):  # unlike Path.resolve, it stands links in a circle
             raise InputError(f"{option} {output}: expected another file than those that are read")
 
 
@@ -91,6 +92,6 @@ def names(option: str, value: str) -> tuple[str, ...]:
 def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
     """The entries of a comma-separated option as whole numbers from `least` on, each once."""
     entries = names(option, value)
-    if not all(entry.isdecimal() and int(entry) >= least for entry in entries):
-        raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value!r}")
+    if not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
+        raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value[:40]!r}")
     return tuple(map(int, entries))

@@ -1,6 +1,7 @@
 """How the command talks: results on stdout; progress, warnings and one-line errors on stderr.
 
-Exit codes: 0 done, 2 wrong arguments or input (`SagaError`), 130 interrupted; anything else is a bug and a traceback.
+Exit codes: 0 done, 2 wrong arguments or input (`SagaError`), 130 interrupted, 143 terminated (`main`); anything else is
+a bug and a traceback.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
+from factors import FactorError
 from pipelines.tracking import Progress as ProgressCallback
 from saga_fg.errors import SagaError
 
@@ -37,7 +39,7 @@ class ReportingGroup(TyperGroup):
         """Run the command."""
         try:
             return super().invoke(ctx)
-        except SagaError as error:
+        except (SagaError, FactorError) as error:
             log.debug("where the error was found", exc_info=error)
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(INPUT_ERROR) from error

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import sys
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipelines.cli.options import Config, Verbose
+from pipelines.cli.termination import TERMINATED
 from pipelines.cli.tracking_options import (
     AssociationOption,
     EstimatorOption,
@@ -22,7 +27,8 @@ from pipelines.cli.tracking_options import (
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.serving import Address, StreamTracker
+    from pipelines.config import TrackConfig
+    from pipelines.serving import Address, StateKeeper, StopRequest, StreamTracker
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 
@@ -40,8 +46,22 @@ def serve(
         bool, typer.Option("--allow-remote", help="Listen where other machines can connect. There is no password.")
     ] = False,
     reorder: Annotated[
-        float, typer.Option("--reorder", min=0.0, help="Hold frames back by up to this many s, to sort them by time.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            "--reorder", min=0.0, help="Hold frames back by up to this many s, to sort them by time.  [default: 0]"
+        ),
+    ] = None,
+    snapshot: Annotated[
+        Path | None,
+        typer.Option("--snapshot", help="Keep the state in this file, and go on from it at the start.", metavar="FILE"),
+    ] = None,
+    every: Annotated[float, typer.Option("--every", min=0.05, help="How often to write --snapshot, s.")] = 5.0,
+    limits: Annotated[
+        Path | None,
+        typer.Option(
+            "--limits", help="YAML file of limits and times to wait; see `saga-fg config --limits`.", metavar="FILE"
+        ),
+    ] = None,
     method: MethodOption = "saga",
     estimator: EstimatorOption = None,
     lag: LagOption = None,
@@ -55,30 +75,73 @@ def serve(
     One line is one frame of one sensor; every frame is answered with the tracks at its time. A line that cannot be
     used is answered with what is wrong, counted and skipped. docs/guides/stream.md describes the messages.
 
+    SIGTERM and Ctrl-C finish what has come in, with a bound on the time; the exit code is then 143 or 0.
+
     \b
     Examples:
       saga-fg serve < frames.ndjson > tracks.ndjson
       saga-fg serve --listen 127.0.0.1:7447 --reorder 0.1
+      saga-fg serve --listen ./saga.sock --snapshot state.saga --every 2
       saga-fg status
     """
-    from pipelines.process import one_thread
-    from pipelines.serving import StreamSettings, StreamTracker
+    from pipelines.configuration import load_settings
+    from pipelines.process import one_thread, return_large_blocks
+    from pipelines.serving import StopRequest, StreamSettings, StreamTracker
+    from pipelines.serving.seldom import SeldomFilter
 
+    if not verbose:
+        for handler in logging.getLogger().handlers:
+            handler.addFilter(SeldomFilter())
     settings = configured("file", config, method, estimator, lag, association, interactions)
-    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), StreamSettings(reorder=reorder))
-    with one_thread():
-        _serve(stream, listen, allow_remote)
-    typer.echo(_summary(stream.status()), err=True)
+    bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
+    if reorder is not None:
+        bounds = replace(bounds, reorder=reorder)
+    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds)
+    return_large_blocks()
+    keeper = None if snapshot is None else _restored(stream, snapshot, every, settings, method)
+    last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)
+    with one_thread(), StopRequest(bounds.stop_timeout, *last_acts) as stop:
+        _serve(stream, keeper, listen, allow_remote, stop)
+        if keeper is not None:
+            keeper.stop()
+        typer.echo(_summary(stream.status()), err=True)
+    if stop.number == signal.SIGTERM:
+        raise typer.Exit(TERMINATED)
 
 
-def _serve(stream: StreamTracker[Any], listen: str | None, allow_remote: bool) -> None:
+def _restored(
+    stream: StreamTracker[Any], snapshot: Path, every: float, settings: TrackConfig, method: str
+) -> StateKeeper:
+    """The keeper of a stream that goes on from its file, if there is one."""
+    from pipelines.configuration import write_settings
+    from pipelines.serving import StateKeeper
+
+    if settings.tracker.providers:
+        raise InputError("--snapshot: expected no tracker.providers, whose factors cannot be kept in a file")
+    configuration = write_settings(settings, comments=False)
+    header = {"version": version("saga-fg"), "method": method, "configuration": configuration}
+    keeper = StateKeeper(stream, snapshot, every, header)
+    if keeper.restore():
+        typer.echo(f"going on from {snapshot}: {stream.status()['frames']} frames so far", err=True)
+    return keeper
+
+
+def _serve(
+    stream: StreamTracker[Any], keeper: StateKeeper | None, listen: str | None, allow_remote: bool, stop: StopRequest
+) -> None:
     """Until the source ends or the service is told to stop."""
     from pipelines.serving import SocketServer, parse_address, serve_pipe
 
+    def ready(address: Address | None = None) -> None:
+        if keeper is not None:
+            keeper.start()
+        if address is not None:
+            typer.echo(f"listening at {address}", err=True)
+
     if listen is None:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as an interrupt: finish what has come in
         try:
-            serve_pipe(stream, sys.stdin.buffer, sys.stdout.buffer)
+            ready()
+            serve_pipe(stream, sys.stdin.buffer, sys.stdout.buffer, stop)
         except BrokenPipeError:
             typer.echo("the reader of the tracks has gone away", err=True)
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered has nowhere to go
@@ -86,7 +149,7 @@ def _serve(stream: StreamTracker[Any], listen: str | None, allow_remote: bool) -
         address = parse_address(listen)
         if not address.is_local and not allow_remote:
             raise InputError(f"--listen {listen}: other machines could connect there; --allow-remote if that is meant")
-        SocketServer(stream, address, _say_ready).run()
+        SocketServer(stream, address, ready).run(stop)
 
 
 def status(
@@ -115,10 +178,6 @@ def status(
     typer.echo(json.dumps(answer) if as_json else _summary(answer))
 
 
-def _say_ready(address: Address) -> None:
-    typer.echo(f"listening at {address}", err=True)
-
-
 def _summary(answer: dict[str, Any]) -> str:
     counts = ", ".join(
         f"{answer[name]} {text}"
@@ -126,11 +185,19 @@ def _summary(answer: dict[str, Any]) -> str:
             ("messages", "messages"),
             ("frames", "frames tracked"),
             ("held", "held back"),
-            ("late", "late"),
+            ("out_of_order", "out of order"),
+            ("late", "too late"),
+            ("unconfirmed", "of unconfirmed time"),
             ("repeats", "repeated"),
             ("refused", "refused"),
             ("jumps", "jumps of the clock"),
+            ("failures", "internal errors"),
+            ("restarts", "restarts of the tracker"),
         )
     )
     latency = ", ".join(f"{name} {ms:g}" for name, ms in answer["latency_ms"].items()) or "none yet"
-    return f"{counts}\nlatency, ms: {latency}\nmemory: {answer['memory_mb']:g} MB, up for {answer['seconds']:.0f} s"
+    error = (answer.get("state") or {}).get("error")
+    kept = "" if error is None else f"\nthe state is not kept: {error}"
+    return (
+        f"{counts}{kept}\nlatency, ms: {latency}\nmemory: {answer['memory_mb']:g} MB, up for {answer['seconds']:.0f} s"
+    )

@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 
 import yaml
 
+from data_tools.input_files import read_text
 from pipelines.configuration.schema import (
     Choice,
     Listing,
@@ -29,19 +30,14 @@ from pipelines.configuration.schema import (
 from saga_fg.errors import InputError
 
 T = TypeVar("T")
+LARGEST = 2**63 - 1  # whole number
 DEFAULT_ENTRY = "default"
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 
 def load_settings(cls: type[T], path: Path, base: T | None = None) -> T:
     """The settings of a YAML file over `base` (default: `cls()`). Raises `InputError` naming file and dotted key."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable YAML file: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a YAML file in UTF-8") from error
-    return read_settings(cls, text, str(path), base)
+    return read_settings(cls, read_text(path), str(path), base)
 
 
 def read_settings(cls: type[T], text: str, source: str = "configuration", base: T | None = None) -> T:
@@ -54,6 +50,8 @@ def read_settings(cls: type[T], text: str, source: str = "configuration", base: 
         raise InputError(f"{source}: {error}") from error
     except (yaml.YAMLError, ValueError) as error:  # ValueError: PyYAML on a date such as 2020-02-31
         raise InputError(f"{source}: expected YAML: {_one_line(error)}") from error
+    except RecursionError as error:
+        raise InputError(f"{source}: expected settings, this YAML is nested too deeply") from error
 
 
 def _read(schema: Schema, data: Any, base: Any, where: str) -> Any:
@@ -82,7 +80,7 @@ def _read_scalar(kind: type, data: Any, where: str) -> Any:
             raise _mismatch(where, "a number", data) from None
     if kind is float and isinstance(data, int) and not isinstance(data, bool) and abs(data) < 2**1023:
         data = float(data)
-    if type(data) is not kind:
+    if type(data) is not kind or (isinstance(data, int) and abs(data) > LARGEST):
         raise _mismatch(where, _NAMES[kind], data)
     return data
 
@@ -119,7 +117,7 @@ def _read_section(schema: Section, data: Any, base: Any, where: str) -> Any:
         if key in settings:
             values[key] = data[key]
         elif key != "kind" or len(schema.classes) == 1:
-            raise InputError(f"{_join(where, key)}: unknown key, {_suggestion(key, settings)}")
+            raise InputError(f"{_join(where, key[:40])}: unknown key, {_suggestion(key, settings)}")
     start = base if type(base) is cls else None
     for name, setting in settings.items():
         before = getattr(start, name) if start is not None else None if setting.required else setting.default()
@@ -139,9 +137,11 @@ def _class_of_kind(schema: Section, data: dict[str, Any], where: str) -> type:
     kinds = [kind_of(cls) for cls in schema.classes]
     if "kind" not in data:
         raise InputError(f"{where}.kind: expected one of {', '.join(kinds)}, the key is missing")
-    cls = schema.class_of_kind(data["kind"]) if isinstance(data["kind"], str) else None
+    if not isinstance(data["kind"], str):
+        raise _mismatch(f"{where}.kind", f"one of {', '.join(kinds)}", data["kind"])
+    cls = schema.class_of_kind(data["kind"])
     if cls is None:
-        raise InputError(f"{where}.kind: got {data['kind']!r}, {_suggestion(str(data['kind']), kinds)}")
+        raise InputError(f"{where}.kind: got {data['kind'][:40]!r}, {_suggestion(data['kind'], kinds)}")
     return cls
 
 
@@ -150,7 +150,9 @@ def _text_keys(data: Any, where: str) -> list[str]:
         raise _mismatch(where, "a section (key: value)", data)
     for key in data:
         if not isinstance(key, str):
-            raise InputError(f"{_join(where, str(key))}: expected a key that is text, got {key!r} (quote it)")
+            raise InputError(
+                f"{_join(where, str(key)[:40])}: expected a key that is text, got {str(key)[:40]} (quote it)"
+            )
     return list(data)
 
 
@@ -161,7 +163,7 @@ def _suggestion(key: str, known: Iterable[str]) -> str:
 
 def _mismatch(where: str, expected: str, data: Any) -> InputError:
     names = {dict: "a section", list: "a list", type(None): "nothing (null)"}
-    got = names.get(type(data)) or (f"the text {data!r}" if isinstance(data, str) else str(data).lower())
+    got = names.get(type(data)) or (f"the text {data[:40]!r}" if isinstance(data, str) else str(data)[:40].lower())
     return InputError(f"{where or 'the top level'}: expected {expected}, got {got}")
 
 

@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from data_tools.atomic_files import write_text
+from data_tools.input_files import read_bytes
+from data_tools.json_stream import parsed_json
 from saga_fg.errors import InputError
 
 
@@ -41,9 +42,9 @@ def read_run_record(result: Path) -> RunRecord | None:
     path = record_path(result)
     if not path.is_file():
         return None
+    raw = parsed_json(read_bytes(path), str(path))
     try:
-        raw: Any = json.loads(path.read_text(encoding="utf-8"))
         milliseconds = {str(name): [float(ms) for ms in times] for name, times in raw["milliseconds"].items()}
         return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: expected the record of a run: {error}") from error

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.input_files import open_bytes
 from data_tools.remote_files import local_copy, name_of
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.scale_out.job import OpenedInput, sha256
@@ -124,8 +125,5 @@ def scene_digests(scene: Scene) -> dict[str, str]:
 
 
 def _file_digest(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    with open_bytes(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

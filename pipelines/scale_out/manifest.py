@@ -6,6 +6,9 @@
 
 A record is written, whole or not at all, after the results it names; so results without a valid record are those of a
 run that was killed, and are made anew. Letters that file names cannot have are written as in URLs (%2F).
+
+Results that a record no longer names are removed when its scene is done again. So that a forged record removes nothing
+else, it may only name files of its own scene: `NAME.SUFFIX` in any folder, or what is below `FOLDER/NAME/`.
 """
 
 from __future__ import annotations
@@ -13,13 +16,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
-from typing import Any
+from pathlib import PurePosixPath
 from urllib.parse import quote
 
-from data_tools.atomic_files import remove_leftovers, write_bytes, write_text
+from data_tools.json_stream import parsed_json
+from pipelines.scale_out.folder import OutputFolder, is_inside
 from pipelines.scale_out.job import Outcome, sha256
 from saga_fg.errors import InputError
+
+OF_THE_RUN = ("manifest", ".lock", ".scratch", "configuration.yaml")  # and of no scene
 
 
 @dataclass(frozen=True)
@@ -50,27 +55,24 @@ def file_name(scene: str) -> str:
 class Manifest:
     """The records and results in a folder."""
 
-    def __init__(self, output: Path) -> None:
-        """Make the folders, where they are missing. Raises `InputError` where that is not possible."""
-        self._output, self._folder = output, output / "manifest"
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{output}: not writable: {error.strerror}; expected a folder for the results") from error
-
-    def clean(self) -> None:
-        """Remove what a killed run left under temporary names."""
-        remove_leftovers(self._output.resolve().parent, self._output.resolve().name)
-        for folder in (self._output, *(path for path in self._output.rglob("*") if path.is_dir())):
-            remove_leftovers(folder)
+    def __init__(self, output: OutputFolder) -> None:
+        self._output = output
 
     def record(self, scene: str) -> Record | None:
-        """What is known of a scene; None where there is no record, or none that can be read."""
+        """What is known of a scene; None where there is no record, or none that can be true."""
         try:
-            raw: Any = json.loads((self._folder / f"{file_name(scene)}.json").read_bytes())
-            return Record(**{field.name: raw[field.name] for field in fields(Record)})
-        except (OSError, ValueError, KeyError, TypeError):
+            raw = parsed_json(self._output.read(_path(scene)) or b"", scene)
+            record = Record(**{field.name: raw[field.name] for field in fields(Record)})
+            texts = {**record.inputs, **record.results}.values()
+            sound = (
+                record.scene == scene
+                and all(_belongs(name, scene) for name in record.results)
+                and all(isinstance(text, str) for text in texts)
+                and all(type(count) is int for count in record.counts.values())
+            )
+        except (InputError, KeyError, TypeError, AttributeError):
             return None
+        return record if sound else None
 
     def valid(self, scene: str, configuration: str, version: str) -> Mapping[str, str] | None:
         """The hashes of the inputs whose results are there, complete and unharmed; None if there are none."""
@@ -78,10 +80,8 @@ class Manifest:
         if record is None or (record.status, record.configuration, record.version) != ("done", configuration, version):
             return None
         for name, expected in record.results.items():
-            try:
-                if sha256((self._output / name).read_bytes()) != expected:
-                    return None
-            except OSError:
+            content = self._output.read(name)
+            if content is None or sha256(content) != expected:
                 return None
         return record.inputs
 
@@ -90,11 +90,9 @@ class Manifest:
         before = self.record(outcome.name)
         for name in before.results if before is not None else ():
             if name not in outcome.files:
-                (self._output / name).unlink(missing_ok=True)
+                self._output.remove(name)
         for name, content in outcome.files.items():
-            path = self._output / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(path, content)
+            self._output.write(name, content)
         record = Record(
             scene=outcome.name,
             status=outcome.status,
@@ -107,5 +105,18 @@ class Manifest:
             seconds=round(outcome.seconds, 3),
         )
         text = json.dumps(asdict(record), indent=1, ensure_ascii=False) + "\n"
-        write_text(self._folder / f"{file_name(outcome.name)}.json", text)
+        self._output.write(_path(outcome.name), text.encode())
         return record
+
+
+def _belongs(name: object, scene: str) -> bool:
+    """Whether it is the name of a result of a scene, which has the scene's name in it."""
+    if not isinstance(name, str) or not is_inside(name):
+        return False
+    *folders, last = name.split("/")
+    own = file_name(scene)
+    return (folders or [last])[0] not in OF_THE_RUN and (PurePosixPath(last).stem == own or own in folders[1:])
+
+
+def _path(scene: str) -> str:
+    return f"manifest/{file_name(scene)}.json"

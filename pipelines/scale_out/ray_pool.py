@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -74,9 +76,12 @@ def _connected(address: str, workers: int) -> ModuleType:
     if address == "local":
         local = {"num_cpus": workers or None, "include_dashboard": False}
         os.environ.setdefault("RAY_worker_niceness", "0")  # there is no raylet of others to be nice to
+    on_sigterm = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, configure_logging=False, **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise InputError(f"--ray {address}: no cluster there: {str(error).strip().splitlines()[0]}") from error
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_sigterm)  # Ray has put a handler of its own in its place
     module: ModuleType = ray
     return module

@@ -7,15 +7,14 @@ results are the files that were written then. One run at a time may write to a f
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
-from data_tools.atomic_files import write_text
+from data_tools.atomic_files import remove_leftovers
+from pipelines.scale_out.folder import OutputFolder
 from pipelines.scale_out.job import Job, Outcome, SceneInput, SceneTask, sha256
 from pipelines.scale_out.manifest import Manifest, Record
 from saga_fg.errors import InputError
@@ -64,15 +63,15 @@ def run_scenes(
     Scenes that fail are in the report and in the manifest, and stop no other. Raises `InputError` for two inputs of one
     name, and if another run writes to the folder.
     """
-    manifest, report = Manifest(output), Report()
+    folder, report = OutputFolder(output), Report()
+    manifest = Manifest(folder)
     configuration, here = sha256(task.configuration.encode()), version("saga-fg")
-    with _alone(output):
-        manifest.clean()
-        scratch = output / ".scratch"
-        shutil.rmtree(scratch, ignore_errors=True)
-        scratch.mkdir()
-        write_text(output / "configuration.yaml", task.configuration)
+    with folder.held():
+        remove_leftovers(output.resolve().parent, output.resolve().name)
+        folder.remove_leftovers()
+        scratch = folder.new_folder(".scratch")
         try:
+            folder.write("configuration.yaml", task.configuration.encode())
             jobs = _jobs(inputs, task, manifest, configuration, here)
             for outcome in new_pool(scratch).outcomes(jobs, total):
                 if outcome.status != "failed" and outcome.version != here:
@@ -82,7 +81,7 @@ def run_scenes(
                 if progress is not None:
                     progress(outcome.name, report.scenes, total)
         finally:
-            shutil.rmtree(scratch, ignore_errors=True)
+            folder.remove_folder(".scratch")
         if finish is not None:
             finish(report)
     return report
@@ -114,19 +113,3 @@ def _count(report: Report, outcome: Outcome, manifest: Manifest, configuration: 
             log.info("%s failed: %s", outcome.name, outcome.reason)
     for name, number in record.counts.items() if record is not None else ():
         report.counts[name] = report.counts.get(name, 0) + number
-
-
-@contextmanager
-def _alone(output: Path) -> Iterator[None]:
-    """Hold the folder for this run; the system lets go of it when the process ends, however it does."""
-    try:
-        import fcntl
-    except ImportError:  # no such thing on Windows: whoever starts two runs there has to know
-        yield
-        return
-    with (output / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(f"{output}: another run is writing to this folder") from error
-        yield

@@ -1,8 +1,9 @@
 """Live tracking as a service: detections in and tracks out, as newline-delimited JSON.
 
-    line -> message -> clock -> reordering -> tracker -> answer
+    line -> message -> numbering -> reordering -> tracker -> answer
 
-`StreamTracker` is the whole of it for one line; `serve_pipe` reads standard input, `SocketServer` a TCP or Unix socket.
+`StreamTracker` is the whole of it for one line; `serve_pipe` reads standard input, `SocketServer` a TCP or Unix
+socket; `StateKeeper` keeps the state in a file.
 """
 
 from pipelines.serving.address import Address, parse_address
@@ -10,11 +11,15 @@ from pipelines.serving.client import StreamClient
 from pipelines.serving.pipe import serve_pipe
 from pipelines.serving.settings import StreamSettings
 from pipelines.serving.sockets import SocketServer
+from pipelines.serving.state_keeper import StateKeeper
+from pipelines.serving.stopping import StopRequest
 from pipelines.serving.stream import StreamTracker
 
 __all__ = [
     "Address",
     "SocketServer",
+    "StateKeeper",
+    "StopRequest",
     "StreamClient",
     "StreamSettings",
     "StreamTracker",

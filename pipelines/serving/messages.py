@@ -3,10 +3,12 @@
 in   frame      what a sensor detected at one time; `type` may be left out
      status     asks for counts and latencies
      subscribe  asks for the tracks of all frames, not just of those this client sends
-     reset      forgets all tracks and the time: a new scene begins
+     reset      forgets all tracks and the time: a new scene begins; with `sensor`, the number of that sensor alone
 out  tracks     the answer to a frame
-     held       a frame that waits for its turn; its tracks follow
-     repeat     a frame that was taken in before
+     held       a frame that waits for its turn; its answer follows
+     late       a frame that came too late and was left out
+     unconfirmed  a frame whose time jumps, left out unless the next frame agrees
+     repeat     a frame that was judged before
      status, reset, subscribe   the answers to the requests
      error      a message that could not be used, and why; nothing else happened
 """
@@ -50,7 +52,14 @@ class FrameMessage:
     seq: int | None = None
 
 
-def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Request:
+@dataclass(frozen=True)
+class SensorReset:
+    """Asks to forget the number of one sensor, whose next frame may have any."""
+
+    sensor: str
+
+
+def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | SensorReset | Request:
     """What a line says. Raises `InputError` naming the field and what was expected."""
     if len(line) > settings.max_message:
         raise InputError(f"message: expected at most {settings.max_message} bytes")
@@ -67,11 +76,14 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Reque
         return _frame_message(message, settings)
     if kind not in REQUESTS:
         raise InputError(f"type: expected frame, {', '.join(REQUESTS)}, got {_short(kind)}")
+    if kind == "reset" and "sensor" in message:
+        _known("", message, ("type", "sensor"))
+        return SensorReset(_name("", message, "sensor", ""))
     _known("", message, ("type",))
     return cast(Request, kind)
 
 
-def tracks_message(tracks: Tracks, message: FrameMessage) -> dict[str, Any]:
+def tracks_message(tracks: Tracks) -> dict[str, Any]:
     """The answer to a frame: its tracks in world coordinates, with the columns of track files."""
     boxes, covariance = tracks.boxes, tracks.position_covariance
     numbers = np.column_stack(
@@ -82,10 +94,21 @@ def tracks_message(tracks: Tracks, message: FrameMessage) -> dict[str, Any]:
     )
     names = (*NUMBERS, "cov_xx", "cov_xy", "cov_yy", "coasting")
     rows = [
-        {"id": id_, "label": label, **{name: x for name, x in zip(names, row, strict=True) if x == x}}
+        {"id": id_, "label": label, **{name: x for name, x in zip(names, row, strict=True) if math.isfinite(x)}}
         for id_, label, row in zip(tracks.id.tolist(), boxes.label.tolist(), numbers.tolist(), strict=True)
     ]
-    return {"type": "tracks", **about(message), "timestamp": tracks.timestamp, "tracks": rows}
+    return {"type": "tracks", "timestamp": tracks.timestamp, "tracks": rows}
+
+
+def late_message(newest: float) -> dict[str, Any]:
+    """The answer to a frame that came too late; `newest`: time of the tracks, s."""
+    return {"type": "late", "timestamp": newest}
+
+
+def unconfirmed_message(timestamp: float) -> dict[str, Any]:
+    """The answer to a frame whose time, s, is far from all before."""
+    text = f"timestamp: {timestamp:.3f} s is far from the newest frame; left out, unless the next one agrees"
+    return {"type": "unconfirmed", "message": text}
 
 
 def about(message: FrameMessage) -> dict[str, Any]:

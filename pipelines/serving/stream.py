@@ -2,23 +2,45 @@
 
 from __future__ import annotations
 
+import logging
+import math
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pipelines.process import resident_memory
-from pipelines.serving.clock import Clock
 from pipelines.serving.latency import Latencies
-from pipelines.serving.messages import FrameMessage, about, parse_message, tracks_message
+from pipelines.serving.messages import (
+    FrameMessage,
+    SensorReset,
+    about,
+    late_message,
+    parse_message,
+    tracks_message,
+    unconfirmed_message,
+)
+from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
+from pipelines.serving.seldom import Seldom
+from pipelines.serving.session_tracker import SessionTracker
 from pipelines.serving.settings import StreamSettings
-from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.serving.state_keeper import StateKeeper
+
+log = logging.getLogger(__name__)
 
 Client = TypeVar("Client")
 Answer = dict[str, Any]
+
+COUNTED = (
+    *("messages", "frames", "out_of_order", "late", "unconfirmed", "repeats", "refused", "jumps"),
+    *("failures", "restarts"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,61 +53,56 @@ class _Held(Generic[Client]):
 class StreamTracker(Generic[Client]):
     """Takes lines of any number of clients and says who is to be answered what.
 
-    new_tracker  makes a tracker; called at the start, on a reset, and where the clock has jumped back
+    new_tracker  makes a tracker; called at the start, on a reset, and after repeated internal errors
     settings     limits of the stream
+    keeper       keeps the state in a file, None: nothing is kept
 
-    A line that cannot be used is answered, counted and otherwise without effect. Frames that carry `seq`, the number of
-    the message among those of its sensor, are taken in once: after a lost connection a client sends again what was not
-    answered.
+    A line that cannot be used is answered, counted and otherwise without effect; so is one that makes the tracker fail.
+    Frames that carry `seq`, the number of the message among those of its sensor, are taken in once: after a lost
+    connection, or a killed service that kept its state, a client sends again what may be lost. One thread at a time.
     """
 
-    def __init__(self, new_tracker: Callable[[], OnlineTracker], settings: StreamSettings | None = None) -> None:
+    def __init__(self, new_tracker: Callable[[], SessionTracker], settings: StreamSettings | None = None) -> None:
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
         self.latencies = Latencies()
+        self.keeper: StateKeeper | None = None
+        self.version = 0  # grows whenever there is something new to keep
         self._new_tracker = new_tracker
         self._tracker = new_tracker()
-        self._clock = Clock(self.settings.max_jump)
-        self._held: Reordering[_Held[Client]] = Reordering(self.settings.reorder, self.settings.max_held)
-        self._last_seq: dict[str, int] = {}
+        self._held: Reordering[_Held[Client]] = Reordering(
+            self.settings.reorder, self.settings.max_held, self._tracker.max_jump
+        )
+        self._numbering = Numbering(self.settings.max_sensors)
+        self._durable: dict[str, int] = {}
+        self._failed_in_a_row = 0
+        self._seldom = Seldom()
         self._started = time.monotonic()
+        self._lock = threading.Lock()
 
-    def handle(self, line: bytes, client: Client, received: float | None = None) -> list[tuple[Client, Answer]]:
+    def handle(self, line: bytes | None, client: Client, received: float | None = None) -> list[tuple[Client, Answer]]:
         """The answers to one line of a client, and to held frames whose turn has come with it.
 
-        received: when the line was read, by `time.monotonic()`
+        line: None stands for one that was too long; received: when it was read, by `time.monotonic()`
         """
-        if not line.strip():
+        if line is not None and not line.strip():
             return []
-        self.counts["messages"] += 1
-        try:
-            message = parse_message(line, self.settings)
-            if message == "status":
-                return [(client, self.status())]
-            if message == "subscribe":
-                return [(client, {"type": "subscribe"})]
-            if message == "reset":
-                return [*self.reset(), (client, {"type": "reset"})]
-            assert isinstance(message, FrameMessage)
-            return self._take(_Held(message, client, time.monotonic() if received is None else received))
-        except InputError as error:
-            return [(client, self.refused(error))]
-
-    def refused(self, error: InputError) -> Answer:
-        """Count a message that could not be used, and answer it."""
-        self.counts["refused"] += 1
-        return {"type": "error", "message": str(error), "number": self.counts["messages"]}
-
-    def reset(self) -> list[tuple[Client, Answer]]:
-        """Take in what is held, then begin anew. `seq` goes on."""
-        answers = self.flush()
-        self._tracker = self._new_tracker()
-        self._clock = Clock(self.settings.max_jump)
+        with self._lock:
+            self.counts["messages"] += 1
+            try:
+                answers = self._handle(line, client, time.monotonic() if received is None else received)
+            except InputError as error:
+                return [(client, self._refused(error))]
+            except Exception as error:
+                return [(client, self._failed(error))]
+        if self.keeper is not None and answers and answers[-1][1]["type"] == "reset":
+            answers[-1][1]["durable"] = self.keeper.save()  # frames can be sent again, a reset could not
         return answers
 
     def flush(self) -> list[tuple[Client, Answer]]:
         """Take in all frames that are held back, at the end of a stream."""
-        return [self._step(held) for held in self._held.flush()]
+        with self._lock:
+            return self._flush()
 
     def status(self) -> Answer:
         """Counts since the start, latencies of frames in ms, memory in MB."""
@@ -94,54 +111,177 @@ class StreamTracker(Generic[Client]):
             for percent in (50, 90, 99, 99.9)
             if len(self.latencies)
         }
+        kept = {} if self.keeper is None else {"durable_seq": dict(self._durable), "state": self.keeper.status()}
         return {
             "type": "status",
             "seconds": round(time.monotonic() - self._started, 3),
-            **{name: self.counts[name] for name in ("messages", "frames", "late", "repeats", "refused", "jumps")},
+            **{name: self.counts[name] for name in COUNTED},
             "held": len(self._held),
             "latency_ms": milliseconds,
             "memory_mb": round(resident_memory(), 1),
-            "last_seq": dict(self._last_seq),
+            "last_seq": dict(self._numbering.last),
+            "taken": dict(self._numbering.taken),
+            **kept,
         }
+
+    def state(self) -> tuple[dict[str, Any], dict[str, int], int]:
+        """All that is to be kept, as a tree of values; the number of each sensor that it is good for; its version.
+
+        Frames that are held are not in it.
+        """
+        with self._lock:
+            state = {
+                "tracker": self._tracker.snapshot(),
+                "numbering": self._numbering.state(),
+                "newest": self._held.newest,
+                "counts": dict(self.counts),
+            }
+            return state, self._numbering.durable(), self.version
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        with self._lock:
+            self._tracker.restore(state["tracker"])
+            self._numbering.restore(state["numbering"])
+            self._held.set_clock(state["newest"])
+            self.counts = Counter(state["counts"])
+            self._durable = self._numbering.durable()
+
+    def made_durable(self, durable: dict[str, int]) -> None:
+        """A state with these numbers is on the disk: answers say so from now on."""
+        self._durable = durable
+
+    def _handle(self, line: bytes | None, client: Client, received: float) -> list[tuple[Client, Answer]]:
+        if line is None:
+            raise InputError(f"message: expected at most {self.settings.max_message} bytes")
+        message = parse_message(line, self.settings)
+        if message == "status":
+            return [(client, self.status())]
+        if message == "subscribe":
+            return [(client, {"type": "subscribe"})]
+        if message == "reset":
+            answers = self._flush()
+            self._begin_anew()
+            return [*answers, (client, {"type": "reset"})]
+        if isinstance(message, SensorReset):
+            answers = self._flush()  # what is held would bring the number back
+            self._forget(message.sensor)
+            self.version += 1
+            return [*answers, (client, {"type": "reset", "sensor": message.sensor})]
+        assert isinstance(message, FrameMessage)
+        return self._take(_Held(message, client, received))
 
     def _take(self, held: _Held[Client]) -> list[tuple[Client, Answer]]:
         message = held.message
-        timestamp, sensor = message.frame.timestamp, message.frame.sensor
-        if message.seq is not None and message.seq <= self._last_seq.get(sensor, -1):
-            self.counts["repeats"] += 1
-            return [(held.client, {"type": "repeat", **about(message)})]
-        newest = self._clock.newest
-        verdict = self._clock.judge(timestamp)
-        if message.seq is not None:
-            if sensor not in self._last_seq and len(self._last_seq) >= self.settings.max_sensors:
-                raise InputError(
-                    f"sensor: expected at most {self.settings.max_sensors} sensors, {sensor!r} is one more"
-                )
-            self._last_seq[sensor] = message.seq
-        if verdict == "doubtful":
-            raise InputError(
-                f"timestamp: {timestamp:.3f} s is {timestamp - newest:+.3f} s from the newest frame; left out, unless "
-                f"the next one of its kind agrees"
-            )
-        answers: list[tuple[Client, Answer]] = []
-        if verdict != "fits":
-            self.counts["jumps"] += 1
-            answers += self.flush()
-            if verdict == "jumped back":
-                self._tracker = self._new_tracker()
-        elif timestamp < newest:
-            self.counts["late"] += 1
+        timestamp, sensor, number = message.frame.timestamp, message.frame.sensor, message.seq
+        if number is not None:
+            last = self._numbering.last.get(sensor)
+            if last is not None and number > last + self.settings.max_seq_jump:
+                most = last + self.settings.max_seq_jump
+                raise InputError(f"seq: expected at most {most} after {last}, the last one of {sensor!r}, got {number}")
+            known = self._numbering.known(sensor, number)
+            if known is not None:
+                self.counts["repeats"] += 1
+                repeat = {"type": "repeat", "last_seq": -1 if last is None else last}
+                answer = repeat if known == "taken" else unconfirmed_message(timestamp)
+                return [(held.client, answer | self._about(message))]
+        self.counts["out_of_order"] += timestamp < self._held.newest and not self._held.jumps(timestamp)
         due = self._held.push(timestamp, held)
-        if held not in due:
-            answers.append((held.client, {"type": "held", **about(message)}))
+        answers: list[tuple[Client, Answer]] = []
+        if not any(each is held for each in due):
+            if number is not None:
+                self._numbering.hold(sensor, number)
+            answers.append((held.client, {"type": "held", **self._about(message)}))
         return answers + [self._step(each) for each in due]
 
+    def _flush(self) -> list[tuple[Client, Answer]]:
+        return [self._step(held) for held in self._held.flush()]
+
     def _step(self, held: _Held[Client]) -> tuple[Client, Answer]:
+        frame, number = held.message.frame, held.message.seq
+        if number is not None:
+            self._numbering.release(frame.sensor, number)
+        self.version += 1
         try:
-            tracks = self._tracker.step(held.message.frame)
+            answer = self._tracked(held.message)
         except InputError as error:
-            return held.client, self.refused(error) | about(held.message)
-        answer = tracks_message(tracks, held.message)
-        self.counts["frames"] += 1
+            return held.client, self._refused(error) | self._about(held.message)
+        except Exception as error:
+            return held.client, self._failed(error) | self._about(held.message)
+        self._failed_in_a_row = 0
         self.latencies.add(time.monotonic() - held.received)
         return held.client, answer
+
+    def _tracked(self, message: FrameMessage) -> Answer:
+        """Take in one frame. Raises what the tracker raises."""
+        frame, number = message.frame, message.seq
+        tracks = self._tracker.step(frame)
+        verdict = self._tracker.time_verdict
+        if verdict == "unconfirmed":
+            self.counts["unconfirmed"] += 1
+            if number is not None:
+                self._numbering.leave_out(frame.sensor, number)
+            return unconfirmed_message(frame.timestamp) | self._about(message)
+        if number is not None:
+            for silent in self._numbering.take(frame.sensor, number):
+                self._forget(silent)
+                if self._seldom.due("sensors"):
+                    most = self.settings.max_sensors
+                    log.warning("more than %d numbered sensors: the number of %r is forgotten", most, silent)
+        if verdict == "late":
+            self.counts["late"] += 1
+            return late_message(tracks.timestamp) | self._about(message)
+        self.counts["frames"] += 1
+        if verdict == "accepted":
+            self._held.set_clock(max(self._held.newest, frame.timestamp))
+            clock = {}
+        else:
+            self.counts["jumps"] += 1
+            self._held.set_clock(frame.timestamp)
+            clock = {"clock": verdict}
+        return tracks_message(tracks) | clock | self._about(message)
+
+    def _about(self, message: FrameMessage) -> Answer:
+        """By what a client knows its frame again, and how far its frames are safe."""
+        known = about(message)
+        if self.keeper is not None and message.seq is not None:
+            known["durable_seq"] = self._durable.get(message.frame.sensor, -1)
+        return known
+
+    def _refused(self, error: InputError) -> Answer:
+        self.counts["refused"] += 1
+        return {"type": "error", "message": str(error), "number": self.counts["messages"]}
+
+    def _failed(self, error: Exception) -> Answer:
+        """Count an error that is no fault of the message, and answer it; after some in a row, begin anew."""
+        if self._seldom.due(_origin(error)):
+            log.error("message %d: internal error, the service goes on", self.counts["messages"], exc_info=error)
+        self.counts["failures"] += 1
+        self._failed_in_a_row += 1
+        if self._failed_in_a_row >= self.settings.max_failures:
+            if self._seldom.due("restart"):
+                log.error("%d internal errors in a row: a fresh tracker begins", self._failed_in_a_row)
+            self.counts["restarts"] += 1
+            self._begin_anew()
+        text = f"internal error: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        return {"type": "error", "message": text, "number": self.counts["messages"]}
+
+    def _forget(self, sensor: str) -> None:
+        """The number of a sensor, and how far its frames were safe."""
+        self._numbering.forget(sensor)
+        self._durable.pop(sensor, None)
+
+    def _begin_anew(self) -> None:
+        """A fresh tracker; `seq` goes on."""
+        self._tracker = self._new_tracker()
+        self._held.set_clock(-math.inf)
+        self._failed_in_a_row = 0
+        self.version += 1
+
+
+def _origin(error: Exception) -> tuple[str, int]:
+    """Kind of an error, and the line it comes from."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return type(error).__name__, 0 if trace is None else trace.tb_lineno

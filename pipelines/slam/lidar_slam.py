@@ -32,6 +32,7 @@ from pipelines.slam.sightings import Seen, SightingSettings, landmarks_seen
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.ego import JointSettings, OdometryNoise, landmark_key, pose_key
+from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.geometry import inverse_transform
 from saga_fg.landmarks import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting, sighting_factors
 from saga_fg.settings import require_positive, setting, settings_group
@@ -187,7 +188,7 @@ def _solved(
     return solve(graph, factors, values)
 
 
-def updated(landmarks: Iterable[Landmark], solution: Solution) -> list[Landmark]:
+def updated(landmarks: Iterable[Landmark], solution: Solution | GraphSolution) -> list[Landmark]:
     """The landmarks where a solution has them."""
     found = []
     for mark in landmarks:

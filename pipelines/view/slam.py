@@ -10,14 +10,14 @@ Metres, about `origin`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from data_tools.input_files import read_bytes
+from data_tools.json_stream import parsed_json
 from data_tools.lidar import read_scan
 from data_tools.trajectories import Trajectory, read_tum_poses
 from pipelines.view.drawing import VEHICLE, Cubes, Drawing, Lines, Marks, Points, Pose, one_colour
@@ -84,11 +84,11 @@ def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:
     """Kind and number of each landmark that is at a place, and the places (M, 3)."""
     if not path.is_file():
         return (), np.empty((0, 3))
+    rows = parsed_json(read_bytes(path), str(path))
     try:
-        rows: Any = json.loads(path.read_text(encoding="utf-8"))
         marks = [row for row in rows if "nx" not in row]
         names = tuple(f"{row.get('kind', row.get('type'))} {row.get('id', row.get('number'))}" for row in marks)
         places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in marks], dtype=np.float64)
         return names, checked("places", places.reshape(-1, 3), (len(names), 3))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: expected a list of landmarks with x, y: {error!r}") from error

@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors import Robust, Solution, SolverSettings, between_factor, pose, pose_prior_factor, solve
+from factors import FactorError, Robust, Solution, SolverSettings, between_factor, pose, pose_prior_factor, solve
 from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
 from saga_fg.pose_graph.chordal import chordal_poses
 from saga_fg.pose_graph.graph import PoseGraph
 
 _ANCHOR = 1e-8  # variance (m^2, rad^2) of the first pose
+_UNLIKE = "expected coordinates and information of sizes that numbers can hold together"
 _SOLVER = SolverSettings(tolerance=1e-3)  # steps below a thousandth of a standard deviation are rounding in long chains
 
 
@@ -35,20 +37,29 @@ class OptimisedPoses:
     solution: Solution
 
     def covariances(self) -> FloatArray:
-        """Covariance (N, k, k) of each pose in its tangent, relative to the first one."""
-        marginals = gtsam.Marginals(self.solution.graph, self.solution.values)
-        return np.stack([marginals.marginalCovariance(row) for row in range(len(self.world_T_pose))])
+        """Covariance (N, k, k) of each pose in its tangent, relative to the first one.
+
+        Raises `InputError` where the measurements are too unlike in size to say.
+        """
+        try:
+            marginals = gtsam.Marginals(self.solution.graph, self.solution.values)
+            return np.stack([marginals.marginalCovariance(row) for row in range(len(self.world_T_pose))])
+        except RuntimeError as error:
+            raise InputError(f"{_UNLIKE}: the covariances of the poses cannot be computed") from error
 
 
 def optimise_poses(graph: PoseGraph, robust: Robust | None = None) -> OptimisedPoses:
     """The poses of least error, from the guess in the graph and from the chordal start.
 
     robust: a loss over the measurements that do not join successive poses, which may be false loop closures; the errors
-    then are robust costs. Raises `InputError` for a graph that is not connected.
+    then are robust costs. Raises `InputError` for a graph that is not connected, or too badly conditioned.
     """
     factors = factor_graph(graph, robust)
     starts = {"chordal": chordal_poses(graph), "guess": graph.world_T_pose}
-    solutions = {name: solve(factors, [], pose_values(start), _SOLVER) for name, start in starts.items()}
+    try:
+        solutions = {name: solve(factors, [], pose_values(start), _SOLVER) for name, start in starts.items()}
+    except FactorError as error:
+        raise InputError(f"{_UNLIKE}: {error}") from error
     best = min(solutions, key=lambda name: solutions[name].error)
     values = solutions[best].values
     errors = {name: solution.error for name, solution in solutions.items()}

@@ -1,5 +1,6 @@
 """Trackers: frames of detections in, tracks out."""
 
+from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.greedy import GreedyTracker
 from saga_fg.tracking.journal import Journal
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
@@ -7,6 +8,7 @@ from saga_fg.tracking.settings import (
     AssociationName,
     AssociationSettings,
     ClassSettings,
+    ClockSettings,
     EstimatorName,
     ExistenceSettings,
     FlowSettings,
@@ -20,6 +22,7 @@ __all__ = [
     "AssociationName",
     "AssociationSettings",
     "ClassSettings",
+    "ClockSettings",
     "EstimatorName",
     "ExistenceSettings",
     "FlowSettings",
@@ -29,6 +32,7 @@ __all__ = [
     "Observer",
     "Stage",
     "StandingSettings",
+    "TimeVerdict",
     "Tracker",
     "TrackerSettings",
     "TrackerView",

@@ -79,6 +79,10 @@ class TrackColumns:
             np.zeros(k, dtype=bool),
         )
 
+    def coasting(self, now: float) -> FloatArray:
+        """(n,) how long the tracks have not been detected, s; to the microsecond, as all times are."""
+        return np.maximum(np.round(now - self.last_seen, 6), 0.0)
+
     def select(self, rows: IntArray | BoolArray) -> Self:
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 

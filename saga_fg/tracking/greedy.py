@@ -13,11 +13,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.boxes import Boxes
+from saga_fg.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.by_class import DEFAULT, class_numbers
+from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
+from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.settings import GreedySettings
 
 NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 and (m/s)^2
@@ -45,14 +47,25 @@ class _Memory:
         return _Memory(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
+@dataclass(frozen=True, eq=False)
+class GreedySnapshot:
+    """A greedy tracker at one moment: its tracks, the id of the next one, its clock, its verdict on the latest time."""
+
+    memory: _Memory
+    next_id: int
+    clock: Clock
+    time_verdict: TimeVerdict
+
+
 class GreedyTracker:
-    """Same methods as `saga_fg.tracking.Tracker`; frames are in order of time."""
+    """Same methods as `saga_fg.tracking.Tracker`; a frame that comes late, up to `max_delay`, is used as a new one."""
 
     def __init__(self, settings: GreedySettings | None = None, sensors: Mapping[str, Sensor] | None = None) -> None:
         self.settings = settings or GreedySettings()
         self.sensors = dict(sensors or {})
+        self.time_verdict: TimeVerdict = "accepted"  # of the latest frame
+        self._clock = Clock()
         self._next_id = 1
-        self._time = -np.inf
         empty = Boxes.empty()
         none = np.empty(0)
         flat = np.empty((0, 2))
@@ -61,10 +74,21 @@ class GreedyTracker:
         )
 
     def step(self, frame: Frame) -> Tracks:
-        """Take in one frame; returns the tracks seen in it, in world coordinates."""
+        """Take in one frame; returns the tracks seen in it, in world coordinates.
+
+        Raises `InputError` for a frame that can't be used; the tracker is then as it was before.
+        """
+        if not isinstance(frame, Frame):
+            raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
         sensor = sensor_model(self.sensors, frame.sensor)
-        now = self._time = max(self._time, frame.timestamp + sensor.time_offset)
         detections = sensor.in_world(frame)
+        settings, timestamp = self.settings, frame.timestamp + sensor.time_offset
+        verdict, self._clock = self._clock.judged(timestamp, frame.sensor, settings.clock, settings.max_delay)
+        self.time_verdict, now = verdict, self._clock.newest
+        if verdict in ("late", "unconfirmed"):
+            return self.tracks(now)
+        if verdict == "set_back":
+            self._memory = self._memory.select(np.empty(0, dtype=np.int64))
         p = sensor.probability(detections.score, detections.boxes.label)
         rows = np.flatnonzero(p >= self.settings.min_score)
         boxes, p = detections.boxes.select(rows), p[rows]
@@ -80,6 +104,7 @@ class GreedyTracker:
         difference = np.where(young[:, None], memory.velocity[match[seen]], moved)
         velocity[seen] = np.where(np.isfinite(velocity[seen]), velocity[seen], difference)
         velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+        velocity = np.clip(velocity, -MAX_SPEED, MAX_SPEED)
         anchor[seen] = np.where(young[:, None], memory.anchor[match[seen]], anchor[seen])
         anchor_time[seen] = np.where(young, memory.anchor_time[match[seen]], anchor_time[seen])
         ids = np.empty(len(boxes), dtype=np.int64)
@@ -106,8 +131,22 @@ class GreedyTracker:
 
     def tracks(self, timestamp: float) -> Tracks:
         """The tracks seen in the newest frame, projected to `timestamp` (s)."""
-        newest = self._memory.select(np.flatnonzero(self._memory.last_seen == self._time))
+        newest = self._memory.select(np.flatnonzero(self._memory.last_seen == self._clock.newest))
         return _tracks(newest, timestamp)
+
+    @property
+    def max_jump(self) -> float:
+        """How far from the newest frame another has to be confirmed, s."""
+        return self.settings.clock.max_jump
+
+    def snapshot(self) -> GreedySnapshot:
+        """All that the tracker knows, as a value."""
+        return GreedySnapshot(self._memory, self._next_id, self._clock, self.time_verdict)
+
+    def restore(self, snapshot: GreedySnapshot) -> None:
+        """Go on from where a tracker of the same settings was."""
+        self._memory, self._next_id, self._clock = snapshot.memory, snapshot.next_id, snapshot.clock
+        self.time_verdict = snapshot.time_verdict
 
     def _match(self, boxes: Boxes, p: FloatArray, now: float) -> IntArray:
         """(m,) row of the track each detection takes, or -1."""
@@ -132,6 +171,8 @@ def _tracks(memory: _Memory, timestamp: float) -> Tracks:
     ahead = timestamp - memory.last_seen
     position = memory.position.copy()
     position[:, :2] += memory.velocity * ahead[:, None]
+    near = np.flatnonzero((np.abs(position) <= MAX_POSITION).all(axis=1))  # the others are lost
+    memory, position, ahead = memory.select(near), position[near], ahead[near]
     nominal = np.tile(NOMINAL_VARIANCE * np.eye(2), (len(memory.id), 1, 1))
     boxes = Boxes(memory.label, position, memory.size, memory.yaw, memory.velocity)
     return Tracks(timestamp, memory.id, boxes, memory.score, nominal, nominal, np.maximum(ahead, 0.0))

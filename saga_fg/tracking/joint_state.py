@@ -5,7 +5,8 @@ Positions are local: the scene's origin is taken off before anything comes here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,8 @@ import numpy as np
 from factors import RangeRate
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import FixedLagSmoother, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.graph import FactorProvider
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
@@ -32,11 +34,13 @@ class Kinematics(NamedTuple):
     P_velocity: FloatArray
 
 
-TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother
+TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | GraphFilter
 
 
-def new_estimator(name: EstimatorName, lag: float) -> TrackEstimator:
-    """A fresh estimator; `lag` (s) is the fixed-lag smoother's."""
+def new_estimator(name: EstimatorName, lag: float, providers: Sequence[FactorProvider] = ()) -> TrackEstimator:
+    """A fresh estimator; `lag` (s) is the fixed-lag smoother's; with `providers` it is a running graph, by iSAM2."""
+    if providers:
+        return GraphFilter(providers)
     if name == "isam2":
         return IncrementalFilter()
     return FixedLagSmoother(lag) if name == "fixed-lag" else JointKalmanFilter()
@@ -48,17 +52,16 @@ class JointTrackState:
     def __init__(self, estimator: TrackEstimator, motion: Callable[[str], Motion]) -> None:
         self._estimator = estimator
         self._motion = motion
-        self._types: dict[str, NodeType] = {}  # by class; classes that move alike share one
+        self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
         self._born: dict[int, float] = {}  # on the estimator's clock
         self._kinematics: Kinematics | None = None  # until the state changes
 
     def type_of(self, label: str) -> NodeType:
         """The node type of a class."""
-        if label not in self._types:
-            motion = self._motion(label)
-            alike = next((t for t in self._types.values() if t.motion == motion), None)
-            self._types[label] = alike or NodeType(type(motion).__name__, motion)
-        return self._types[label]
+        motion = self._motion(label)
+        if motion not in self._types:
+            self._types[motion] = NodeType(type(motion).__name__, motion)
+        return self._types[motion]
 
     def types_of(self, label: StrArray) -> tuple[NodeType, ...]:
         """The node type of each row (n,)."""
@@ -79,7 +82,11 @@ class JointTrackState:
             if delay > 0:
                 F, Q = _own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
-            self._changed().add(ids[rows], mean, P)
+            estimator = self._changed()
+            if isinstance(estimator, GraphFilter):
+                estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
+            else:
+                estimator.add(ids[rows], mean, P)
         self._born.update(dict.fromkeys(ids.tolist(), self._estimator.time))
 
     def remove(self, ids: IntArray) -> None:
@@ -119,12 +126,14 @@ class JointTrackState:
         rate: FloatArray,
         variance: FloatArray,
         viewpoint: FloatArray,
+        gate: FloatArray,
         delay: float,
     ) -> None:
         """Take in one range rate each of some tracks, m/s over ground, seen from `viewpoint` (2,) `delay` s ago.
 
         rate (k,), variance (k,). Every estimator takes the same linear measurement: the range rate linearised at the
-        present estimate, moved back by `delay` along own motion. Left out: tracks within `LEAST_RANGE` of the sensor.
+        present estimate, moved back by `delay` along own motion. Left out: tracks within `LEAST_RANGE` of the sensor,
+        and range rates whose normalised innovation squared is above `gate` (k,).
         """
         for node_type, rows in self._by_type(label, moving=True):
             if not node_type.has(VELOCITY):
@@ -139,8 +148,18 @@ class JointTrackState:
                 continue
             model = RangeRate(node_type.dim, tuple(at_p), tuple(at_v), (float(viewpoint[0]), float(viewpoint[1]), 0.0))
             H = model.jacobian(x)
-            z = rate[rows, None] - model.predict(x) + (H @ x[:, :, None])[:, :, 0]
-            self._measure(node_type, ids[rows], z, H, variance[rows, None, None], delay)
+            innovation, R = rate[rows, None] - model.predict(x), variance[rows, None, None]
+            H_now, R_now = _moved_to_present(node_type, H, R, delay) if delay > 0 else (H, R)
+            S = H_now @ self._estimator.covariance(ids[rows]) @ np.swapaxes(H_now, 1, 2) + R_now
+            likely = innovation[:, 0] ** 2 <= gate[rows] * S[:, 0, 0]
+            z = innovation + (H @ x[:, :, None])[:, :, 0]
+            self._measure(node_type, ids[rows][likely], z[likely], H[likely], R[likely], delay)
+
+    def ask_providers(self, origin: FloatArray) -> None:
+        """Let users' providers add their factors; positions are from `origin` (2,)."""
+        if isinstance(self._estimator, GraphFilter):
+            self._estimator.ask(origin)
+            self._changed()
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
@@ -191,6 +210,12 @@ class JointTrackState:
         """Continue from a snapshot."""
         state, self._born = snapshot
         self._changed().restore(state)
+
+    def copied(self) -> JointTrackState:
+        """A state that goes its own way from here."""
+        twin = copy.copy(self)
+        twin._estimator, twin._born = copy.copy(self._estimator), dict(self._born)
+        return twin
 
     def _measure(
         self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float

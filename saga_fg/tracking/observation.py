@@ -61,7 +61,9 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     yaw_noise = np.where(np.isfinite(boxes.yaw), yaw_noise, UNKNOWN_YAW_NOISE)
-    with_velocity = np.isfinite(boxes.velocity[:, 0] + boxes.velocity[:, 1]) & sensor.use_velocity
+    limit = sensor.max_speed if sensor.use_velocity else -1.0
+    with_velocity = np.hypot(*boxes.velocity.T) <= limit
+    with_range_rate = np.abs(detections.range_rate) <= limit
     return Observed(
         boxes,
         probability,
@@ -70,7 +72,7 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
         z_noise,
         yaw_noise,
         keep,
-        np.where(sensor.use_velocity, detections.range_rate, np.nan),
+        np.where(with_range_rate, detections.range_rate, np.nan),
         sensor.range_rate_variance(boxes.label, probability),
         sensor.told(boxes.label, probability),
         viewpoint,

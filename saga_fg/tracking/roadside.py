@@ -9,7 +9,7 @@ colour of a light, of the nearest known one within reach.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -37,7 +37,7 @@ GATE = 0.999  # share of true sightings of a light that may be its own
 
 
 @dataclass(frozen=True)
-class _Place:
+class Place:
     """Where the map has a node, world: middle (2,), polyline (k, 2) about it, direction of travel, m and rad."""
 
     middle: FloatArray
@@ -46,38 +46,44 @@ class _Place:
     width: float
 
 
+@dataclass(eq=False)
 class Roadside:
-    """What is known of the road. `settings`: how lights change."""
+    """What is known of the road.
 
-    def __init__(self, settings: SignalSettings) -> None:
-        self._settings = settings
-        self.id: IntArray = np.empty(0, dtype=np.int64)
-        self.label: StrArray = np.empty(0, dtype="<U16")
-        self._name: tuple[str, ...] = ()
-        self._place: tuple[_Place, ...] = ()
-        self._light: tuple[str, ...] = ()  # that governs each node, "" for none
-        self._belief: Mapping[str, FloatArray] = {}
+    settings  how lights change
+    id, label, name, place  (n,) of the nodes
+    light     (n,) name of the light that governs each, "" for none
+    beliefs   by light, the probabilities of its colours
+    """
+
+    settings: SignalSettings
+    id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    label: StrArray = field(default_factory=lambda: np.empty(0, dtype="<U16"))
+    name: tuple[str, ...] = ()
+    place: tuple[Place, ...] = ()
+    light: tuple[str, ...] = ()
+    beliefs: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.id)
 
     def belief(self, light: str) -> Mapping[str, float]:
         """Probabilities of the colours of a light, by colour; raises `KeyError` for one that no map has."""
-        return dict(zip(COLOURS, self._belief[light].tolist(), strict=True))
+        return dict(zip(COLOURS, self.beliefs[light].tolist(), strict=True))
 
     def learn(self, road_map: RoadMap, origin: FloatArray, state: JointTrackState) -> None:
         """Add what is new in a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
-        new = [(name, *rest) for name, *rest in _elements(road_map) if name not in self._name]
+        new = [(name, *rest) for name, *rest in _elements(road_map) if name not in self.name]
         if not new:
             return
         names, labels, places, lights = zip(*new, strict=True)
         ids = -np.arange(len(self) + 1, len(self) + len(new) + 1, dtype=np.int64)
         self.id, self.label = np.concatenate([self.id, ids]), np.concatenate([self.label, np.array(labels)])
-        self._name += names
-        self._place += places
-        self._light += lights
-        fresh = {name: self._settings.stationary for name in lights if name and name not in self._belief}
-        self._belief = {**self._belief, **fresh}
+        self.name += names
+        self.place += places
+        self.light += lights
+        fresh = {name: self.settings.stationary for name in lights if name and name not in self.beliefs}
+        self.beliefs = {**self.beliefs, **fresh}
         n, P = len(ids), road_map.deviation**2 * np.eye(2)
         middle = np.array([place.middle for place in places]) - origin
         still = np.zeros((n, 2)), np.zeros((n, 2, 2))
@@ -85,9 +91,9 @@ class Roadside:
 
     def predict(self, dt: float) -> None:
         """The lights may change within `dt` s."""
-        if self._belief and dt > 0:
-            later = self._settings.predicted(np.array(list(self._belief.values())), dt)
-            self._belief = dict(zip(self._belief, later, strict=True))
+        if self.beliefs and dt > 0:
+            later = self.settings.predicted(np.array(list(self.beliefs.values())), dt)
+            self.beliefs = dict(zip(self.beliefs, later, strict=True))
 
     def heed(self, frame: Frame, sensor: Sensor, origin: FloatArray, state: JointTrackState, delay: float) -> None:
         """Take in the lights that a frame shows, as it was `delay` s ago: their colours, and where they are."""
@@ -101,15 +107,15 @@ class Roadside:
         z = seen.boxes.position[:, :2] - origin
         d2, log_det = mahalanobis(position, P, z, R)
         apart = np.hypot(*np.moveaxis(z[None] - position[:, None], -1, 0))
-        possible = (d2 < gate(GATE)) & (apart < self._settings.max_distance)
+        possible = (d2 < gate(GATE)) & (apart < self.settings.max_distance)
         cost = d2 + log_det
         row, column = assign(cost, possible, cost.max(initial=0.0) + 1.0)
-        belief = dict(self._belief)
+        belief = dict(self.beliefs)
         for light, sighting in zip(lights[row].tolist(), column.tolist(), strict=True):
             colour = SIGHTINGS.index(str(seen.boxes.label[sighting]))
-            name = self._name[light]
+            name = self.name[light]
             belief[name] = colour_updated(belief[name], colour, sensor.colour_accuracy)
-        self._belief = belief
+        self.beliefs = belief
         k = len(row)
         if k:
             full = np.zeros((k, 4, 4))
@@ -125,20 +131,20 @@ class Roadside:
             return tracks
         position, _ = state.places(self.id, self.label)
         moved = tracks.has_moved
-        beliefs = [self._belief[light] for light in self._light if light]
-        closed = self._settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))
-        governed = np.array([bool(light) for light in self._light])
+        beliefs = [self.beliefs[light] for light in self.light if light]
+        closed = self.settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))
+        governed = np.array([bool(light) for light in self.light])
         weight = np.zeros(n + m)
         weight[n:][governed] = closed
-        outline = {n + k: place.outline + position[k] for k, place in enumerate(self._place) if len(place.outline)}
-        width = {n + k: place.width for k, place in enumerate(self._place) if place.width > 0}
+        outline = {n + k: place.outline + position[k] for k, place in enumerate(self.place) if len(place.outline)}
+        width = {n + k: place.width for k, place in enumerate(self.place) if place.width > 0}
         return NodeTable(
             np.concatenate([tracks.id, self.id]),
             np.concatenate([tracks.label, self.label]),
             tracks.types + state.types_of(self.label),
             np.concatenate([tracks.position, position]),
             np.concatenate([tracks.velocity, np.zeros((m, 2))]),
-            np.concatenate([tracks.heading, [place.heading for place in self._place]]),
+            np.concatenate([tracks.heading, [place.heading for place in self.place]]),
             np.concatenate([tracks.length, np.zeros(m)]),
             np.concatenate([tracks.velocity_variance, np.zeros(m)]),
             None if moved is None else np.concatenate([moved, np.zeros(m, dtype=bool)]),
@@ -149,17 +155,17 @@ class Roadside:
         )
 
 
-def _elements(road_map: RoadMap) -> list[tuple[str, str, _Place, str]]:
+def _elements(road_map: RoadMap) -> list[tuple[str, str, Place, str]]:
     """Name, class, place and governing light of every element of a map."""
     none = np.empty((0, 2))
     elements = [
-        (light.name, LIGHT, _Place(np.array(light.position), none, 0.0, 0.0), light.name) for light in road_map.lights
+        (light.name, LIGHT, Place(np.array(light.position), none, 0.0, 0.0), light.name) for light in road_map.lights
     ]
     for line in road_map.stop_lines:
         middle = line.ends.mean(axis=0)
-        elements.append((line.name, STOP_LINE, _Place(middle, line.ends - middle, line.heading, 0.0), line.light))
+        elements.append((line.name, STOP_LINE, Place(middle, line.ends - middle, line.heading, 0.0), line.light))
     for lane in road_map.lanes:
         centre = np.array(lane.centre)
         middle = centre[len(centre) // 2]
-        elements.append((lane.name, LANE, _Place(middle, centre - middle, 0.0, lane.width), ""))
+        elements.append((lane.name, LANE, Place(middle, centre - middle, 0.0, lane.width), ""))
     return elements

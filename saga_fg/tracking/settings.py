@@ -139,6 +139,22 @@ class StandingSettings:
 
 
 @dataclass(frozen=True)
+class ClockSettings:
+    """Which timestamps are believed, see `saga_fg.tracking.clock`."""
+
+    max_jump: float = setting(
+        10.0, "a frame further than this from the newest time is left out until a second one confirms its time, s"
+    )
+    late_run: int = setting(
+        3, "new frames in a row by which a sensor goes back in time, after which the clock is set back"
+    )
+
+    def __post_init__(self) -> None:
+        require_positive(self, "max_jump", infinite=True)
+        require_positive(self, "late_run")
+
+
+@dataclass(frozen=True)
 class TrackerSettings:
     """Everything the tracker can be told; `edges` empty is the classical filter of independent objects.
 
@@ -161,13 +177,18 @@ class TrackerSettings:
         0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
     )
     max_step: float = setting(
-        math.inf, "a longer interval is predicted in several steps, each with edges of its own, s; .inf: in one"
+        math.inf,
+        "a longer interval is predicted in several steps, at most 100, each with edges of its own, s; .inf: in one",
     )
     signals: SignalSettings = settings_group(SignalSettings, "traffic lights, where a map knows of any")
     road_map: RoadMap | None = settings_group(
         lambda: None, "lights, stop lines and lanes, world coordinates; null: none but those that frames bring along"
     )
     estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
+    providers: tuple[str, ...] = setting(
+        (),
+        "factor providers of your own as MODULE:NAME, imported when a tracker is made; with estimator: isam2",
+    )
     lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
@@ -182,6 +203,7 @@ class TrackerSettings:
     unconfirmed_share: float = setting(
         0.0, "share of its score with which a track is reported that waits for confirmation; 0: not at all"
     )
+    clock: ClockSettings = settings_group(ClockSettings, "which timestamps are believed")
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
     max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
@@ -218,8 +240,10 @@ class GreedySettings:
     max_coasting: float = setting(1.2, "a track without detection is kept this long, s")
     baseline: float = setting(0.2, "velocities are differences of positions at least this far apart in time, s")
     min_score: float = setting(0.0, "detections with a lower probability are not used")
+    clock: ClockSettings = settings_group(ClockSettings, "which timestamps are believed")
+    max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
 
     def __post_init__(self) -> None:
         require_between(self, 0, 1, "min_score")
-        require_between(self, 0, math.inf, "baseline")
+        require_between(self, 0, math.inf, "baseline", "max_delay")
         require_positive(self, "max_coasting", infinite=True)

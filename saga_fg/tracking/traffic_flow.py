@@ -15,6 +15,7 @@ those that move, with the weights 1 - b_0 and k_j (1 - b_j).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,25 +53,25 @@ class Expected(NamedTuple):
     variance: FloatArray
 
 
+@dataclass(eq=False)
 class TrafficFlow:
     """The passages of the last `memory` seconds."""
 
-    def __init__(self, settings: FlowSettings) -> None:
-        self._settings = settings
-        self._passages: Passages | None = None
+    settings: FlowSettings
+    passages: Passages | None = None
 
     def pass_by(self, passages: Passages) -> None:
         """Remember where tracks are now; those of unknown heading or speed are left out."""
-        settings = self._settings
+        settings = self.settings
         if settings.weight == 0:
             return
         known = np.isfinite(passages.heading) & (passages.variance < settings.known_speed**2)
         if len(known) == 0:
             return
         new = passages.select(known)
-        if self._passages is not None:
-            new = self._passages.select(self._passages.time >= passages.time[0] - settings.memory).extended(new)
-        self._passages = new
+        if self.passages is not None:
+            new = self.passages.select(self.passages.time >= passages.time[0] - settings.memory).extended(new)
+        self.passages = new
 
     def expected(
         self, label: StrArray, position: FloatArray, heading: FloatArray, variance: FloatArray, standing: float = 0.0
@@ -79,7 +80,7 @@ class TrafficFlow:
 
         variance, standing  (k,) of the speed of one of which nothing is known, and the belief that it stands
         """
-        passages, settings = self._passages, self._settings
+        passages, settings = self.passages, self.settings
         if passages is None or len(passages.id) == 0 or len(label) == 0:
             return Expected(np.full(len(label), standing), np.zeros(len(label)), variance.copy())
         offset = passages.position - position[:, None]

@@ -64,7 +64,7 @@ def nodes_of(
         np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
         (P[:, 0, 0] + P[:, 1, 1]) / 2,
         columns.has_moved.copy(),
-        unseen=np.maximum(time - columns.last_seen, 0.0),
+        unseen=columns.coasting(time),
     )
 
 
@@ -102,7 +102,7 @@ def reported_tracks(
     settings: TrackerSettings,
 ) -> Tracks:
     """The tracks that are believed and were seen of late, as of `timestamp`; `now`, s, is the state's time."""
-    coasting = np.maximum(now - columns.last_seen, 0.0)
+    coasting = columns.coasting(now)
     shown = (
         (columns.accepted | (settings.unconfirmed_share > 0))
         & (columns.confirmed | (columns.existence >= settings.existence.report))

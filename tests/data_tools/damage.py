@@ -6,6 +6,7 @@ programs and people do to them.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import random
 import re
@@ -18,14 +19,19 @@ from kitti_example import write_sequence
 from nuscenes_example import box, results, write_results, write_tables
 
 from data_tools import KittiTracking, NuScenes, read_detections, split_scenes
+from data_tools.argoverse import ArgoverseLogs
 from data_tools.detection_files import read_tracks
+from data_tools.eth_ucy import EthUcy
 from data_tools.kitti.scored_sequences import read_scored_sequences
 from data_tools.label_files import read_label_table
 from data_tools.lidar import read_scan
 from data_tools.nuscenes import read_scored_scenes
+from data_tools.plaza import read_plaza
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
+from data_tools.victoria_park import read_victoria_park
 from pipelines.config import load_config
+from pipelines.explaining import read_events
 from pipelines.report.run_record import read_run_record
 from pipelines.serving import StreamTracker
 
@@ -33,6 +39,7 @@ PIECES = [
     *(b"", b"NaN", b"nan", b"-1", b"0", b"1e999", b"-1e308", b"1e-320", b"99999999999999999999", b"0x10", b"1_0"),
     *(b"null", b"true", b"[]", b"{}", b'""', b'"x"', b"[[[[", b"\n", b"\r\n", b"\t", b",", b" ", b";", b'"'),
     *(b"\xff", b"\x00", b"\xef\xbb\xbf", "²".encode(), "car²".encode(), b"../../x", b"!!python/object:os.system"),
+    *(b"1e300", b"-1e300", b"9" * 4000, b"9" * 5000, b"[" * 5000, b"- " * 3000, b'{"a":' * 3000),
 ]
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
@@ -65,6 +72,15 @@ PLY = (
     "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     "1 2 3\n4 5 6\n"
 )
+PARK = "ODOMETRY 0 1 1.5 0 0 0.01 0 0 0.02 0 0.03\nLANDMARK 1 2 4 -1 0.4 0.1 0.5\n"
+PLAZA = {
+    "DR": "10.0 0.5 0.1\n10.2\t0.25\t-0.1\n",
+    "TD": "10.15 2 3 12\n10.1 2 7 30.5\n",
+    "GT": "10 1 2 0.5\n10.2 3 4 0.6\n",
+    "TL": "7 20 30\n3 -1 -2\n",
+}
+OBSMAT = "780 1 8.0 0 3.0 1.0 0 0.0\n786 1 8.4 0 3.0 1.0 0 0.0\n786 2 1.0 0 2.0 0.0 0 -0.5\n"
+JOURNAL = '{"event": "born", "track": 1, "scene": "a"}\n{"event": "ended", "track": 1, "scene": "a"}\n'
 
 
 @dataclass(frozen=True)
@@ -99,8 +115,11 @@ def targets(folder: Path) -> dict[str, Target]:
     np.savez(npz, timestamp=[0.0, 1.0], x=[1.0, 2.0], y=[3.0, 4.0], label=["car", "bus"])
     npy = folder / "scan.npy"
     np.save(npy, np.ones((3, 4), dtype=np.float32))
+    plaza = tuple(table(f"P_{kind}.txt", content) for kind, content in PLAZA.items())
+    (folder / "eth").mkdir()
     config = load_config("file")
     return {
+        **_argoverse(folder / "argoverse"),
         "nuScenes": Target(tuple(sorted((nuscenes / "v1.0-mini").glob("*.json"))), lambda: _read_nuscenes(nuscenes)),
         "nuScenes detections": Target((found,), lambda: _read_nuscenes(nuscenes)),
         "nuScenes results": Target((tracked,), lambda: read_scored_scenes(tracked, nuscenes, "v1.0-mini")),
@@ -121,6 +140,10 @@ def targets(folder: Path) -> dict[str, Target]:
         "scan, PLY": one("scan.ply", PLY, read_scan),
         "scan, NumPy": Target((npy,), lambda: read_scan(npy)),
         "configuration": one("config.yaml", CONFIG, lambda path: load_config("file", path)),
+        "Victoria Park": one("park.txt", PARK, read_victoria_park),
+        "Plaza": Target(plaza, lambda: read_plaza(plaza[0])),
+        "ETH and UCY": one("eth/obsmat.txt", OBSMAT, lambda path: EthUcy(folder).scene("eth")),
+        "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
     }
@@ -180,6 +203,25 @@ def _tracked(token: str) -> dict[str, object]:
     found = box(token, velocity=[1.0, 0.0])
     score = found.pop("detection_score")
     return {**found, "tracking_id": "1", "tracking_name": found.pop("detection_name"), "tracking_score": score}
+
+
+def _argoverse(root: Path) -> dict[str, Target]:
+    """A log, where pyarrow is installed."""
+    if importlib.util.find_spec("pyarrow") is None:
+        return {}
+    import pyarrow
+    from pyarrow import feather
+
+    pose = {name: [0.0, 0.0] for name in ("qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    rows = {"timestamp_ns": [0, 10**8], "qw": [1.0, 1.0]} | pose
+    size = {name: [1.0, 2.0] for name in ("length_m", "width_m", "height_m")}
+    named = {"track_uuid": ["a", "a"], "category": ["BUS", "BUS"], "num_interior_pts": [1, 0]}
+    log = root / "log"
+    log.mkdir(parents=True)
+    files = (log / "annotations.feather", log / "city_SE3_egovehicle.feather")
+    for path, columns in zip(files, (rows | size | named, rows), strict=True):
+        feather.write_feather(pyarrow.table(columns), path)
+    return {"Argoverse": Target(files, lambda: ArgoverseLogs(root).scene("log"))}
 
 
 def _read_nuscenes(root: Path) -> None:

@@ -75,8 +75,18 @@ def test_a_missing_column_a_missing_pose_and_a_broken_file_are_named(tmp_path):
     ego = {name: column[1:] for name, column in poses().items()}
     with pytest.raises(InputError, match=r"expected a pose at every annotated time, 1100000000 has none"):
         write(tmp_path, boxes(), ego).scene("log")
+    dataset = write(tmp_path, boxes() | {"length_m": ["long"] * 3}, poses())
+    with pytest.raises(InputError, match=r"annotations.feather: length_m: expected numbers, got object"):
+        dataset.scene("log")
+    dataset = write(tmp_path, boxes() | {"track_uuid": ["a", None, "b"]}, poses())
+    with pytest.raises(InputError, match=r"annotations.feather: track_uuid: expected a value in every row"):
+        dataset.scene("log")
     dataset = write(tmp_path, boxes(), poses())
-    (tmp_path / "log" / "annotations.feather").write_bytes(b"not feather")
+    path = tmp_path / "log" / "annotations.feather"
+    path.write_bytes(path.read_bytes().replace(b"category", b"c\xf9tegory"))
+    with pytest.raises(InputError, match=r"annotations.feather: expected a readable Feather file: 'utf-8'"):
+        dataset.scene("log")
+    path.write_bytes(b"not feather")
     with pytest.raises(InputError, match=r"expected a readable Feather file"):
         dataset.scene("log")
 

@@ -163,6 +163,7 @@ def test_csv_and_ndjson_agree(tmp_path_factory: pytest.TempPathFactory, table: l
 
 
 HEAD = "timestamp,x,y,z,length,score,label\n0,1,1,1,1,1,car\n"
+OPEN_QUOTE = "expected comma-separated values: a quote is opened and not closed on this line"
 BROKEN_CSV = [
     ("", "expected a column 'timestamp', the columns there are none"),
     ("timestamp,x,y\n", "expected at least one row"),
@@ -184,6 +185,12 @@ BROKEN_CSV = [
     ("timestamp,x,y,coordinates\n0,1,1,ego\n", "line 2: coordinates: ego needs the columns ego_x, ego_y and ego_yaw"),
     ("timestamp,x,y,ego_x\n0,1,1,3\n", "line 2: ego_y: expected a finite number, since ego_x is given, it is left out"),
     (HEAD + "1,1,1,1,1,1," + "c" * 200_000, "line 3: expected comma-separated values: field larger"),
+    (HEAD + "1,1,1,1,1,1," + "c" * 1000, "line 3: label: expected a name of at most 256 characters, got 1000"),
+    (HEAD + '1,1,1,1,1,1,"car\n' + "1,1,1,1,1,1,car\n" * 1000, f"line 3: {OPEN_QUOTE}"),
+    (HEAD + '1,1,1,1,1,1,"car\n' + "1,1,1,1,1,1,car\n" * 9 + '1,1,1,1,1,1,car"\n', f"line 3: {OPEN_QUOTE}"),
+    (HEAD + '\n1,1,1,1,1,1,"car\n' + "1,1,1,1,1,1,car\n" * 10_000, f"line 4: {OPEN_QUOTE}"),
+    ('"timestamp,x,y\n0,1,1\n', f"line 1: {OPEN_QUOTE}"),
+    (HEAD + '1,1,1,1,1,1,"ca"r\n', "line 3: expected comma-separated values: ',' expected after '\"'"),
     ("timestamp,x,y,empty\n0,1,1,yes\n", "empty: expected an array of booleans, in NumPy archives only"),
 ]
 
@@ -214,7 +221,7 @@ BROKEN_NDJSON = [
     (FIRST + '{"timestamp": 1, "x": NaN, "y": 1}', "line 2: x: expected a finite number of metres, got nan"),
     (FIRST + '{"timestamp": 1, "x": 1, "y": 1, "label": 3}', "line 2: label: expected a name, got 3"),
     (FIRST + '{"x": 1, "y": 1}', "line 2: timestamp: expected a finite number of seconds, it is left out"),
-    (FIRST + '{"timestamp": 1, "x": 1' + "0" * 400 + ', "y": 1}', "line 2: x: expected a number, got '1000"),
+    (FIRST + '{"timestamp": 1, "x": 1' + "0" * 400 + ', "y": 1}', "line 2: x: expected a finite number, got inf"),
     (FIRST + "[" * 100_000, "line 2: broken or truncated JSON"),
     ("", "expected at least one row"),
 ]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from typing import Any
 
 import pytest
@@ -56,9 +57,7 @@ def test_a_truncated_array_is_an_error(content: list[Any], data: st.DataObject) 
         list(stream(text[:cut], 3).array())
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{}", "[1 2]", "[1,]", "[1", "nonsense", "[" * 100_000, "[1e]", "[" + "9" * 5000 + "]"]
-)
+@pytest.mark.parametrize("text", ["", "{}", "[1 2]", "[1,]", "[1", "nonsense", "[" * 100_000, "[1e]"])
 def test_broken_array_names_file_and_position(text: str) -> None:
     with pytest.raises(InputError, match=r"^x\.json: character \d+: "):
         list(stream(text).array())
@@ -69,6 +68,11 @@ def test_broken_object_names_file_and_position(text: str) -> None:
     reader = stream(text)
     with pytest.raises(InputError, match=r"^x\.json: character \d+: "):
         {key: reader.value() for key in reader.members()}
+
+
+@pytest.mark.parametrize("digits", [400, 4000, 5000])
+def test_a_whole_number_no_float_can_hold_is_infinite(digits: int) -> None:
+    assert list(stream(f"[-{'9' * digits}, 7, 12345678901234567890]").array()) == [-math.inf, 7, 12345678901234567890.0]
 
 
 def test_text_after_the_end_is_an_error() -> None:

@@ -101,3 +101,15 @@ def test_nuscenes_tables_of_labels_are_read_as_a_dataset(tmp_path: Path) -> None
             last, token, count = token, record["next"], count + 1
         assert (last, count) == (instance["last_annotation_token"], instance["nbr_annotations"])
     assert (tmp_path / "labels" / "maps" / "placeholder.png").is_file()
+
+
+def test_masks_of_maps_are_copied_to_the_folder_of_maps_alone(tmp_path: Path) -> None:
+    write_nuscenes(tmp_path / "data", SimulatedTraffic(SimulatorSettings(duration=1.0), scenes=1, seed=1))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "victim.txt").write_text("theirs")
+    (tmp_path / "out" / "victim.txt").write_text("mine")
+    table = tmp_path / "data" / "v1.0-mini" / "map.json"
+    table.write_text(json.dumps([{**json.loads(table.read_text())[0], "filename": "maps/../../victim.txt"}]))
+    write_nuscenes_labels(tmp_path / "out" / "labels", tmp_path / "data", "v1.0-mini", [])
+    assert (tmp_path / "out" / "victim.txt").read_text() == "mine"
+    assert not list((tmp_path / "out" / "labels").rglob("victim.txt"))

@@ -98,6 +98,8 @@ def test_the_truth_of_beacons_and_drive_is_optional(tmp_path: Path) -> None:
         ({"TD": ""}, "P_TD.txt: expected records"),
         ({"DR": "10 1 0\n9 1 0\n"}, "P_DR.txt: line 2: time: expected 10.000000 or later"),
         ({"DR": "10 one 0\n"}, "P_DR.txt: line 1: distance: expected a finite number, got 'one'"),
+        ({"GT": ""}, "P_GT.txt: expected records"),
+        ({"TL": "1e300 20 30\n"}, "P_TL.txt: line 1: beacon: expected a whole number"),
         ({"TL": "7 20\n"}, "P_TL.txt: line 1: expected 3 columns"),
     ],
 )

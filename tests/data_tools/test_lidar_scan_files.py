@@ -92,7 +92,7 @@ def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
         ("a.pcd", b"rubbish", r"a\.pcd: expected a header that ends in a line DATA"),
         ("a.ply", b"rubbish", r"a\.ply: expected a header that ends in a line end_header"),
         ("a.txt", b"", r"a\.txt: expected a name that ends in \.pcd\.bin, \.bin"),
-        ("missing/a.bin", None, r"a\.bin: cannot be read: there is no such file"),
+        ("missing/a.bin", None, r"a\.bin: cannot be read: No such file"),
     ],
 )
 def test_damaged_files_say_what_is_wrong(tmp_path: Path, name: str, content: bytes | None, expected: str) -> None:
@@ -100,6 +100,12 @@ def test_damaged_files_say_what_is_wrong(tmp_path: Path, name: str, content: byt
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=expected):
         read_scan(tmp_path / name)
+
+
+def test_a_signalling_nan_is_refused_as_any_other(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.full((1, 4), 0x7FA00000, dtype="<u4").view("<f4"))
+    with pytest.raises(InputError, match=r"a\.npy: points\[0, 0\]: expected a finite number"):
+        read_scan(tmp_path / "a.npy")
 
 
 def test_an_array_of_another_shape_and_an_archive_without_points_are_refused(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_patterns_are_sorted_and_every_file_comes_once(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError, match="expected at least one file"):
         expanded([f"{tmp_path}/*.ndjson"])
-    with pytest.raises(InputError, match=r"none\.txt: expected a readable list"):
+    with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
         expanded([f"{tmp_path}/none.txt"])
 
 
@@ -83,3 +83,11 @@ def test_without_fsspec_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(MissingExtraError, match=r"saga-fg\[remote\]"), local_copy("s3://bucket/a.csv"):
         pass
+
+
+def test_a_list_in_itself_is_refused(tmp_path: Path) -> None:
+    one, other = tmp_path / "one.txt", tmp_path / "other.txt"
+    one.write_text(f"{other}\n")
+    other.write_text(f"{one}\n")
+    with pytest.raises(InputError, match=r"one\.txt: expected a list of files, this one is in itself"):
+        expanded([str(one)])

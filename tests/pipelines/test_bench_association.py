@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.cli.main import app
+from pipelines.cli import app
 
 
 def test_a_row_for_every_method_and_size(tmp_path: Path) -> None:

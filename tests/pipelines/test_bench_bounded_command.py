@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typer.testing import CliRunner
 
-from pipelines.cli.main import app
+from pipelines.cli import app
 
 
 def test_it_prints_a_row_for_each_bound() -> None:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from pipelines.bench import coasting_trajectories
 from pipelines.bench.coasting_trajectories import CoastingErrors, CoastingSettings, coasting_figures
-from pipelines.cli.main import app
+from pipelines.cli import app
 from saga_fg.edge_rules import Following
 from saga_fg.errors import InputError
 from saga_fg.interactions import CarFollowing

@@ -9,7 +9,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from pipelines.bench.fusion import of_sensors, survived, without
-from pipelines.cli.main import app
+from pipelines.cli import app
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Sensor, Tracks
 from saga_fg.sensor import FieldOfView
 

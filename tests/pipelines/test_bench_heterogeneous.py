@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.bench.heterogeneous import _figures, cars_alone, contenders, tables
 from pipelines.bench.predictions import prediction_errors
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import load_config
 from saga_fg import Detection, Detections, Frame
 from saga_fg.track import Tracks

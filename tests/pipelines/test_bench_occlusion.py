@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.bench.occlusion import until_last_seen
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import load_config
 from saga_fg import Annotations, Boxes
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from pipelines.bench.flocks import flock
 from pipelines.bench.graph_tracking import JointGraphTracking, SeparateGraphTracking
 from pipelines.bench.scaling import APART, JOINT, NODES, SEPARATE, ScalingSettings, bench_scaling
-from pipelines.cli.main import app
+from pipelines.cli import app
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from pipelines.bench import synthetic as bench
 from pipelines.bench.drawn_scenes import INTERVAL, DrawnSettings, drawn_scene
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.cli.options import names
 from saga_fg.edge_rules import Neighbours
 

@@ -17,7 +17,7 @@ from pipelines.bench.coasting import HIDDEN, NEVER_GIVEN_UP, coasting_errors, ke
 from pipelines.bench.recordings import NuScenesSet, Score, SimulatedSet
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
 from pipelines.bench.variants import COMPONENTS, METHODS, changed, variants
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import Family, load_config
 from pipelines.tracking import track_scene
 from saga_fg import InputError

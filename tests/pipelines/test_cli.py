@@ -81,6 +81,42 @@ def test_verbose_adds_the_traceback(tmp_path: Path) -> None:
     assert result.stderr.splitlines()[-1].startswith("error: ")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("track", "file", "circle.csv", "-o", "out.csv"),
+        ("track", "file", "in.csv", "-o", "circle.csv"),
+        ("track", "file", "in.csv", "-o", "out.csv", "--config", "circle.csv"),
+        ("track", "file", "circle.csv", "-o", "out", "--workers", "1"),
+        ("track", "kitti", "--dataroot", "circle.csv", "--detections", "circle.csv", "-o", "out"),
+        ("smooth", "file", "circle.csv", "-o", "out"),
+        ("smooth", "file", "in.csv", "-o", "circle.csv"),
+        ("slam", "g2o", "circle.csv", "-o", "out"),
+        ("slam", "plaza", "circle.csv", "-o", "out"),
+        ("slam", "victoria-park", "circle.csv", "-o", "out"),
+        ("explain", "circle.csv", "--track", "1"),
+        ("explain", "in.csv", "--track", "9" * 5000),
+        ("report", "file", "circle.csv", "-o", "page.html"),
+        ("report", "file", "in.csv", "-o", "circle.csv"),
+        ("bench", "scaling", "--objects", "9" * 5000),
+        ("simulate", "-o", "circle.csv", "--scenes", "1"),
+        ("demo", "-o", "circle.csv", "--scenes", "1"),
+    ],
+)
+def test_links_in_a_circle_and_endless_numbers_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("circle.csv").symlink_to("circle.csv")
+    Path("in.csv").write_text("timestamp,x,y\n0,1,2\n")
+    result = saga_fg(*arguments)
+    assert result.exit_code in (1, 2), result.exception
+    assert isinstance(result.exception, SystemExit)
+    assert result.stderr.splitlines()[-1].startswith(("error: ", "failed: "))
+    assert len(result.stderr) < 500
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "out") == ["circle.csv", "in.csv"]
+
+
 def test_a_missing_option_is_explained() -> None:
     result = saga_fg("track", "nuscenes", "--dataroot", "x")
     assert result.exit_code == 2

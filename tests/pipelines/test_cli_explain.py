@@ -78,6 +78,21 @@ def test_journals_that_are_not_there_or_broken(tmp_path: Path) -> None:
         assert expected in result.stderr
 
 
+@pytest.mark.parametrize("change", [{"time": "noon"}, {"time": None}, {"event": "eaten"}, {"sensor": {}}, {"label": 1}])
+def test_an_event_that_nobody_wrote(folder: Path, tmp_path: Path, change: dict[str, object]) -> None:
+    lines = (folder / "tracks.csv.journal.jsonl").read_text().splitlines()
+    events = [json.loads(line) for line in lines]
+    changed = next(event for event in events if event.get("track") == 1)
+    changed.update(change)
+    if "label" in change:
+        del changed["label"]
+    (tmp_path / "t.csv.journal.jsonl").write_text("\n".join(map(json.dumps, events)))
+    result = saga_fg("explain", tmp_path / "t.csv", "--track", "1", "--scene", changed["scene"])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {tmp_path / 't.csv.journal.jsonl'}: expected events as --explain writes")
+    assert result.stdout == ""
+
+
 @pytest.mark.parametrize(
     ("option", "expected"), [(("--method", "centerpoint"), "keeps no journal"), (("--workers", "1"), "goes without")]
 )

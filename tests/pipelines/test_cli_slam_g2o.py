@@ -52,6 +52,17 @@ def test_a_graph_in_pieces_is_refused_by_the_name_of_its_file(tmp_path: Path) ->
     assert not output.exists()
 
 
+@pytest.mark.parametrize("place", ["1e8", "1e9"])
+def test_a_graph_without_a_minimum_that_can_be_found_is_one_line(tmp_path: Path, place: str) -> None:
+    file, output = tmp_path / "far.g2o", tmp_path / "out"
+    file.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 {place} 0 0 100 0 0 100 0 400\n")
+    result = CliRunner().invoke(app, ["slam", "g2o", str(file), "--output", str(output)])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {file}: expected coordinates and information of sizes that")
+    assert result.stderr.count("\n") == 1
+    assert not output.exists()
+
+
 def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
     graph, truth = loop(2, seed=0)
     wrong = graph.first_T_second.copy()

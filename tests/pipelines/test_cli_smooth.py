@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from data_tools.label_files import read_label_table
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import Family
 from pipelines.configuration import read_settings, write_settings
 from pipelines.smoothing import SmoothConfig, load_smooth_config

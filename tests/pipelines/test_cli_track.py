@@ -81,7 +81,7 @@ def test_the_same_command_writes_the_same_file(simulated: Path, tmp_path: Path) 
         (("--split", "all", "--detections", "b.json"), "--detections b.json: expected NAME=FILE"),
         (("--split", "all", "--detections", "camera=none.json"), "none.json"),
         (("--split", "all", "--version", "v1.0-none"), "v1.0-none"),
-        (("--split", "all", "--config", "none.yaml"), "none.yaml: expected a readable YAML file"),
+        (("--split", "all", "--config", "none.yaml"), "none.yaml: cannot be read"),
     ],
 )
 def test_mistakes_end_in_one_line_and_no_file(

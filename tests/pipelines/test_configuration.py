@@ -75,7 +75,7 @@ class RequiredSettings:
 
 finite = st.floats(allow_nan=False)
 words = st.text(st.characters(codec="utf-8"), max_size=20)
-gates = st.builds(GateSettings, st.floats(1e-300, 1.0), st.integers())
+gates = st.builds(GateSettings, st.floats(1e-300, 1.0), st.integers(-(2**63) + 1, 2**63 - 1))
 entries = st.builds(ClassSettings, finite, gates, st.none() | finite)
 rules = st.builds(DistanceRule, finite) | st.builds(
     FollowingRuleSettings, st.lists(words).map(tuple), st.tuples(finite, finite)
@@ -187,6 +187,13 @@ def test_written_floats_stay_floats_for_any_yaml_reader(value: float) -> None:
     assert read == value
 
 
+def test_aliases_that_stand_for_millions_of_entries_are_not_printed() -> None:
+    lists = "".join(f"  - &l{k} [{', '.join([f'*l{k - 1}'] * 10) if k else 'lol'}]\n" for k in range(7))
+    with pytest.raises(InputError) as caught:
+        read_settings(WholeSettings, f"rules:\n- kind:\n{lists}", "my.yaml")
+    assert str(caught.value) == "my.yaml: rules[0].kind: expected one of distance, following_rule, got a list"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -199,6 +206,10 @@ def test_written_floats_stay_floats_for_any_yaml_reader(value: float) -> None:
         ("gate: {probability: high}", "my.yaml: gate.probability: expected a number, got the text 'high'"),
         ("gate: {probability: true}", "my.yaml: gate.probability: expected a number, got true"),
         ("gate: {largest: 1.5}", "my.yaml: gate.largest: expected a whole number, got 1.5"),
+        (f"gate: {{largest: {'9' * 4000}}}", f"my.yaml: gate.largest: expected a whole number, got {'9' * 40}"),
+        (f"gate: {{probability: {'9' * 4000}}}", f"my.yaml: gate.probability: expected a number, got {'9' * 40}"),
+        ("gate: " + "[" * 5000, "my.yaml: expected settings, this YAML is nested too deeply"),
+        ("gate:\n" + "- " * 5000 + "1", "my.yaml: expected settings, this YAML is nested too deeply"),
         ("gate: {largest: true}", "my.yaml: gate.largest: expected a whole number, got true"),
         ("gate: {probability: 2}", "my.yaml: gate: probability: expected a number in (0, 1], got 2.0"),
         ("gate: 3", "my.yaml: gate: expected a section (key: value), got 3"),
@@ -233,10 +244,10 @@ def test_mistakes_are_one_line_errors(text: str, message: str) -> None:
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.yaml: expected a readable YAML file: No such file"):
+    with pytest.raises(InputError, match=r"none\.yaml: cannot be read: No such file"):
         load_settings(WholeSettings, tmp_path / "none.yaml")
     (tmp_path / "latin.yaml").write_bytes(b"name: \xe9t\xe9\n")
-    with pytest.raises(InputError, match=r"latin\.yaml: expected a YAML file in UTF-8"):
+    with pytest.raises(InputError, match=r"latin\.yaml: expected text in UTF-8"):
         load_settings(WholeSettings, tmp_path / "latin.yaml")
 
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pipelines.learning.interactions
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
 from pipelines.learning import TrajectorySource
 from saga_fg import InputError

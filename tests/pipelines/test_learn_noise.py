@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from data_tools.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.settings import SensorSettings
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
 from saga_fg import ConstantVelocity

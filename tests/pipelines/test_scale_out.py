@@ -21,6 +21,7 @@ from pipelines.scale_out import (
     perform,
     run_scenes,
 )
+from pipelines.scale_out.folder import OutputFolder
 from pipelines.scale_out.job import SceneInput
 from saga_fg.errors import InputError
 
@@ -112,7 +113,7 @@ def test_a_scene_that_fails_is_reported_and_stops_no_other(tmp_path: Path) -> No
     report = run(inputs, output, workers=2)
     assert sorted(report.done) == ["a00", "a02"]
     assert report.failed == {"a01": f"{tmp_path / 'in' / 'a01.csv'}: line 2: x: expected a number, got 'far'"}
-    record = Manifest(output).record("a01")
+    record = Manifest(OutputFolder(output)).record("a01")
     assert record is not None
     assert (record.status, record.results) == ("failed", {})
     (tmp_path / "in" / "a01.csv").write_text(good)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from data_tools.simulator import simulate_scene
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from pipelines.bench.joint import JointBench, bench_joint
-from pipelines.cli.main import app
+from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.slam.joint import keyframes, run_joint
 from pipelines.slam.roadside import RoadsideSettings, observe_poles

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.cli.main import app
+from pipelines.cli import app
 
 ROWS = "timestamp,x,y\n0.0,1.0,2.0\n0.1,1.5,2.0\n"
 

@@ -589,6 +589,17 @@ def test_bad_input_does_not_end_the_interpreter(recipe):
     assert done.stdout.split() == [str(len(BAD)), "refused;", "4", "nodes", "left"]
 
 
+def test_of_no_nodes_there_is_nothing_to_tell(make):
+    for estimator in (make(), filled(make)):
+        nodes = estimator.nodes.tolist()
+        assert estimator.mean([]).shape[0] == estimator.covariance([]).shape[0] == 0
+        assert estimator.joint_mean([]).shape == (0,)
+        assert estimator.joint_covariance([]).shape == (0, 0)
+        assert estimator.update(Measurements([], [], [], [])) == 0.0
+        estimator.marginalise([])
+        assert estimator.nodes.tolist() == nodes
+
+
 # snapshots
 
 

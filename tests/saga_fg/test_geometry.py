@@ -12,6 +12,7 @@ from saga_fg.geometry import (
     checked_quaternions,
     checked_transform,
     inverse_transform,
+    is_rotation,
     quaternion_rotation,
     quaternion_yaw,
     transform_points,
@@ -142,3 +143,7 @@ def test_quaternions_are_normalised_when_nearly_unit_and_refused_otherwise():
     with pytest.raises(InputError, match=r"rotation: expected shape \(any, 4\)"):
         checked_quaternions("rotation", [[1.0, 0.0, 0.0]])
     assert checked_quaternions("rotation", []).shape == (0, 4)
+
+
+def test_a_matrix_whose_determinant_underflows_is_no_rotation() -> None:
+    assert not is_rotation(np.array([[1.0, 0, 0], [0, 0, 1], [0, 1e-320, 1]]), 1e-4)

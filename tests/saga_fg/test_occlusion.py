@@ -63,7 +63,7 @@ def existence(occlusion):
     for k in range(15):
         cars = [(20.0, 0.0)] if k < 10 else [(10.0, 0.0)]
         tracker.step(replace(frame(0.1 * k, cars, size=SIZE, yaw=np.pi / 2), world_T_ego=EGO))
-    columns = tracker.snapshot().own[0]
+    columns = tracker.snapshot().tracks.tables.columns
     return columns.existence[0], columns.looks[0] - columns.hits[0]
 
 

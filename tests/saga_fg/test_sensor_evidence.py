@@ -18,7 +18,7 @@ def heard(evidence, sensor, now, seen=(), p=(), missed=None, chance=0.8, n=1):
 
 
 def born(p=0.6, sensor="lidar", now=0.0):
-    evidence = SensorEvidence()
+    evidence = SensorEvidence.empty()
     evidence.born(sensor, np.atleast_1d(p), now)
     return evidence
 

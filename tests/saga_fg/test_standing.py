@@ -28,7 +28,7 @@ def beliefs(frames, settings=SETTINGS):
     tracker, found = Tracker(settings), []
     for f in frames:
         tracker.step(f)
-        (standing,) = (part for part in tracker.snapshot().own if isinstance(part, Standing))
+        standing = tracker.snapshot().tracks.tables.standing
         found.append(standing.belief.item())
     return found
 

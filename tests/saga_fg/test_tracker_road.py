@@ -73,7 +73,8 @@ def test_the_light_is_believed_by_noisy_reports():
     far = tracker.snapshot()
     tracker.tracks(63.0)
     assert tracker.roadside.belief("light")["red"] > 0.95
-    tracker.step(Frame(60.0, "camera", Detections.empty()))
+    for timestamp in (60.0, 60.1):
+        tracker.step(Frame(timestamp, "camera", Detections.empty()))
     assert tracker.roadside.belief("light")["red"] < 0.6
     tracker.restore(far)
     assert tracker.roadside.belief("light")["red"] > 0.95
@@ -112,8 +113,8 @@ def test_the_map_is_corrected_by_what_is_seen():
     frames = [replace(frame, road_map=wrong) for frame in queue_frames()]
     tracker = tracked(frames)
     light = tracker.roadside.id[tracker.roadside.label == "traffic_light"]
-    position, P = tracker._state.places(light, np.array(["traffic_light"]))
-    assert position[0, 1] + tracker._origin[1] == pytest.approx(0.0, abs=0.15)
+    position, P = tracker._tracks._state.places(light, np.array(["traffic_light"]))
+    assert position[0, 1] + tracker._tracks._origin[1] == pytest.approx(0.0, abs=0.15)
     assert P[0, 1, 1] < 0.1
 
 

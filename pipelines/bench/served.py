@@ -1,0 +1,55 @@
+"""A service in a process of its own, for benchmarks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections import deque
+
+from pipelines.serving import Address, parse_address
+from saga_fg.errors import SagaError
+
+COMMAND = (sys.executable, "-c", "from pipelines.cli.main import main; main()", "serve")
+
+
+class Served:
+    """Starts `saga-fg serve` with some options; `address` is where it listens. Raises `SagaError` if it does not."""
+
+    def __init__(self, *options: str) -> None:
+        self.process = subprocess.Popen([*COMMAND, *options], stderr=subprocess.PIPE, text=True)
+        self._said: deque[str] = deque(maxlen=20)
+        self.address = self._address()
+        self._listening = threading.Thread(target=self._listen, daemon=True)  # or it would wait with its warnings
+        self._listening.start()
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.process.kill()
+        self._gone()
+
+    def end(self) -> int:
+        """SIGTERM; the exit code."""
+        self.process.terminate()
+        return self._gone()
+
+    def _gone(self) -> int:
+        code = self.process.wait(60)
+        self._listening.join()
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+        return code
+
+    def _address(self) -> Address:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self._said.append(line.strip())
+            if line.startswith("listening at "):
+                return parse_address(line.strip().removeprefix("listening at "))
+        self.process.stderr.close()
+        self.process.wait()
+        raise SagaError(f"the service did not come up: {' '.join(self._said)}")
+
+    def _listen(self) -> None:
+        assert self.process.stderr is not None
+        self._said.extend(self.process.stderr)

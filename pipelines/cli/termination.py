@@ -1,0 +1,69 @@
+"""SIGTERM as an exception: `finally` blocks run, temporary files go, workers end, as they do after Ctrl-C.
+
+Unlike `KeyboardInterrupt`, which comes wherever it may, it waits while work is under way that is short and must not be
+cut in two: an import, which might swallow the exception or leave a module half made, the start of a process, and the
+moments when a temporary file or folder is made, moved into its place, or removed.
+"""
+
+from __future__ import annotations
+
+import signal
+import weakref
+from types import FrameType
+
+TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
+
+_AGAIN = 0.02  # s, until it is tried again
+_UNINTERRUPTED = frozenset(
+    {
+        "data_tools.atomic_files",
+        "importlib._bootstrap",
+        "multiprocessing.process",
+        "multiprocessing.util",
+        "pipelines.scale_out.folder",
+        "shutil",
+        __name__,
+        "tempfile",
+    }
+)
+
+
+class Terminated(BaseException):
+    """The process has been asked to end."""
+
+
+def raise_on_sigterm() -> None:
+    """From now on, SIGTERM raises `Terminated` in the main thread, which has to be the caller's.
+
+    Where that is swallowed, as in a finaliser, it is raised again.
+    """
+    raised: weakref.ref[Terminated] | None = None
+
+    def on_signal(_: int, frame: FrameType | None) -> None:
+        nonlocal raised
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+        on_its_way = raised is not None and raised() is not None
+        if not on_its_way and not _uninterrupted(frame):
+            error = Terminated()
+            raised = weakref.ref(error)
+            try:
+                raise error
+            finally:
+                del error  # which would keep itself alive, by its traceback
+
+    signal.signal(signal.SIGALRM, on_signal)
+    signal.signal(signal.SIGTERM, on_signal)
+
+
+def ignore_sigterm() -> None:
+    """From now on, SIGTERM has no effect: the process is about to end by itself."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(signal.SIGALRM, signal.SIG_IGN)
+
+
+def _uninterrupted(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_globals.get("__name__") in _UNINTERRUPTED:
+            return True
+        frame = frame.f_back
+    return False

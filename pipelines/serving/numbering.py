@@ -1,0 +1,105 @@
+"""The numbers of frames: which were taken in, which wait, and which are safe in a state file.
+
+A client may send a frame again whenever it is unsure; each is taken in once. Numbers of a sensor grow, with gaps where
+the client left some out. Frames that are held back for reordering may go in after higher numbers of their sensor; those
+below the last one that are still held are *open*: neither taken in nor to be forgotten.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any, Literal
+
+Known = Literal["taken", "unconfirmed"]
+
+
+class Numbering:
+    """Frame numbers by sensor, of at most `max_sensors`: one more, and the sensor silent for longest is forgotten.
+
+    last   the highest number that was taken in; the sensor silent for longest first
+    taken  how many numbered frames were taken in
+    """
+
+    def __init__(self, max_sensors: float = math.inf) -> None:
+        self._max_sensors = max_sensors
+        self.last: dict[str, int] = {}
+        self.taken: Counter[str] = Counter()
+        self._held: dict[str, set[int]] = {}
+        self._open: dict[str, set[int]] = {}  # of a restored state: held there, and not sent again so far
+        self._unconfirmed: dict[str, int] = {}  # the latest frame left out until the next one agrees
+
+    def known(self, sensor: str, number: int) -> Known | None:
+        """Whether this frame was judged before, None for a new one."""
+        if self._unconfirmed.get(sensor) == number:  # or it would bear witness to itself
+            return "unconfirmed"
+        if number in self._held.get(sensor, ()):
+            return "taken"
+        return "taken" if number <= self.last.get(sensor, -1) and number not in self._open.get(sensor, ()) else None
+
+    def hold(self, sensor: str, number: int) -> None:
+        """A frame waits for its turn."""
+        self._held.setdefault(sensor, set()).add(number)
+
+    def release(self, sensor: str, number: int) -> None:
+        """Its turn has come."""
+        held = self._held.get(sensor, set())
+        held.discard(number)
+        if not held:
+            self._held.pop(sensor, None)
+
+    def take(self, sensor: str, number: int) -> list[str]:
+        """A frame was taken in, or left out for good; the sensors that are forgotten for it."""
+        self.taken[sensor] += 1
+        still = self._open.get(sensor, set())
+        if number in still:
+            still.discard(number)
+        elif number > self.last.get(sensor, -1):  # the client goes on: what it has not sent again it won't
+            still.clear()
+        if not still:
+            self._open.pop(sensor, None)
+        self.last[sensor] = max(self.last.pop(sensor, -1), number)
+        forgotten = []
+        while len(self.last) > self._max_sensors:
+            forgotten.append(next(iter(self.last)))
+            self.forget(forgotten[-1])
+        return forgotten
+
+    def leave_out(self, sensor: str, number: int) -> None:
+        """A frame was left out unless the next one agrees."""
+        self._unconfirmed.pop(sensor, None)
+        self._unconfirmed[sensor] = number
+        if len(self._unconfirmed) > self._max_sensors:
+            del self._unconfirmed[next(iter(self._unconfirmed))]
+
+    def forget(self, sensor: str) -> None:
+        """A sensor begins anew, with any number."""
+        for numbers in (self.last, self.taken, self._held, self._open, self._unconfirmed):
+            numbers.pop(sensor, None)
+
+    def durable(self) -> dict[str, int]:
+        """By sensor, the number up to which all is settled: a client goes on after it from the present state."""
+        return {
+            sensor: min([last, *(n - 1 for n in self._held.get(sensor, set()) | self._open.get(sensor, set()))])
+            for sensor, last in self.last.items()
+        }
+
+    def state(self) -> dict[str, Any]:
+        """As plain values; frames that are held are open in it."""
+        unsettled = {
+            sensor: sorted(n for n in self._held.get(sensor, set()) | self._open.get(sensor, set()) if n < last)
+            for sensor, last in self.last.items()
+        }
+        return {
+            "last": dict(self.last),
+            "taken": dict(self.taken),
+            "open": {sensor: numbers for sensor, numbers in unsettled.items() if numbers},
+            "unconfirmed": dict(self._unconfirmed),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a state; nothing is held."""
+        self.last, self.taken = dict(state["last"]), Counter(state["taken"])
+        self._open = {sensor: set(numbers) for sensor, numbers in state["open"].items()}
+        self._unconfirmed = dict(state["unconfirmed"])
+        self._held = {}

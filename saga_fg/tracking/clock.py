@@ -1,0 +1,91 @@
+"""The clock of a tracker: which frames are in time, which come too late, and when the clock itself was set.
+
+One frame with a broken timestamp must not take the tracker to another century, from where all that follows would be
+late; and a clock that was set must not stop the tracking. With `apart` the time of a frame less the newest time:
+
+    -max_delay <= apart <= max_jump   accepted
+    |apart| > max_jump                unconfirmed: left out, until a second frame of about that time confirms it
+    else                              late: left out
+
+After a single frame nobody knows which of two times of a sensor is wrong, and the second is believed. A stream whose
+steps are longer than `max_jump` is known by two steps alike, and then has its own limit.
+
+A sensor whose own frames go back in time, `late_run` new ones in a row, has had its clock set back; the tracker
+follows. Frames of others that come late, in a burst after a stall for instance, and frames that are sent again say
+nothing of the clock. A sensor that was never in time, since its own clock is wrong, confirms a jump only by `late_run`
+frames in a row.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from saga_fg.tracking.settings import ClockSettings
+
+REMEMBERED = 200  # accepted frames, by which sensors are known and what is sent again
+
+TimeVerdict = Literal["accepted", "late", "unconfirmed", "set_ahead", "set_back"]
+"""About the time of a frame. A late or unconfirmed one was left out. With the others it was used, after the clock had
+been set to it where the verdict says so."""
+Stamp = tuple[str, float]
+"""Sensor and time of a frame, s."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The newest time, s, and what speaks for another one. A value: `judged` returns the clock after a frame.
+
+    newest       of the frames accepted, -inf before the first
+    accepted     the latest of them, since the clock was set
+    step         the latest step of a slow stream, 0 of others, s
+    doubtful     the latest frame that was left out, None if there is none since the latest accepted one
+    run          frames in a row that speak for the time of that one
+    """
+
+    newest: float = -math.inf
+    accepted: tuple[Stamp, ...] = ()
+    step: float = 0.0
+    doubtful: Stamp | None = None
+    run: int = 0
+
+    def judged(
+        self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float
+    ) -> tuple[TimeVerdict, Clock]:
+        """Judge a frame of `sensor` by its time, s; frames up to `max_delay` s old are used."""
+        apart, max_jump = timestamp - self.newest, max(settings.max_jump, 2 * self.step)
+        if -max_delay <= apart <= max_jump or self.newest == -math.inf:
+            return "accepted", self._with(timestamp, sensor, apart if settings.max_jump < apart < math.inf else 0.0)
+        far, stamp = abs(apart) > max_jump, (sensor, timestamp)
+        if stamp == self.doubtful or stamp in self.accepted:  # sent again: no second opinion
+            return "unconfirmed" if far else "late", self
+        own = [time for name, time in self.accepted if name == sensor]
+        before = self.run if self._doubts_far(max_jump) == far else 0
+        if far:
+            run = before + 1 if self._agrees(timestamp, max_jump) else 1
+            needed = settings.late_run if not own else 1 if len(self.accepted) == 1 else 2
+        else:
+            run = before + (bool(own) and timestamp < max(own))
+            needed = settings.late_run
+        if run < needed:
+            return "unconfirmed" if far else "late", replace(self, doubtful=stamp, run=run)
+        last = self.newest if self.doubtful is None else self.doubtful[1]
+        step = timestamp - last if timestamp - last > max_jump else 0.0
+        return "set_ahead" if apart > 0 else "set_back", Clock()._with(timestamp, sensor, step)
+
+    def _with(self, timestamp: float, sensor: str, step: float) -> Clock:
+        """After an accepted frame."""
+        accepted = (*self.accepted, (sensor, timestamp))[-REMEMBERED:]
+        return Clock(max(self.newest, timestamp), accepted, step)
+
+    def _doubts_far(self, max_jump: float) -> bool:
+        """Whether the doubtful frame is further away than `max_jump`."""
+        return self.doubtful is not None and abs(self.doubtful[1] - self.newest) > max_jump
+
+    def _agrees(self, timestamp: float, max_jump: float) -> bool:
+        """Whether a time fits the doubtful one: close to it, or the next of a slow stream, whose steps are alike."""
+        if self.doubtful is None or not self._doubts_far(max_jump):
+            return False
+        step = timestamp - self.doubtful[1]
+        return abs(step) <= max_jump or 0 < step <= 1.5 * (self.doubtful[1] - self.newest)

@@ -1,0 +1,156 @@
+"""Trees of values: what comes back is what was written, whatever it is, and nothing else is made."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.config import load_config
+from pipelines.serving.value_tree import TreeWriter, read_tree
+from saga_fg import Detection, Detections, Frame, InputError
+from saga_fg.node import ConstantVelocity
+from saga_fg.tracking.settings import TrackerSettings
+from saga_fg.tracking.traffic_flow import Expected
+
+
+def again(value: Any) -> Any:
+    tree = TreeWriter(value)
+    return read_tree(json.loads(json.dumps(tree.nodes)), bytes(tree.arrays))
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.lists(inner, max_size=3).map(tuple)
+        | st.dictionaries(st.text(max_size=3) | st.integers(), inner, max_size=3)
+    ),
+    max_leaves=20,
+)
+
+
+def same(a: Any, b: Any) -> bool:
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    return bool(a == b) and (not isinstance(a, float) or math.copysign(1, a) == math.copysign(1, b))
+
+
+@given(VALUES)
+def test_plain_values_come_back_with_their_types(value: Any):
+    assert same(again(value), value)
+
+
+def test_infinities_and_nan_come_back():
+    low, high, none = again((-math.inf, math.inf, math.nan))
+    assert (low, high) == (-math.inf, math.inf)
+    assert math.isnan(none)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).reshape(2, 3),
+        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        np.arange(24)[::3],
+        np.array(["car", "bücher"]),
+        np.empty((0, 3)),
+        np.empty(0, dtype="<U1"),
+        np.array([True, False]),
+        np.array(3.5),
+        np.array([np.nan, np.inf]),
+    ],
+)
+def test_arrays_come_back_with_type_shape_and_order(array: np.ndarray[Any, Any]):
+    back = again((1, array))[1]
+    np.testing.assert_array_equal(back, array)
+    assert (back.dtype, back.shape) == (array.dtype, array.shape)
+    assert back.flags.f_contiguous == np.ascontiguousarray(array).flags.f_contiguous or array.flags.f_contiguous
+    back[...] = back  # writeable, as it was
+    array.flags.writeable = False
+    assert not again(array).flags.writeable
+
+
+def test_what_is_shared_stays_shared():
+    shared = np.arange(3.0)
+    first, (second,), scalar = again([shared, [shared], np.float64(2.5)])
+    assert first is second
+    assert type(scalar) is np.float64
+
+
+def test_objects_are_made_again_by_their_constructors():
+    settings = TrackerSettings(estimator="fixed-lag")
+    assert again(settings.classes) == settings.classes
+    assert again(ConstantVelocity(3.0)) == ConstantVelocity(3.0)
+    expected = Expected(np.zeros(1), np.ones(1), np.ones(1))
+    assert type(again(expected)) is Expected
+    tree = TreeWriter(ConstantVelocity(3.0))
+    tree.nodes[0] = -1.0
+    with pytest.raises(InputError, match="acceleration_noise"):
+        read_tree(tree.nodes, b"")
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [],
+        [{"object": ["os", "system"], "parts": {}}],
+        [{"object": ["pathlib", "Path"], "parts": {}}],
+        [{"object": ["saga_fg.tracking.tracker", "np"], "parts": {}}],
+        [{"object": ["saga_fg.tracking.tracker", "InputError"], "parts": {}}],
+        [{"object": ["saga_fg.errors", "InputError"], "parts": {}}],
+        [{"object": ["saga_fg.frame", "Frame.__init__"], "parts": {}}],
+        [{"object": ["saga_fg.no_such_module", "Frame"], "parts": {}}],
+        [{"list": [0]}],
+        [1, {"list": [-1]}],
+        [{"pickle": "gASV"}],
+        [{"array": ["|O", [1], "C", True, 0]}],
+        [{"array": ["<f8", [1000000000], "C", True, 0]}],
+        [{"array": ["<f8", [-1], "C", True, 0]}],
+        [{"array": ["<f8", [1], "C", True, -8]}],
+    ],
+)
+def test_what_no_writer_writes_is_refused(nodes: list[Any]):
+    with pytest.raises(InputError):
+        read_tree(nodes, bytes(8))
+
+
+def test_what_cannot_be_written_is_refused():
+    circle: list[Any] = []
+    circle.append(circle)
+    for value in (circle, object(), Path("x"), np.array([None]), {1, 2}, lambda: 0):
+        with pytest.raises(InputError):
+            TreeWriter(value)
+
+
+def frame(k: int) -> Frame:
+    rng = np.random.default_rng(k)
+    places = np.array([[8.0 * k / 10 + 12 * i, 3.0 * i, 0.0] for i in range(4)]) + rng.normal(0, 0.2, (4, 3))
+    return Frame(k / 10, "lidar", Detections.of([Detection("car", (x, y, z)) for x, y, z in places.tolist()]))
+
+
+@pytest.mark.parametrize("method", ["saga", "kf"])
+@pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
+def test_a_tracker_goes_on_from_its_written_snapshot_to_the_last_bit(method: Any, estimator: Any):
+    config = load_config("file")
+    config = replace(config, tracker=replace(config.tracker, estimator=estimator))
+    first, second = config.new_tracker(method), config.new_tracker(method)
+    for k in range(12):
+        first.step(frame(k))
+    second.restore(again(first.snapshot()))
+    for k in range(12, 20):
+        one, other = first.step(frame(k)), second.step(frame(k))
+        np.testing.assert_array_equal(one.id, other.id)
+        np.testing.assert_array_equal(one.boxes.position, other.boxes.position)
+        np.testing.assert_array_equal(one.position_covariance, other.position_covariance)
