@@ -11,7 +11,8 @@ from __future__ import annotations
 import argparse
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 
 import gtsam
@@ -40,6 +41,12 @@ def best(run: Callable[[], object], repeats: int = 7) -> float:
         run()
         times.append(time.thread_time() - start)
     return min(times)
+
+
+def linearise_all(singles: Sequence[factors.Linearisable], values: gtsam.Values) -> None:
+    """One factor after the other."""
+    for factor in singles:
+        factor.linearise(values)
 
 
 def report(name: str, seconds: float, n: int, baseline: float) -> None:
@@ -98,13 +105,13 @@ def main() -> None:
         ),
     }
     for name, (singles, together) in pairs.items():
-        separate = best(lambda singles=singles: [factor.linearise(values) for factor in singles], 3)
+        separate = best(partial(linearise_all, singles, values), 3)
         report(f"{name}: linearise one by one", separate, n, separate)
-        report(f"{name}: together", best(lambda many=together: many.linearise(values)), n, separate)
+        report(f"{name}: together", best(partial(together.linearise, values)), n, separate)
 
     priors = factors.nonlinear_graph(factors.prior_factors(now, b, np.eye(4)), dims)
-    singles, together = ([group[k] for group in pairs.values()] for k in (0, 1))
-    ours = [factor for group in singles for factor in group]
+    ours = [factor for singles, _ in pairs.values() for factor in singles]
+    families = [family for _, family in pairs.values()]
     once = factors.SolverSettings("gauss-newton", max_iterations=3, tolerance=1e-300)
     custom = priors.clone()
     for factor in ours:
@@ -116,7 +123,7 @@ def main() -> None:
     theirs = best(lambda: gtsam.GaussNewtonOptimizer(custom, values, params).optimize(), 1)
     report("GTSAM's Gauss-Newton over CustomFactors, per iteration", theirs / 3, n, theirs / 3)
     report("solve, factors one by one", best(lambda: factors.solve(priors, ours, values, once), 1) / 3, n, theirs / 3)
-    report("solve, factors together", best(lambda: factors.solve(priors, together, values, once), 3) / 3, n, theirs / 3)
+    report("solve, factors together", best(lambda: factors.solve(priors, families, values, once), 3) / 3, n, theirs / 3)
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from benchmarks.heterogeneous import cars_alone
 from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import World, build_world
-from pipelines.bench.heterogeneous import cars_alone
 from pipelines.config import TrackConfig, load_config
 from saga_fg.arrays import FloatArray
 from saga_fg.boxes import Boxes

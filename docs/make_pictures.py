@@ -1,4 +1,4 @@
-"""Makes the pictures of the documentation: python docs/make_pictures.py (needs a Chromium for the page's)."""
+"""Makes the pictures of the documentation; needs a Chromium for the page: PYTHONPATH=. python docs/make_pictures.py."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
 
+from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
 from data_tools.simulator.scan_drive import SimulatedScans
-from pipelines.bench.scaling import ScalingSettings, bench_scaling, write_picture
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint

@@ -103,6 +103,9 @@ def main() -> int:
     beside = ROOT.parent / "shared" / "data"
     if "SAGA_FG_DATA" in environment or beside.is_dir():  # as an absolute path: examples run in other folders
         environment["SAGA_FG_DATA"] = str(Path(environment.get("SAGA_FG_DATA", beside)).resolve())
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [str(ROOT), *filter(None, [environment.get("PYTHONPATH")])]
+    )  # benchmarks
     wanted = (arguments.mark,) if arguments.mark else MARKS[:2]
     with ThreadPoolExecutor(arguments.jobs) as pool:
         results = pool.map(lambda page: run_page(page, wanted, environment, arguments.jobs > 1), arguments.pages)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 
 from pipelines.cli.termination import TERMINATED, Terminated, ignore_sigterm, raise_on_sigterm
 
 
 def main() -> None:
-    """Run the command, which ends in `SystemExit`; after SIGTERM, when all is tidied up, with exit code 143."""
+    """Run the command `saga-fg`."""
+    run("pipelines.cli.commands", "saga-fg")
+
+
+def run(module: str, name: str) -> None:
+    """Run the `app` of a module, which ends in `SystemExit`; after SIGTERM, when all is tidied up, with code 143."""
     raise_on_sigterm()
     try:
-        from pipelines.cli.commands import app
-
-        app(prog_name="saga-fg")
+        import_module(module).app(prog_name=name)
     except Terminated:
         pass  # and let go of its frames, so that contexts that were just being entered end as well
     finally:

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer import Typer
 from typer.testing import CliRunner
 
+from benchmarks.app import app as benchmarks
 from data_tools.metrics import ErrorSample, Interval, LabelErrors
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.bench import learned_folds
@@ -142,7 +144,11 @@ def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:
 
 
 def saga_fg(*arguments: str | Path) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return run(app, *arguments)
+
+
+def run(command: Typer, *arguments: str | Path) -> str:
+    result = CliRunner().invoke(command, [str(argument) for argument in arguments])
     assert result.exit_code == 0, result.output
     return result.stdout
 
@@ -172,7 +178,7 @@ def test_the_commands_on_recordings_in_the_nuscenes_layout(tmp_path: Path) -> No
 
     detections = root / "detections"
     files = ("--camera", detections / "camera.json", "--lidar", detections / "centerpoint_lidar.json")
-    printed = saga_fg("bench", "paper", "--dataroot", root, "--split", "lidar_centerpoint", *files, "--json", json_file)
+    printed = run(benchmarks, "paper", "--dataroot", root, "--split", "lidar_centerpoint", *files, "--json", json_file)
     figures = json.loads(json_file.read_text())
     assert set(figures["measured"]) == set(figures["paper"]) == {"camera", "lidar", "fusion"}
     assert figures["measured"]["fusion"]["saga"]["amota"] > 0.2

@@ -98,7 +98,6 @@ def test_verbose_adds_the_traceback(tmp_path: Path) -> None:
         ("explain", "in.csv", "--track", "9" * 5000),
         ("report", "file", "circle.csv", "-o", "page.html"),
         ("report", "file", "in.csv", "-o", "circle.csv"),
-        ("bench", "scaling", "--objects", "9" * 5000),
         ("simulate", "-o", "circle.csv", "--scenes", "1"),
         ("demo", "-o", "circle.csv", "--scenes", "1"),
     ],

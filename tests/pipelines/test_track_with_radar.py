@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.fusion import of_sensors
 from data_tools.detection_files import read_detections, read_tracks
 from data_tools.metrics import difference, paired_bootstrap, root_mean_square, scene_metrics
 from data_tools.simulator import SimulatorSettings, lidar, radar, simulate_scene
-from pipelines.bench.fusion import of_sensors
 from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import track_scene
