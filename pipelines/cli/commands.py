@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from typing import Annotated
 
 import typer
@@ -21,6 +20,7 @@ from pipelines.cli.slam import slam_app
 from pipelines.cli.smooth import smooth_app
 from pipelines.cli.track import track_app
 from pipelines.cli.view import view_app
+from saga_fg import __version__
 
 app = typer.Typer(
     cls=ReportingGroup,
@@ -48,7 +48,7 @@ app.command()(config)
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"saga-fg {version('saga-fg')}")
+        typer.echo(f"saga-fg {__version__}")
         raise typer.Exit
 
 
