@@ -2,40 +2,7 @@
 
 from importlib.metadata import version
 
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Annotations, Dataset, Scene
-from saga_fg.errors import InputError, MissingExtraError, SagaError, UnknownNodeError
-from saga_fg.frame import Detection, Detections, Frame
-from saga_fg.node import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
-from saga_fg.scene_graph import Edges, SceneGraph
-from saga_fg.sensor import Sensor
-from saga_fg.track import Track, Tracks
-from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
+import lazy_loader
 
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __version__ = version("saga-fg")
-
-__all__ = [
-    "Annotations",
-    "Boxes",
-    "ConstantAcceleration",
-    "ConstantVelocity",
-    "Dataset",
-    "Detection",
-    "Detections",
-    "Edges",
-    "Frame",
-    "GreedyTracker",
-    "InputError",
-    "MissingExtraError",
-    "NodeType",
-    "RandomWalk",
-    "SagaError",
-    "Scene",
-    "SceneGraph",
-    "Sensor",
-    "Track",
-    "Tracker",
-    "TrackerSettings",
-    "Tracks",
-    "UnknownNodeError",
-]

@@ -29,6 +29,11 @@ def test_importing_the_tracker_loads_nothing_heavy_either() -> None:
     assert not loaded_by("from saga_fg import *\nfrom saga_fg.tracking import Tracker") & HEAVY
 
 
+@pytest.mark.parametrize("module", ["saga_fg.errors", "pipelines.cli.commands"])
+def test_errors_and_the_help_of_the_command_answer_before_numpy_is_there(module: str) -> None:
+    assert not loaded_by(f"import {module}") & {"numpy", "scipy", "gtsam"}
+
+
 def test_imports_run_one_way() -> None:
     """pipelines -> data_tools -> saga_fg -> factors, as the contract in pyproject.toml says."""
     pytest.importorskip("importlinter", reason="import-linter comes with the extra dev")

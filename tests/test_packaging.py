@@ -41,7 +41,7 @@ def test_the_wheel_holds_exactly_the_four_packages(wheel: zipfile.ZipFile) -> No
 
 def test_the_wheel_holds_every_source_file_and_only_those(wheel: zipfile.ZipFile) -> None:
     inside = {name for name in wheel.namelist() if ".dist-info/" not in name}
-    suffixes = {".py", ".yaml", ".html", ".css", ".js", ".typed"}
+    suffixes = {".py", ".pyi", ".yaml", ".html", ".css", ".js", ".typed"}
     expected = {
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES

@@ -24,11 +24,11 @@ from pipelines.cli.options import (
 from pipelines.cli.reporting import ReportingGroup, progress_bar, working
 from pipelines.cli.tables import JsonFile, show_tables
 from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, LagOption, MethodOption, configured
-from pipelines.figures import FigureTable
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.evaluation import KittiEvaluation, NuScenesEvaluation
+    from pipelines.figures import FigureTable
     from saga_fg.arrays import FloatArray
 
 evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipelines.cli.options import sensor_files
 from saga_fg.errors import InputError
 
@@ -42,6 +40,8 @@ def labelled_recordings(
 
     Raises `InputError` unless exactly one kind of recordings is named, and for a result without a table.
     """
+    import numpy as np
+
     from data_tools.label_files import read_label_table
 
     given = [value is not None for value in (nuscenes, kitti, file, seed)]

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import functools
 import logging
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
-from factors import FactorError
-from pipelines.tracking import Progress as ProgressCallback
 from saga_fg.errors import SagaError
+
+if TYPE_CHECKING:
+    from pipelines.tracking import Progress as ProgressCallback
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +34,12 @@ def error_console() -> Console:
     return Console(stderr=True)
 
 
+def _factor_error() -> type[Exception]:
+    """What factors raise; where none were imported, none can have been raised."""
+    raised: type[Exception] = getattr(sys.modules.get("factors.errors"), "FactorError", SagaError)
+    return raised
+
+
 class ReportingGroup(TyperGroup):
     """Turns what a command raises into a line on stderr and an exit code."""
 
@@ -39,7 +47,7 @@ class ReportingGroup(TyperGroup):
         """Run the command."""
         try:
             return super().invoke(ctx)
-        except (SagaError, FactorError) as error:
+        except (SagaError, _factor_error()) as error:
             log.debug("where the error was found", exc_info=error)
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(INPUT_ERROR) from error

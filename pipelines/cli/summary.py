@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
-from pipelines.config import TrackConfig
-from pipelines.configuration import write_settings
-from pipelines.report.run_record import RunRecord, write_run_record
-from pipelines.tracking import TrackedScene
+if TYPE_CHECKING:
+    from pipelines.config import TrackConfig
+    from pipelines.tracking import TrackedScene
 
 
 @dataclass
@@ -39,6 +39,9 @@ class Summary:
 
     def write_record(self, method: str, settings: TrackConfig) -> None:
         """Write the record of the run beside its result, for reports."""
+        from pipelines.configuration import write_settings
+        from pipelines.report.run_record import RunRecord, write_run_record
+
         rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
         write_run_record(self.output, RunRecord(method, write_settings(settings, comments=False), rounded))
 

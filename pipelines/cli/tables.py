@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.figures import FigureTable
+if TYPE_CHECKING:
+    from pipelines.figures import FigureTable
 
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
 

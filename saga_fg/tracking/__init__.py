@@ -1,39 +1,5 @@
 """Trackers: frames of detections in, tracks out."""
 
-from saga_fg.tracking.clock import TimeVerdict
-from saga_fg.tracking.greedy import GreedyTracker
-from saga_fg.tracking.journal import Journal
-from saga_fg.tracking.observer import Observer, Stage, TrackerView
-from saga_fg.tracking.settings import (
-    AssociationName,
-    AssociationSettings,
-    ClassSettings,
-    ClockSettings,
-    EstimatorName,
-    ExistenceSettings,
-    FlowSettings,
-    GreedySettings,
-    StandingSettings,
-    TrackerSettings,
-)
-from saga_fg.tracking.tracker import Tracker
+import lazy_loader
 
-__all__ = [
-    "AssociationName",
-    "AssociationSettings",
-    "ClassSettings",
-    "ClockSettings",
-    "EstimatorName",
-    "ExistenceSettings",
-    "FlowSettings",
-    "GreedySettings",
-    "GreedyTracker",
-    "Journal",
-    "Observer",
-    "Stage",
-    "StandingSettings",
-    "TimeVerdict",
-    "Tracker",
-    "TrackerSettings",
-    "TrackerView",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

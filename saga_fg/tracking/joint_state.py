@@ -20,7 +20,7 @@ from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.scene_graph import SceneGraph
-from saga_fg.tracking.settings import EstimatorName
+from saga_fg.tracking.names import EstimatorName
 
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 

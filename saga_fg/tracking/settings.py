@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import get_args
 
 from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
@@ -19,9 +19,7 @@ from saga_fg.road.lane_keeping import InLane
 from saga_fg.road.stopping import RedLight
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 from saga_fg.stability import require_stable
-
-EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
-AssociationName = Literal["hungarian", "greedy", "graph"]
+from saga_fg.tracking.names import AssociationName, EstimatorName
 
 
 @dataclass(frozen=True)
