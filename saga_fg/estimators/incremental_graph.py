@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -67,18 +67,28 @@ class IncrementalSmoother:
 
     def step(self, time: float, providers: Sequence[FactorProvider] | None = None) -> None:
         """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve."""
-        unchanged = self._graph
-        graph = unchanged.copy()
-        graph.advance(time)
-        self._asked(graph, self.providers if providers is None else providers)
-        times = [*self._times, graph.time]
-        first = 0 if self._lag is None else sum(t <= time - self._lag for t in times[1:])
+        unchanged, times = self._graph, self._times
+        self.begin(time, self.providers if providers is None else providers)
         try:
-            self.marginalise(graph.older_than(times[first]))
+            self.forget()
         except GraphError:
-            self._graph, self._engine = unchanged, None
+            self._graph, self._times, self._engine = unchanged, times, None
             raise
-        self._times = times[first:]
+
+    def begin(self, time: float, providers: Sequence[FactorProvider]) -> None:
+        """The same, but keep all that is older than the lag."""
+        graph = self._graph.copy()
+        graph.advance(time)
+        self._asked(graph, providers)
+        self._times = [*self._times, graph.time]
+
+    def forget(self, kept: Collection[int] = ()) -> None:
+        """Marginalise what is older than the lag, but for the variables `kept`."""
+        if self._lag is None:
+            return
+        first = sum(t <= self.time - self._lag for t in self._times[1:])
+        self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
+        self._times = self._times[first:]
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch, and solve again."""
