@@ -1,51 +1,68 @@
 """The tracker's filter as a running graph, in which factors of users' own take part.
 
-The calls of an estimator become providers of an `IncrementalSmoother` of lag 0: what is added is a birth, a prediction
-an epoch with its interaction factors, an update detections. Between them users' providers are asked.
+The calls of an estimator become providers of an `IncrementalSmoother`: what is added is a birth, a prediction an epoch
+with its interaction factors, an update detections. Between them users' providers are asked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.correction import innovation_likelihood
+from saga_fg.estimators.graph_moments import condense, in_moments, stays
 from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.partition import Partition
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.sighting import Sighting
+from saga_fg.estimators.smoothed import Newest
 from saga_fg.graph.keys import node_key
 from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 
+@dataclass(frozen=True, eq=False)
+class GraphState:
+    """The filter as a value: the graph; its nodes, in order; their variables, by id; variables beside them that stay
+    until providers are asked again."""
+
+    graph: SceneFactorGraph
+    layout: Layout
+    keys: Mapping[int, int]
+    beside: tuple[int, ...]
+
+
 class GraphFilter:
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
-    lag        s; how long epochs stay in the graph, at least until they have been asked once at the next one
+    lag        s; how long epochs stay in the graph, at least until providers have been asked at the next one
 
-    What is told and reported is the newest state, at any lag.
+    What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
+    stands still; where noise is so small that factors would lose digits, it is predicted in moments.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
         self.providers, self._lag = tuple(providers), lag
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
-        self._beside: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._layout = Layout()
+        self._keys: Mapping[int, int] = {}
+        self._beside: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._posterior: BlockGaussian | None = None  # until the graph changes
 
     def __copy__(self) -> GraphFilter:
         twin = GraphFilter(self.providers, self._lag)
-        twin._smoother, twin._layout, twin._posterior = self._smoother.handed_over(), self._layout, self._posterior
-        twin._beside = self._beside
+        twin.__dict__ |= self.__dict__
+        twin._smoother = self._smoother.handed_over()
         return twin
 
     @property
@@ -61,8 +78,8 @@ class GraphFilter:
         self._smoother.origin = origin
         smoother = self._changed()
         smoother.extend(self.providers)
-        smoother.forget()
-        graph, nodes = smoother.graph(), set(self._keys(self.nodes))
+        smoother.forget(self._keys.values())
+        graph, nodes = smoother.graph(), set(self._keys.values())
         self._beside = tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
 
     def add(
@@ -72,76 +89,109 @@ class GraphFilter:
         layout = self._layout.extended(nodes, mean.shape[1])
         added = layout.nodes[len(self._layout) :]
         smoother = self._changed()
-        smoother.marginalise(key for key in self._keys_of(added) if key in smoother.graph().variables)  # gone and back
+        keys = {node: node_key(node, smoother.graph().epoch) for node in added.tolist()}
+        back = [key for key in keys.values() if key in smoother.graph().variables]
+        if back:  # gone and back at the same epoch: iSAM2 has to forget them first
+            smoother.marginalise(back)
+            smoother.extend([])
         smoother.extend([Births(added, mean, covariance, labels or {})])
-        self._layout, self._posterior = layout, None
+        self._layout, self._keys = layout, {**self._keys, **keys}
 
     def predict(self, transition: Transition) -> None:
-        Dynamics.of(transition, self._layout)  # or an error
+        require_kind("transition", transition, Transition)
+        motion = Motion(transition)
+        motion.check(self._layout)
+        still = stays(transition)
+        if transition.dt == 0 and still.all():
+            return
+        x = self.posterior()
+        others = np.arange(len(self._layout), len(x.layout))
+        dynamics = motion.dynamics(self._layout, x.mean[: self._layout.size]).beside(x.layout, others)
+        kept = np.isin(x.layout.nodes, transition.nodes[~still], invert=True)
+        moments = in_moments(x, dynamics, kept)
+        standing, epoch = set(transition.nodes[still].tolist()), self._smoother.graph().epoch + 1
+        keys = {n: key if n in standing else node_key(n, epoch) for n, key in self._keys.items()}
+        earlier, now = ({**{key: key for key in x.layout.nodes[others].tolist()}, **k} for k in (self._keys, keys))
+        unused = still | np.isin(transition.nodes, moments.layout.nodes)
         smoother = self._changed()
-        smoother.forget(self._beside)
-        smoother.begin(self.time + transition.dt, [Interactions(transition)])
+        smoother.forget({*self._keys.values(), *self._beside})
+        smoother.begin(
+            self.time + transition.dt,
+            [Interactions(_with_noise(transition, unused), self._keys, standing)],
+            [self._keys[node] for node in standing],
+            lambda graph: condense(graph, moments, earlier, now),
+        )
+        self._keys = keys
 
-    def update(self, measurements: Measurements) -> None:
+    def update(self, measurements: Measurements) -> float:
         require_kind("measurements", measurements, Measurements)
-        if len(measurements):
-            self._layout.rows(measurements.nodes)
-            self._changed().extend([LinearDetections(measurements)])
+        sighting = Sighting(measurements)
+        sighting.check(self._layout)
+        if len(measurements) == 0:
+            return 0.0
+        x = self.posterior()
+        likelihood = innovation_likelihood(x, *sighting.linearised(x.layout, x.mean))
+        self._changed().extend([LinearDetections(measurements, self._keys)])
+        return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Nodes that disappear have no state at the next epoch; what they told of their neighbours stays."""
         self._layout = self._layout.without(self._layout.rows(nodes))
+        self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
         self._posterior = None
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
-        keys = self._keys(nodes)
-        return np.stack([self._state(key) for key in keys]) if keys else np.empty((0, 0))
+        return self._newest().mean(nodes)
 
     def covariance(self, nodes: ArrayLike) -> FloatArray:
-        rows = self._layout.rows(nodes)
-        self._layout.spans(rows)
-        return self.posterior().covariances(rows)
+        return self._newest().covariance(nodes)
 
     def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return np.concatenate([np.empty(0), *(self._state(key) for key in self._keys(nodes))])
+        return self._newest().joint_mean(nodes)
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self.posterior().joint(self._layout.rows(nodes))
+        return self._newest().joint_covariance(nodes)
 
     def posterior(self) -> BlockGaussian:
-        """The joint Gaussian of all nodes, as one component: all together cost little more than one alone."""
+        """The joint Gaussian of all nodes, then of other variables that are of now, by increments from the base."""
         if self._posterior is None:
-            nodes = self._layout.nodes
-            partition = Partition(self._layout, np.zeros(len(nodes), dtype=np.int64))
-            blocks = (self._smoother.joint_covariance(self._keys(nodes))[None],) if len(nodes) else ()
-            self._posterior = BlockGaussian(partition, self.joint_mean(nodes), blocks)
+            every = self._smoother.graph().variables
+            others = [key for key, one in every.items() if one.epoch is None or key in self._beside]
+            layout = self._layout
+            for key in others:
+                layout = layout.extended([key], every[key].dim)
+            keys = [*(self._keys[node] for node in self._layout.nodes.tolist()), *others]
+            self._posterior = self._smoother.joint_gaussian(layout, keys)
         return self._posterior
 
     def graph(self) -> SceneFactorGraph:
         """The running graph itself."""
         return self._smoother.graph()
 
-    def snapshot(self) -> tuple[SceneFactorGraph, Layout]:
-        """The graph and its nodes as values, which can be pickled."""
-        return self._smoother.snapshot(), self._layout
+    def snapshot(self) -> GraphState:
+        """The whole state as a value. iSAM2 begins anew from it, so that both go on to the same bits."""
+        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._beside)
+        self.restore(state)
+        return state
 
-    def restore(self, state: tuple[SceneFactorGraph, Layout]) -> None:
+    def restore(self, state: GraphState) -> None:
         """Continue from a snapshot."""
-        require_kind("state", state, tuple)
-        graph, self._layout = state
-        self._changed().restore(graph)
+        require_kind("state", state, GraphState)
+        self._changed().restore(state.graph)
+        self._layout, self._keys, self._beside = state.layout, state.keys, state.beside
+
+    def _newest(self) -> Newest:
+        return Newest(self._layout, self.posterior())
 
     def _changed(self) -> IncrementalSmoother:
         self._posterior = None
         return self._smoother
 
-    def _keys(self, nodes: ArrayLike) -> list[int]:
-        self._layout.rows(nodes)
-        return self._keys_of(nodes)
 
-    def _keys_of(self, nodes: ArrayLike) -> list[int]:
-        epoch = self._smoother.graph().epoch
-        return [node_key(node, epoch) for node in np.asarray(nodes).tolist()]
-
-    def _state(self, key: int) -> FloatArray:
-        return np.asarray(self._smoother.state(key))
+def _with_noise(transition: Transition, rows: BoolArray) -> Transition:
+    """The same with noise of variance 1 for some nodes (n,), so that there are factors of it, which are not used."""
+    Q = [
+        replace(group, values=np.where(rows[group.target][:, None, None], np.eye(group.values.shape[1]), group.values))
+        for group in transition.Q
+    ]
+    return replace(transition, Q=tuple(Q))

@@ -78,7 +78,7 @@ class JointKalmanFilter:
         self._state, self._beside = asked(self._state, self._beside, self.providers, self._time, origin)
 
     def predict(self, transition: Transition) -> None:
-        dynamics = self._beside.dynamics(transition, self._state.layout)
+        dynamics = self._beside.dynamics(transition, self._state)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
         self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         self._predictions += 1
