@@ -6,7 +6,7 @@ with its interaction factors, an update detections. Between them users' provider
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
-from saga_fg.estimators.graph_moments import condense, in_moments, stays
+from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.graph_moments import condense, in_moments, lossy, stays
 from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
@@ -105,22 +106,16 @@ class GraphFilter:
         if transition.dt == 0 and still.all():
             return
         x = self.posterior()
-        others = np.arange(len(self._layout), len(x.layout))
-        dynamics = motion.dynamics(self._layout, x.mean[: self._layout.size]).beside(x.layout, others)
-        kept = np.isin(x.layout.nodes, transition.nodes[~still], invert=True)
-        moments = in_moments(x, dynamics, kept)
+        dynamics = motion.dynamics(self._layout, x.mean)
         standing, epoch = set(transition.nodes[still].tolist()), self._smoother.graph().epoch + 1
         keys = {n: key if n in standing else node_key(n, epoch) for n, key in self._keys.items()}
-        earlier, now = ({**{key: key for key in x.layout.nodes[others].tolist()}, **k} for k in (self._keys, keys))
-        unused = still | np.isin(transition.nodes, moments.layout.nodes)
+        chosen = lossy(x, dynamics, np.isin(x.layout.nodes, transition.nodes[still]))
+        unused = still | np.isin(transition.nodes, x.layout.nodes[chosen])
+        change = self._in_moments(dynamics, chosen, keys) if chosen.any() else None
         smoother = self._changed()
         smoother.forget({*self._keys.values(), *self._beside})
-        smoother.begin(
-            self.time + transition.dt,
-            [Interactions(_with_noise(transition, unused), self._keys, standing)],
-            [self._keys[node] for node in standing],
-            lambda graph: condense(graph, moments, earlier, now),
-        )
+        moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, standing)
+        smoother.begin(self.time + transition.dt, [moved], [self._keys[node] for node in standing], change)
         self._keys = keys
 
     def update(self, measurements: Measurements) -> float:
@@ -153,15 +148,9 @@ class GraphFilter:
         return self._newest().joint_covariance(nodes)
 
     def posterior(self) -> BlockGaussian:
-        """The joint Gaussian of all nodes, then of other variables that are of now, by increments from the base."""
+        """The joint Gaussian of all nodes."""
         if self._posterior is None:
-            every = self._smoother.graph().variables
-            others = [key for key, one in every.items() if one.epoch is None or key in self._beside]
-            layout = self._layout
-            for key in others:
-                layout = layout.extended([key], every[key].dim)
-            keys = [*(self._keys[node] for node in self._layout.nodes.tolist()), *others]
-            self._posterior = self._smoother.joint_gaussian(layout, keys)
+            self._posterior = self._joint()
         return self._posterior
 
     def graph(self) -> SceneFactorGraph:
@@ -179,6 +168,26 @@ class GraphFilter:
         require_kind("state", state, GraphState)
         self._changed().restore(state.graph)
         self._layout, self._keys, self._beside = state.layout, state.keys, state.beside
+
+    def _in_moments(
+        self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
+    ) -> Callable[[SceneFactorGraph], None]:
+        """What is to be done to the graph to move the components of the `chosen` nodes (n,) in moments."""
+        every = self._smoother.graph().variables
+        beside = {key: key for key, one in every.items() if one.epoch is None or key in self._beside}
+        x = self._joint(beside)
+        others = np.arange(len(self._layout), len(x.layout))
+        moved = in_moments(x, dynamics.beside(x.layout, others), chosen)
+        earlier, now = ({**beside, **nodes} for nodes in (self._keys, keys))
+        return lambda graph: condense(graph, moved, earlier, now)
+
+    def _joint(self, beside: Iterable[int] = ()) -> BlockGaussian:
+        """The joint Gaussian of all nodes, then of other variables, by increments from the base."""
+        layout, every = self._layout, self._smoother.graph().variables
+        for key in beside:
+            layout = layout.extended([key], every[key].dim)
+        keys = {**dict.fromkeys(beside), **self._keys}
+        return self._smoother.joint_gaussian(layout, [keys[node] or node for node in layout.nodes.tolist()])
 
     def _newest(self) -> Newest:
         return Newest(self._layout, self.posterior())

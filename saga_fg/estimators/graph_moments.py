@@ -87,13 +87,19 @@ def stays(transition: Transition) -> BoolArray:
     return same & ~told
 
 
-def in_moments(x: BlockGaussian, dynamics: Dynamics, still: BoolArray) -> BlockGaussian:
-    """The prediction of those components of which factors would lose digits; still (n,): what keeps its variable."""
+def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray) -> BoolArray:
+    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable."""
     prediction = Prediction.of(x, dynamics)
     label = prediction.components.label
     wide = np.bincount(label, weights=x.layout.dims)[label] > _SMALL
-    lossy = np.isin(label, label[(prediction.ratio > np.where(wide, *_LIMITS[::-1])) & ~still])
-    return predict(x.without(np.flatnonzero(~lossy)), dynamics.restricted(np.flatnonzero(lossy)))
+    return np.isin(label, label[(prediction.ratio > np.where(wide, *_LIMITS[::-1])) & ~still])
+
+
+def in_moments(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:
+    """The prediction of those components of `x` that have one of the first nodes, which are `chosen` (n,)."""
+    label = dynamics.joined(x.partition).label
+    mine = np.isin(label, label[: len(chosen)][chosen])
+    return predict(x.without(np.flatnonzero(~mine)), dynamics.restricted(np.flatnonzero(mine)))
 
 
 def condense(graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, int], now: Mapping[int, int]) -> None:
