@@ -102,15 +102,15 @@ class GraphFilter:
         require_kind("transition", transition, Transition)
         motion = Motion(transition)
         motion.check(self._layout)
-        still = stays(transition)
+        x, nodes = self.posterior(), self._layout.nodes
+        dynamics = motion.dynamics(self._layout, x.mean)
+        still = stays(dynamics)
         if transition.dt == 0 and still.all():
             return
-        x = self.posterior()
-        dynamics = motion.dynamics(self._layout, x.mean)
-        standing, epoch = set(transition.nodes[still].tolist()), self._smoother.graph().epoch + 1
+        standing, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
         keys = {n: key if n in standing else node_key(n, epoch) for n, key in self._keys.items()}
-        chosen = lossy(x, dynamics, np.isin(x.layout.nodes, transition.nodes[still]))
-        unused = still | np.isin(transition.nodes, x.layout.nodes[chosen])
+        chosen = lossy(x, dynamics, still)
+        unused = np.isin(transition.nodes, nodes[still | chosen])
         change = self._in_moments(dynamics, chosen, keys) if chosen.any() else None
         smoother = self._changed()
         smoother.forget({*self._keys.values(), *self._beside})

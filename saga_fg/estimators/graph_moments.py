@@ -24,7 +24,6 @@ from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
 
 _SMALL = 64  # size of the largest component for which the first limit holds, since it is eliminated by QR
 _LIMITS = 1e11, 1e6  # variance predicted over process noise, up to which factors keep enough digits
@@ -73,17 +72,17 @@ def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
     return dict(zip(row, connected_components(matrix, directed=False)[1].tolist(), strict=True))
 
 
-def stays(transition: Transition) -> BoolArray:
-    """(n,) whether nodes of a transition stay as they are: x' = x, without noise, whatever the others do."""
-    n = len(transition.nodes)
+def stays(dynamics: Dynamics) -> BoolArray:
+    """(n,) whether nodes stay as they are: x' = x, without noise, whatever the others do."""
+    n = len(dynamics.layout)
     same, told = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    for F in transition.F:
+    for F in dynamics.F:
         own = F.target == F.source
         same[F.target[own & (F.values == np.eye(*F.values.shape[1:])).all(axis=(1, 2))]] = True
         told[F.target[~own & F.values.any(axis=(1, 2))]] = True
-    for Q in transition.Q:
+    for Q in dynamics.Q:
         told[Q.target[Q.values.any(axis=(1, 2))]] = True
-    told[np.repeat(np.arange(n), transition.graph.dims)[transition.b != 0]] = True
+    told[np.repeat(np.arange(n), dynamics.layout.dims)[dynamics.b != 0]] = True
     return same & ~told
 
 
