@@ -7,7 +7,7 @@ detection    || z - H x_i ||_R                           `LinearDetections`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +18,7 @@ from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.graph.keys import OBJECT
+from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.transition import Transition
@@ -36,19 +36,26 @@ class Births:
 
     def factors(self, view: GraphView) -> Additions:
         ids = np.asarray(self.nodes).tolist()
-        born = [
-            NewVariable(OBJECT, i, mean, label=self.labels.get(i, "")) for i, mean in zip(ids, self.means, strict=True)
-        ]
         if not ids:
             return Additions()
-        return Additions(born, prior_factors([view.key(OBJECT, i) for i in ids], self.means, self.covariances))
+        born = [
+            NewVariable(*node_kind(i), mean, label=self.labels.get(i, ""))
+            for i, mean in zip(ids, self.means, strict=True)
+        ]
+        return Additions(born, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
 
 
 @dataclass(frozen=True, eq=False)
 class Interactions:
-    """Objects of the epoch before move by a transition over those that stay; nonlinear motion goes beside it."""
+    """Objects move by a transition over those that stay.
+
+    earlier    by id, the keys of their variables, by default those of the epoch before
+    standing   ids of those whose variables stay as they are
+    """
 
     transition: Transition
+    earlier: Mapping[int, int] | None = None
+    standing: Collection[int] = ()
     name: str = "interactions"
 
     def factors(self, view: GraphView) -> Additions:
@@ -56,25 +63,34 @@ class Interactions:
         nodes = transition.nodes.tolist()
         if not nodes:
             return Additions()
-        before = view.before(OBJECT)
+        earlier = self.earlier or {node: node_key(node, view.epoch - 1) for node in nodes}
+        now = {node: node_key(node, view.epoch) for node in nodes}
         layout = Layout(nodes, transition.graph.dims)
-        mean = np.concatenate([view.state(before[node].key) for node in nodes])
-        moved = transition.F_matrix @ mean + transition.b
+        mean = np.concatenate([view.state(earlier[node]) for node in nodes])
+        motion = Motion(transition)
+        dynamics = motion.dynamics(layout, mean)
+        moved = dynamics.moved(mean) + dynamics.b
         states = np.split(moved, transition.offsets[1:-1])
-        new = [NewVariable(OBJECT, n, x, label=before[n].label) for n, x in zip(nodes, states, strict=True)]
-        now = {node: view.key(OBJECT, node) for node in nodes}
-        earlier = {node: before[node].key for node in nodes}
-        return Additions(new, motion_factors(Motion(transition), layout, mean, earlier, now)[0])
+        new = [
+            NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
+            for n, x in zip(nodes, states, strict=True)
+            if n not in self.standing
+        ]
+        native, nonlinear = motion_factors(motion, layout, mean, dict(earlier), now)
+        still = {now[node] for node in self.standing}
+        return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
 
 
 @dataclass(frozen=True, eq=False)
 class LinearDetections:
-    """Linear measurements of objects at this epoch."""
+    """Linear measurements of objects; keys: of their variables by id, by default those of this epoch."""
 
     measurements: Measurements
+    keys: Mapping[int, int] | None = None
     name: str = "detections"
 
     def factors(self, view: GraphView) -> Additions:
         m = self.measurements
-        keys = np.array([[view.key(OBJECT, node)] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
+        now = self.keys or {node: node_key(node, view.epoch) for node in m.nodes.tolist()}
+        keys = np.array([[now[node]] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
         return Additions(factors=gaussian_factors(keys, [m.H], m.z, m.R))

@@ -38,12 +38,12 @@ TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | Grap
 
 
 def new_estimator(name: EstimatorName, lag: float, providers: Sequence[FactorProvider] = ()) -> TrackEstimator:
-    """A fresh estimator; `lag` (s) is the fixed-lag smoother's; with `providers` it is a running graph, by iSAM2."""
+    """A fresh estimator; `lag` (s) is the fixed-lag smoother's; with `providers`, iSAM2 and it are a running graph."""
+    if name == "kalman":
+        return JointKalmanFilter(providers)
     if providers:
-        return GraphFilter(providers)
-    if name == "isam2":
-        return IncrementalFilter()
-    return FixedLagSmoother(lag) if name == "fixed-lag" else JointKalmanFilter()
+        return GraphFilter(providers, lag if name == "fixed-lag" else 0.0)
+    return FixedLagSmoother(lag) if name == "fixed-lag" else IncrementalFilter()
 
 
 class JointTrackState:
@@ -83,7 +83,7 @@ class JointTrackState:
                 F, Q = _own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
             estimator = self._changed()
-            if isinstance(estimator, GraphFilter):
+            if isinstance(estimator, GraphFilter | JointKalmanFilter):
                 estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
             else:
                 estimator.add(ids[rows], mean, P)
@@ -157,8 +157,9 @@ class JointTrackState:
 
     def ask_providers(self, origin: FloatArray) -> None:
         """Let users' providers add their factors; positions are from `origin` (2,)."""
-        if isinstance(self._estimator, GraphFilter):
-            self._estimator.ask(origin)
+        estimator = self._estimator
+        if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
+            estimator.ask(origin)
             self._changed()
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:

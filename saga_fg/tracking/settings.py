@@ -185,9 +185,11 @@ class TrackerSettings:
     estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
     providers: tuple[str, ...] = setting(
         (),
-        "factor providers of your own as MODULE:NAME, imported when a tracker is made; with estimator: isam2",
+        "factor providers of your own as MODULE:NAME, imported when a tracker is made",
     )
-    lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
+    lag: float = setting(
+        2.0, "window of the fixed-lag estimator, s; without providers, frames this late are put where they belong"
+    )
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     flow: FlowSettings = settings_group(FlowSettings, "the speed of new tracks from traffic around them")
