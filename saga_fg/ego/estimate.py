@@ -10,11 +10,12 @@ import numpy as np
 
 from factors import Solution
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.ego.graph import Keyed, error_key, object_key, pose_key
+from saga_fg.ego.graph import Keyed, error_key, object_key
 from saga_fg.ego.record import EgoMoment
 from saga_fg.ego.standing import SlowErrors
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.interactions import POSITION, VELOCITY
+from saga_fg.landmarks import pose_key
 
 
 @dataclass(frozen=True, eq=False)
