@@ -36,6 +36,7 @@ from saga_fg.geometry import inverse_transform
 from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
 from saga_fg.landmarks import (
     Landmark,
+    LandmarkDetector,
     LandmarkMapper,
     MapperSettings,
     MeasuredMotion,
@@ -121,9 +122,11 @@ def lidar_slam(
     settings: LidarSlamSettings | None = None,
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
+    detectors: Sequence[LandmarkDetector] = (),
 ) -> LidarSlam:
     """Estimate everything from K >= 2 scans. The only pose of the recording that counts is the first, unless the source
-    is "oxts". providers: of other factors for the graph of all keyframes, one an epoch.
+    is "oxts". providers: of other factors for the graph of all keyframes, one an epoch; detectors: of other landmarks
+    in the points of keyframes.
     """
     s = settings or LidarSlamSettings()
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
@@ -138,7 +141,7 @@ def lidar_slam(
         if k:
             mapper.move(*motions[k - 1])
         if s.landmarks:
-            seen.append(landmarks_seen(points, s.sightings))
+            seen.append(landmarks_seen(points, s.sightings, detectors))
             mapper.observe([each.observation for each in seen[-1]])
         online.append(mapper.pose)
         if progress is not None:
@@ -152,7 +155,8 @@ def lidar_slam(
     graph = SceneFactorGraph()
     for k, (time, place) in enumerate(zip(scans.timestamps[drive.keyframes], landmark_map.world_T_pose, strict=True)):
         graph.advance(time)
-        ask_all([MeasuredMotion(*(motions[k - 1] if k else (place, _START)), place), *known, *providers], graph)
+        motion, covariance = motions[k - 1] if k else (place, _START)
+        ask_all([MeasuredMotion(motion, covariance, place), *known, *providers], graph)
     solution = graph.solve()
     world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
     return LidarSlam(
@@ -211,7 +215,7 @@ def updated(landmarks: Iterable[Landmark], solution: Solution | GraphSolution) -
     found = []
     for mark in landmarks:
         key = landmark_key(mark.number)
-        state, covariance = mark.kind.variable.read(solution.values, key), solution.covariance([key])
+        state, covariance = mark.kind.variable.read(solution.values, key), solution.marginal(key)
         found.append(replace(mark, state=state, covariance=covariance))
     return found
 

@@ -8,6 +8,7 @@ anew along the path found.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -59,10 +60,11 @@ def estimate_jointly(
         lanes = LaneKeeping(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
         moments = register(frames, path, odometry, tracker, settings.motion_noise)
         standing = standing_probabilities(moments, path, slow, settings)
-        seen = [nearest_landmarks(landmarks, path, settings.landmark_reach)] if landmarks else []
+        seen = nearest_landmarks(landmarks or [()] * len(frames), path, settings.landmark_reach)
         first = [None] if estimate is None else []
         record = list(enumerate(moments))
-        estimate = _solved(record, path, [*first, standing], lanes, [*seen, *new_providers()], settings)
+        estimate = _solved(record, path, [*first, standing], lanes, [seen, *new_providers()], settings)
+        estimate = replace(estimate, sightings=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate

@@ -40,7 +40,7 @@ class Moments:
     """
 
     record: Keyed
-    path: Sequence[FloatArray]
+    path: Sequence[FloatArray] | FloatArray
     settings: JointSettings
     known: int = 0
     name: str = "vehicle and objects"

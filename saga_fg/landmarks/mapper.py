@@ -27,10 +27,11 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from factors import ResidualFactor, Variable
+from factors import ResidualFactor, Solution, Variable
 from saga_fg.arrays import FloatArray
 from saga_fg.association import gate
 from saga_fg.estimators.graph_engine import RelinearisationSettings
+from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.graph import Additions, GraphView
 from saga_fg.landmarks.association import associate
@@ -85,6 +86,27 @@ class LandmarkMap:
     world_T_pose: FloatArray
     landmarks: list[Landmark]
     sightings: list[Sighting]
+
+
+def landmarks_of(
+    seen: Iterable[tuple[int, Observation]], solution: Solution | GraphSolution, confirm: int = 1
+) -> list[Landmark]:
+    """The landmarks, by number, of which these observations are, where a solution has them."""
+    kinds, counts = dict[int, LandmarkType](), Counter[int]()
+    for number, observation in seen:
+        kinds[number] = observation.kind
+        counts[number] += 1
+    return [
+        Landmark(
+            number,
+            kinds[number],
+            kinds[number].variable.read(solution.values, landmark_key(number)),
+            solution.marginal(landmark_key(number)),
+            count,
+            count >= confirm,
+        )
+        for number, count in sorted(counts.items())
+    ]
 
 
 class LandmarkMapper:
@@ -181,18 +203,8 @@ class LandmarkMapper:
     def map(self) -> LandmarkMap:
         """Everything."""
         self.merge()
-        solution, seen = self._smoother.solution(), Counter(s.landmark for s in self._sightings)
-        landmarks = [
-            Landmark(
-                number,
-                kind,
-                self._smoother.state(landmark_key(number)),
-                solution.marginal(landmark_key(number)),
-                seen[number],
-                seen[number] >= self.settings.confirm,
-            )
-            for number, kind in sorted(self._kinds.items())
-        ]
+        seen = ((s.landmark, s.observation) for s in self._sightings)
+        landmarks = landmarks_of(seen, self._smoother.solution(), self.settings.confirm)
         poses = np.stack([self._pose(epoch).matrix() for epoch in range(self._smoother.graph().epoch + 1)])
         return LandmarkMap(poses, landmarks, list(self._sightings))
 
