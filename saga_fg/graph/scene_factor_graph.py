@@ -235,13 +235,11 @@ class SceneFactorGraph:
     def parts(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
-        for held in self._groups.values():
+        for held in sorted(self._groups.values(), key=lambda held: held.sharpness):
             if isinstance(held.factors, NativeGroup):
                 native.add(held.factors.factor)
-            elif isinstance(held.factors, PriorGroup):
-                native.push_back(held.factors.native(held.rows, self._base))
             else:
-                ours.append(ActiveRows(held.factors, held.rows, point))  # type: ignore[arg-type]
+                ours.append(ActiveRows(held.factors, held.rows, point))
         return native, ours
 
     def copy(self) -> SceneFactorGraph:
