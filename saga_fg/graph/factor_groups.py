@@ -112,6 +112,8 @@ class StackedGroup:
     def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
         W, jacobians, residuals = self.factors.linearisation(point.values, chosen)
         keys, rhs, blocks = self.factors.rows[chosen], -residuals, []
+        if point.base is point.values:
+            return whitened_factors(keys, W, jacobians, rhs)
         states, origins = self.factors.states(point.values, chosen), self.factors.states(point.base, chosen)
         for k, J in enumerate(jacobians):
             column = keys[:, k].tolist()

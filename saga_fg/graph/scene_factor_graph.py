@@ -23,14 +23,14 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
+from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, nonlinear_graph, solve
 from factors.marginal import Elimination
 from factors.validation import format_key
 from saga_fg.arrays import BoolArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_checks import Factor, grouped
-from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, NativeGroup, PriorGroup
+from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, LinearGroup, NativeGroup, PriorGroup
 from saga_fg.graph.keys import Kind, described, key_of
 from saga_fg.graph.parts import FactorEntry, HeldGroup, NewVariable
 from saga_fg.graph.point import Point
@@ -238,6 +238,9 @@ class SceneFactorGraph:
         for held in sorted(self._groups.values(), key=lambda held: held.sharpness):
             if isinstance(held.factors, NativeGroup):
                 native.add(held.factors.factor)
+            elif isinstance(held.factors, LinearGroup):
+                dims = {key: self._variables[key].dim for row in held.factors.rows for key in row}
+                native.push_back(nonlinear_graph([held.factors.factors[row] for row in held.rows.tolist()], dims))
             else:
                 ours.append(ActiveRows(held.factors, held.rows, point))
         return native, ours
