@@ -31,6 +31,7 @@ from pipelines.slam.sightings import Seen, SightingSettings, landmarks_seen
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.ego import JointSettings, OdometryNoise
+from saga_fg.estimators import BatchSolver
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.geometry import inverse_transform
 from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
@@ -157,14 +158,14 @@ def lidar_slam(
         graph.advance(time)
         motion, covariance = motions[k - 1] if k else (place, _START)
         ask_all([MeasuredMotion(motion, covariance, place), *known, *providers], graph)
-    solution = graph.solve()
+    solution = BatchSolver(graph=graph).solve()
     world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
     return LidarSlam(
         drive,
         _trajectory(scans, drive.poses),
         _trajectory(scans, drive.carried(world_T_lidar)),
         _trajectory(scans, drive.carried(np.array(online))),
-        np.array([solution.covariance([pose_key(k)]) for k in range(count)]),
+        np.array([solution.marginal(pose_key(k)) for k in range(count)]),
         updated(certain, solution),
         landmark_map.sightings,
         [each.extent for scan in seen for each in scan],

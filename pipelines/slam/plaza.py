@@ -23,6 +23,7 @@ from factors import Robust, SolverSettings, calibrated_range_factors, prior_fact
 from pipelines.slam.landmark_results import planar_trajectory
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
+from saga_fg.estimators import BatchSolver
 from saga_fg.geometry import inverse_transform, transform_points
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
 from saga_fg.landmarks import MeasuredMotion, landmark_key, pose_key
@@ -92,14 +93,16 @@ def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> B
             if landmark_key(number) not in graph.variables and np.count_nonzero(seen) >= _RANGES:
                 places[number] = trilateration(poses[at[seen], :2, 2], drive.range[seen])
         ask_all([_Ranges(drive, settings, at, places)], graph)
-        solution = graph.solve(_SOLVER)
+        solver = BatchSolver(graph=graph, settings=_SOLVER)
+        solver.solve()
+        graph = solver.snapshot()
         end = max(end + 1, int(settings.growth * end))
     beacons = {n: graph.state(landmark_key(n)) for n in numbers if landmark_key(n) in graph.variables}
     missing = set(numbers) - set(beacons)
     if missing:
         raise InputError(f"beacon {min(missing)}: expected at least {_RANGES} ranges to place it")
     poses = np.stack([graph.state(pose_key(row)).matrix() for row in range(len(reckoned))])
-    covariances = {number: solution.covariance([landmark_key(number)]) for number in beacons}
+    covariances = {number: solver.covariance(landmark_key(number)) for number in beacons}
     scale, offset = graph.state(_CALIBRATION).tolist()
     return BeaconMap(poses, beacons, covariances, scale, offset, reckoned)
 

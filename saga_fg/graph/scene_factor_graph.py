@@ -239,8 +239,9 @@ class SceneFactorGraph:
             if isinstance(held.factors, NativeGroup):
                 native.add(held.factors.factor)
             elif isinstance(held.factors, LinearGroup):
-                dims = {key: self._variables[key].dim for row in held.factors.rows for key in row}
-                native.push_back(nonlinear_graph([held.factors.factors[row] for row in held.rows.tolist()], dims))
+                rows, held_rows = held.rows.tolist(), held.factors.rows
+                dims = {key: self._variables[key].dim for row in rows for key in held_rows[row]}
+                native.push_back(nonlinear_graph([held.factors.factors[row] for row in rows], dims))
             else:
                 ours.append(ActiveRows(held.factors, held.rows, point))
         return native, ours
