@@ -34,7 +34,7 @@ from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
 from factors.relative_detection import relative_detection_factors
 from factors.relative_polar import relative_range_bearing_factors
-from factors.robust import Robust
+from factors.robust import Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
 from factors.variables import PlanarPose, SpatialPose, Variable, Vector
@@ -56,6 +56,7 @@ __all__ = [
     "ResidualFactor",
     "ResidualFactors",
     "Robust",
+    "RobustLoss",
     "SingularSystemError",
     "Solution",
     "SolverSettings",

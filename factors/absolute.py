@@ -15,14 +15,14 @@ from numpy.typing import ArrayLike
 
 from factors.between import noise_model
 from factors.errors import FactorError
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.validation import checked, checked_keys
 
 _UP = (0.0, 0.0, 1.0)
 
 
 def position_factor(
-    pose_key: int, position: ArrayLike, covariance: ArrayLike, robust: Robust | None = None
+    pose_key: int, position: ArrayLike, covariance: ArrayLike, robust: RobustLoss | None = None
 ) -> gtsam.NonlinearFactor:
     """Return GTSAM's factor of a measured place; position: (3,), m, local frame; covariance: (3, 3), m^2.
 
@@ -38,7 +38,7 @@ def attitude_factor(
     seen: ArrayLike,
     variance: float,
     world: ArrayLike = _UP,
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> gtsam.NonlinearFactor:
     """Return GTSAM's factor of a known direction seen from a `gtsam.Pose3`.
 

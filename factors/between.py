@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.validation import checked, checked_keys, whitener
 
 Pose = gtsam.Pose2 | gtsam.Pose3
@@ -34,7 +34,7 @@ def pose(name: str, matrix: ArrayLike) -> Pose:
 
 
 def pose_prior_factor(
-    key: int, world_T_pose: ArrayLike, covariance: ArrayLike, robust: Robust | None = None
+    key: int, world_T_pose: ArrayLike, covariance: ArrayLike, robust: RobustLoss | None = None
 ) -> gtsam.NonlinearFactor:
     """Return GTSAM's prior on a pose; world_T_pose: (3, 3) or (4, 4); covariance: (3, 3) or (6, 6) of its tangent."""
     (name,) = checked_keys("key", [key])
@@ -46,7 +46,7 @@ def pose_prior_factor(
 
 
 def between_factor(
-    first: int, second: int, first_T_second: ArrayLike, covariance: ArrayLike, robust: Robust | None = None
+    first: int, second: int, first_T_second: ArrayLike, covariance: ArrayLike, robust: RobustLoss | None = None
 ) -> gtsam.NonlinearFactor:
     """Return GTSAM's factor of a pose measured in the frame of another.
 
@@ -68,7 +68,7 @@ def gaussian_noise(name: str, covariance: ArrayLike, dim: int) -> gtsam.noiseMod
 
 
 def noise_model(
-    name: str, covariance: ArrayLike, dim: int, robust: Robust | None = None
+    name: str, covariance: ArrayLike, dim: int, robust: RobustLoss | None = None
 ) -> gtsam.noiseModel.Gaussian | gtsam.noiseModel.Robust:
     """The same under a robust loss, if one is given."""
     gaussian = gaussian_noise(name, covariance, dim)

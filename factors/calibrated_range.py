@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
 from factors.variables import PlanarPose
 
 
 def calibrated_range_factors(
-    rows: ArrayLike, z: ArrayLike, variance: float, robust: Robust | None = None
+    rows: ArrayLike, z: ArrayLike, variance: float, robust: RobustLoss | None = None
 ) -> ResidualFactors:
     """Return n factors of ranges.
 

@@ -23,14 +23,14 @@ from factors.errors import FactorError
 from factors.gaussian import gaussian_factor, gaussian_factors
 from factors.measurement import MeasurementModel
 from factors.nonlinear import ResidualFactor
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, KeyArray, checked, checked_covariances, checked_key_array
 from factors.variables import Vector
 
 
 def detection_factor(
-    key: int, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: Robust | None = None
+    key: int, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: RobustLoss | None = None
 ) -> ResidualFactor:
     """Return the factor rho(|| h(x) - z ||_R) on the vector variable `key`.
 
@@ -51,7 +51,7 @@ def detection_factor(
 
 
 def detection_factors(
-    keys: ArrayLike, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: Robust | None = None
+    keys: ArrayLike, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: RobustLoss | None = None
 ) -> ResidualFactors:
     """Return n factors of one model, linearised together; keys: (n,), z: (n, m), R: (n, m, m), or (m, m) for all."""
     measured = checked("z", z, (None, model.dim)).copy()

@@ -25,7 +25,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
@@ -60,7 +60,7 @@ class HesseLine:
 
 
 def edge_factors(
-    rows: ArrayLike, ends: ArrayLike, covariances: ArrayLike, robust: Robust | None = None
+    rows: ArrayLike, ends: ArrayLike, covariances: ArrayLike, robust: RobustLoss | None = None
 ) -> ResidualFactors:
     """Return n factors of straight edges seen from the vehicle.
 

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from factors.between import pose
 from factors.errors import FactorError
 from factors.measurement import checked_components
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
@@ -43,7 +43,7 @@ def lane_boundary_factors(
     world_T_curve: ArrayLike,
     coefficients: int,
     offsets: ArrayLike = 0.0,
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> ResidualFactors:
     """Return n factors of points on a lane curve, seen from the vehicle.
 
@@ -74,7 +74,7 @@ def lane_keeping_factors(
     state_dim: int,
     position: tuple[int, int] = (0, 1),
     offsets: ArrayLike = 0.0,
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> ResidualFactors:
     """Return n factors of objects that keep to a lane curve, or to a line beside it.
 

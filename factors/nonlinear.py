@@ -25,7 +25,7 @@ from factors.custom import custom_factor, tolerant_custom_factor
 from factors.differences import central_differences, wrap_angles
 from factors.errors import FactorError
 from factors.gaussian import native_factor
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.validation import FloatArray, checked, checked_keys, format_keys, whitener
 from factors.variables import Variable, read_states
 
@@ -60,7 +60,7 @@ class ResidualFactor:
     residual: Callable[..., ArrayLike]
     covariance: FloatArray
     jacobians: Callable[..., Sequence[ArrayLike]] | None = None
-    robust: Robust | None = None
+    robust: RobustLoss | None = None
     angles: tuple[int, ...] = ()
     name: str = "factor"
     _whitener: FloatArray = field(init=False, repr=False)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from factors.differences import stacked_differences, wrap_angles
 from factors.errors import FactorError
 from factors.nonlinear import ResidualFactor
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances, checked_key_array
 from factors.variables import Vector
@@ -57,7 +57,7 @@ class NonlinearInteraction:
         dims: int | Sequence[int],
         dt: float,
         covariance: ArrayLike,
-        robust: Robust | None = None,
+        robust: RobustLoss | None = None,
     ) -> ResidualFactor:
         """Return the factor of one node and step.
 
@@ -86,7 +86,7 @@ class NonlinearInteraction:
         dims: int | Sequence[int],
         dt: float,
         covariances: ArrayLike,
-        robust: Robust | None = None,
+        robust: RobustLoss | None = None,
     ) -> ResidualFactors:
         """Return the factors of n nodes with k neighbours each, evaluated together.
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.rotations import cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
@@ -41,7 +41,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def odometry_factors(
-    rows: ArrayLike, a_T_b: ArrayLike, dt: ArrayLike, covariances: ArrayLike, robust: Robust | None = None
+    rows: ArrayLike, a_T_b: ArrayLike, dt: ArrayLike, covariances: ArrayLike, robust: RobustLoss | None = None
 ) -> ResidualFactors:
     """Return n factors of odometry with slow errors.
 

@@ -18,7 +18,7 @@ import numpy as np
 from factors.measurement import checked_components
 from factors.nonlinear import ResidualFactor
 from factors.plane import OrientedPlane
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.validation import FloatArray, checked
 from factors.variables import Vector
 
@@ -30,7 +30,7 @@ def on_plane_factor(
     variance: float,
     state_dim: int,
     position: tuple[int, int, int] = (0, 1, 2),
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> ResidualFactor:
     """Return the factor of an object on a plane.
 

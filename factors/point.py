@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
@@ -26,7 +26,7 @@ from factors.variables import PlanarPose, SpatialPose
 
 
 def point_factors(
-    rows: ArrayLike, z: ArrayLike, covariances: ArrayLike, robust: Robust | None = None
+    rows: ArrayLike, z: ArrayLike, covariances: ArrayLike, robust: RobustLoss | None = None
 ) -> ResidualFactors:
     """Return n factors of points seen from poses.
 

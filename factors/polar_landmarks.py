@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike
 
 from factors.between import noise_model
 from factors.errors import FactorError
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.validation import checked, checked_keys
 
 
 def range_factor(
-    pose_key: int, point_key: int, distance: float, variance: float, planar: bool, robust: Robust | None = None
+    pose_key: int, point_key: int, distance: float, variance: float, planar: bool, robust: RobustLoss | None = None
 ) -> gtsam.NonlinearFactor:
     """Return GTSAM's factor of a range from a pose to a point.
 
@@ -41,7 +41,7 @@ def bearing_range_factor(
     bearing: float | ArrayLike,
     distance: float,
     covariance: ArrayLike,
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> gtsam.NonlinearFactor:
     """Return GTSAM's factor of bearing and range from a pose to a point.
 

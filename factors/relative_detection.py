@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.measurement import checked_components
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
@@ -35,7 +35,7 @@ def relative_detection_factors(
     covariances: ArrayLike,
     state_dim: int,
     position: tuple[int, int] = (0, 1),
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> ResidualFactors:
     """Return n factors of objects seen from the vehicle.
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
 from factors.measurement import checked_components
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
 from factors.variables import PlanarPose
@@ -33,7 +33,7 @@ def relative_range_bearing_factors(
     covariances: ArrayLike,
     state_dim: int,
     position: tuple[int, int] = (0, 1),
-    robust: Robust | None = None,
+    robust: RobustLoss | None = None,
 ) -> ResidualFactors:
     """Return n factors of objects seen from the vehicle.
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args
 
 import gtsam
 import numpy as np
@@ -29,6 +29,14 @@ from factors.errors import FactorError
 from factors.validation import FloatArray
 
 Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
+
+
+class RobustLoss(Protocol):
+    """What factors ask of a loss: `Robust` is one."""
+
+    def cost(self, distance: ArrayLike) -> FloatArray: ...
+    def weight(self, distance: ArrayLike) -> FloatArray: ...
+    def model(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust: ...
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from factors.validation import FloatArray, format_keys
 _LOG = logging.getLogger(__name__)
 _EXACT = 1e-12  # relative agreement of the error with its prediction from which a problem counts as linear
 _MAX_DAMPING = 1e12
+_PIVOT = 1e-14  # relative to its column
 
 
 @dataclass(frozen=True)
@@ -249,11 +250,35 @@ def _step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: 
             key = ordering.at(i)
             dim = zero.dim(key)
             system.push_back(native_factor([key], [dim], np.sqrt(damping) * np.eye(dim, dim + 1)))
+    step: gtsam.VectorValues | None
     try:
         step = system.optimize(ordering)
+    except RuntimeError:  # Cholesky squares the condition number
+        step = _step_by_qr(system, ordering)
+    return step if step is not None and np.isfinite(step.norm()) else None
+
+
+def _step_by_qr(system: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues | None:
+    """Return the step, or None where a pivot is but rounding: |r_ii| is how far column i of A is from those before."""
+    try:
+        tree = system.eliminateMultifrontal(ordering, gtsam.EliminateQR)
     except RuntimeError:
         return None
-    return step if np.isfinite(step.norm()) else None
+    step, keys = tree.optimize(), sorted(system.keyVector())
+    ends = np.cumsum([step.dim(key) for key in keys])
+    _, columns, entries = system.sparseJacobian_()
+    lengths = np.sqrt(np.bincount(columns.astype(int) - 1, entries**2, ends[-1] + 1))
+    of_key = dict(zip(keys, np.split(lengths, ends), strict=False))
+    cliques = list(tree.roots())
+    while cliques:
+        clique = cliques.pop()
+        conditional = clique.conditional()
+        pivots = np.abs(np.diagonal(conditional.R()))
+        columns = np.concatenate([of_key[key] for key in conditional.keys()])[: len(pivots)]  # noqa: SIM118
+        if not (pivots > _PIVOT * columns).all():
+            return None
+        cliques += [clique[k] for k in range(clique.nrChildren())]
+    return step
 
 
 def _length(linear: gtsam.GaussianFactorGraph, step: gtsam.VectorValues, damping: float) -> float:

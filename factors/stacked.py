@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from factors.differences import stacked_differences, wrap_angles
 from factors.errors import FactorError
 from factors.gaussian import gaussian_graph, whitened_factors
-from factors.robust import Robust
+from factors.robust import RobustLoss
 from factors.validation import (
     FloatArray,
     KeyArray,
@@ -52,7 +52,7 @@ class ResidualFactors:
     residual: Callable[..., ArrayLike]
     covariances: FloatArray
     jacobians: Callable[..., Sequence[ArrayLike]] | None = None
-    robust: Robust | None = None
+    robust: RobustLoss | None = None
     angles: tuple[int, ...] = ()
     name: str = "factors"
     _whiteners: FloatArray = field(init=False, repr=False)

@@ -16,7 +16,7 @@ import numpy as np
 from data_tools.metrics import Interval, paired_bootstrap
 from pipelines.config import TrackConfig
 from pipelines.slam.joint import JointRun, run_joint
-from pipelines.slam.roadside import observe_poles
+from pipelines.slam.roadside import poles_at
 from pipelines.tracking import Progress
 from saga_fg.dataset import Scene
 from saga_fg.ego import JointSettings, LaneSettings
@@ -85,7 +85,7 @@ def bench_joint(
             odometry, joint = run.errors()
             with_poles = float("nan")
             if poles:
-                see = partial(observe_poles, seed=seed)
+                see = partial(poles_at, seed=seed)
                 with_poles = run_joint(scene, config, settings, sensor, seed, see).errors()[1].ate
             on_lanes = None
             if lanes:

@@ -54,11 +54,13 @@ def kitti(
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
+    from dataclasses import replace
+
     from data_tools.atomic_files import check_writable_folder
     from data_tools.kitti import KittiScans, KittiTracking
-    from pipelines.config import load_config
+    from pipelines.slam.configuration import load_slam_config
     from pipelines.slam.kitti import write_lidar_slam
-    from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+    from pipelines.slam.lidar_slam import lidar_slam
     from pipelines.slam.with_objects import with_objects
     from saga_fg.errors import InputError
 
@@ -68,7 +70,8 @@ def kitti(
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
     window = online_window(online, lag)
     check_writable_folder(output)
-    frames, tracker = [], load_config("kitti", config)
+    frames, settings = [], load_slam_config("kitti", config)
+    slam = settings.slam
     if objects:
         detector = detections or dataroot / "detections" / "pointrcnn"
         frames = list(KittiTracking(dataroot, detector, [sequence]).scene(sequence).frames)
@@ -76,11 +79,15 @@ def kitti(
     blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
     recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
     with progress_bar() as progress:
-        settings = LidarSlamSettings(landmarks=landmarks and not blind, loop_closures=not blind)
-        result = lidar_slam(recorded, odometry, settings, progress)
+        lidar = replace(
+            slam.lidar,
+            landmarks=slam.lidar.landmarks and landmarks and not blind,
+            loop_closures=slam.lidar.loop_closures and not blind,
+        )
+        result = lidar_slam(recorded, odometry, lidar, progress, slam.new_providers(), slam.new_detectors())
     if objects:
         with working("objects"):
-            together = with_objects(result, recorded, frames, tracker, settings, window)
+            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers)
             figures = write_lidar_slam(output, together, recorded)
     else:
         figures = write_lidar_slam(output, result, recorded)

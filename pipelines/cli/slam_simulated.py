@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.cli.reporting import working
+
+if TYPE_CHECKING:
+    from saga_fg.ego import Observations
+    from saga_fg.frame import Frame
 
 
 def simulated(
@@ -24,8 +29,8 @@ def simulated(
 
     With --online once more, frame by frame, in a window of the last seconds.
 
-    Writes the paths (TUM, KITTI), the covariances of the poses, the tracks of the objects (tracks.csv), errors.json and
-    a picture from above (above.png).
+    Writes the paths (TUM, KITTI), the covariances of the poses, the tracks of the objects (tracks.csv), landmarks
+    (landmarks.json), errors.json and a picture from above (above.png).
 
     \b
     Example:
@@ -37,16 +42,21 @@ def simulated(
     from data_tools.atomic_files import check_writable_folder
     from data_tools.simulator import simulate_scene
     from data_tools.trajectories import trajectory_errors
-    from pipelines.config import load_config
+    from pipelines.slam.configuration import load_slam_config
     from pipelines.slam.joint import run_joint
     from pipelines.slam.simulated import online_paths, street, write_joint
-    from saga_fg.ego import JointSettings
 
     window = online_window(online, lag)
     check_writable_folder(output)
+    settings = load_slam_config("simulated", config)
+    slam, detectors = settings.slam, settings.slam.new_detectors()
+
+    def landmarks(frames: Sequence[Frame]) -> Observations:
+        return [[seen for detector in detectors for seen in detector.observations(frame)] for frame in frames]
+
     scene = simulate_scene(replace(street(), duration=duration), seed)
     with working("estimating"):
-        run = run_joint(scene, load_config("simulated", config), JointSettings(), "lidar", seed, lag=window)
+        run = run_joint(scene, settings, slam.joint, "lidar", seed, landmarks, window, slam.new_providers)
         write_joint(output, run)
     odometry, joint = run.errors()
     typer.echo(f"{output}: {joint.poses} poses over {joint.path_length:.0f} m")

@@ -13,7 +13,6 @@ import numpy as np
 
 from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odometry, trajectory_errors
 from pipelines.config import TrackConfig
-from saga_fg.arrays import FloatArray
 from saga_fg.dataset import Scene
 from saga_fg.ego import (
     JointEstimate,
@@ -26,6 +25,7 @@ from saga_fg.ego import (
 )
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
+from saga_fg.graph import FactorProvider
 from saga_fg.tracking import Tracker
 
 
@@ -54,12 +54,14 @@ def run_joint(
     settings: JointSettings,
     sensor: str,
     seed: int,
-    landmarks: Callable[[FloatArray], Observations] | None = None,
+    landmarks: Callable[[Sequence[Frame]], Observations] | None = None,
     lag: float | None = None,
+    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
 ) -> JointRun:
     """Estimate jointly from the frames of one sensor and odometry degraded as `settings.odometry` says.
 
-    landmarks: what is observed of them from true poses (n, 4, 4); lag: s, to estimate online as well.
+    landmarks: what is observed of them at n frames; lag: s, to estimate online as well; new_providers: gives fresh
+    providers of other factors.
     Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
     """
     frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], settings.keyframe_period)
@@ -76,11 +78,12 @@ def run_joint(
     def new_tracker() -> Tracker:
         return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
 
-    observed = None if landmarks is None else landmarks(truth.world_T_ego)
-    estimate = estimate_jointly(frames, odometry, new_tracker, settings, start, observed)
+    observed = None if landmarks is None else landmarks(frames)
+    estimate = estimate_jointly(frames, odometry, new_tracker, settings, start, observed, new_providers)
     online = None
     if lag is not None:
-        online = estimate_online(frames, odometry, new_tracker(), lag, settings, start, observed)
+        tracker, own = new_tracker(), new_providers()
+        online = estimate_online(frames, odometry, tracker, lag, settings, start, observed, providers=own)
     return JointRun(truth, Trajectory(truth.timestamps, odometry.path(start)), estimate, online)
 
 

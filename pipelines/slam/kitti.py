@@ -32,7 +32,7 @@ from pipelines.figures import write_figures
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.object_tracks import tracks, tracks_csv
-from pipelines.slam.sightings import EDGE, POLE, WALL
+from pipelines.slam.sightings import EDGE, GROUND, WALL
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.arrays import FloatArray
 from saga_fg.geometry import transform_points
@@ -144,8 +144,9 @@ def _lines(result: LidarSlam) -> dict[str, FloatArray]:
 
 
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
-    """Places (P, 2) of the poles."""
-    return np.array([mark.state for mark in landmarks if mark.kind == POLE], dtype=np.float64).reshape(-1, 2)
+    """Places (P, 2) of all but planes and edges."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (EDGE, GROUND, WALL)]
+    return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 
 def _pieces(result: LidarSlam, kind: str) -> FloatArray:

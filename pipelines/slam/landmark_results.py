@@ -33,6 +33,16 @@ class LandmarkRecord:
     covariance: FloatArray
     sightings: int
 
+    def listed(self) -> dict[str, object]:
+        """The entry of landmarks.json."""
+        return {
+            "number": self.number,
+            "type": self.kind,
+            **self.coordinates,
+            "covariance": self.covariance.tolist(),
+            "sightings": self.sightings,
+        }
+
 
 def records(landmarks: Sequence[Landmark]) -> list[LandmarkRecord]:
     """The landmarks of a map."""
@@ -54,21 +64,11 @@ def write_landmark_results(
     figures: go to figures.json; others: further paths (n, 2 or 3) for the picture, under their names.
     """
     places = np.array([[c["x"], c["y"], c.get("z", 0.0)] for c in (r.coordinates for r in landmarks)]).reshape(-1, 3)
-    listed = [
-        {
-            "number": record.number,
-            "type": record.kind,
-            **record.coordinates,
-            "covariance": record.covariance.tolist(),
-            "sightings": record.sightings,
-        }
-        for record in landmarks
-    ]
     picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
     with atomic_directory(output) as folder:
         write_tum_poses(folder / "trajectory.tum", trajectory)
         write_kitti_poses(folder / "trajectory.kitti", trajectory)
-        write_figures(folder / "landmarks.json", listed)
+        write_figures(folder / "landmarks.json", [record.listed() for record in landmarks])
         write_ply(folder / "landmarks.ply", places)
         write_figures(folder / "figures.json", dict(figures))
         write_bytes(folder / "above.png", png(picture))

@@ -18,12 +18,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import gtsam
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
 from data_tools.trajectories import Trajectory
-from factors import Linearisable, ResidualFactors, Robust, Solution, between_factor, pose, pose_prior_factor, solve
+from factors import Robust, Solution, between_factor
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.drive import LEAST, Drive, drive_by_lidar, drive_by_poses
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, find_loops
@@ -31,10 +30,23 @@ from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.sightings import Seen, SightingSettings, landmarks_seen
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.ego import JointSettings, OdometryNoise, landmark_key, pose_key
+from saga_fg.ego import JointSettings, OdometryNoise
+from saga_fg.estimators import BatchSolver
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.geometry import inverse_transform
-from saga_fg.landmarks import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting, sighting_factors
+from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
+from saga_fg.landmarks import (
+    Landmark,
+    LandmarkDetector,
+    LandmarkMapper,
+    MapperSettings,
+    MeasuredMotion,
+    Observation,
+    Sighting,
+    Sightings,
+    landmark_key,
+    pose_key,
+)
 from saga_fg.settings import require_positive, setting, settings_group
 
 OdometrySource = Literal["lidar", "oxts"]
@@ -110,9 +122,12 @@ def lidar_slam(
     source: OdometrySource = "lidar",
     settings: LidarSlamSettings | None = None,
     progress: Progress | None = None,
+    providers: Sequence[FactorProvider] = (),
+    detectors: Sequence[LandmarkDetector] = (),
 ) -> LidarSlam:
     """Estimate everything from K >= 2 scans. The only pose of the recording that counts is the first, unless the source
-    is "oxts".
+    is "oxts". providers: of other factors for the graph of all keyframes, one an epoch; detectors: of other landmarks
+    in the points of keyframes.
     """
     s = settings or LidarSlamSettings()
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
@@ -127,24 +142,31 @@ def lidar_slam(
         if k:
             mapper.move(*motions[k - 1])
         if s.landmarks:
-            seen.append(landmarks_seen(points, s.sightings))
+            seen.append(landmarks_seen(points, s.sightings, detectors))
             mapper.observe([each.observation for each in seen[-1]])
-        online.append(mapper.estimate.pose.matrix())
+        online.append(mapper.pose)
         if progress is not None:
             progress("landmarks", k + 1, len(drive.points))
     landmark_map = mapper.map()
     clouds = [points[voxel_downsample(points, s.map_spacing)] for points in drive.points]
     loops = find_loops(clouds, landmark_map.world_T_pose, s.loops) if s.loop_closures else []
-    solution = _solved(landmark_map, motions, loops, Robust("geman-mcclure", s.robust_scale))
     count = len(drive.keyframes)
+    certain = [mark for mark in landmark_map.landmarks if mark.confirmed]
+    known = known_providers(certain, landmark_map.sightings, loops, range(count), s.robust_scale)
+    graph = SceneFactorGraph()
+    for k, (time, place) in enumerate(zip(scans.timestamps[drive.keyframes], landmark_map.world_T_pose, strict=True)):
+        graph.advance(time)
+        motion, covariance = motions[k - 1] if k else (place, _START)
+        ask_all([MeasuredMotion(motion, covariance, place), *known, *providers], graph)
+    solution = BatchSolver(graph=graph).solve()
     world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
     return LidarSlam(
         drive,
         _trajectory(scans, drive.poses),
         _trajectory(scans, drive.carried(world_T_lidar)),
         _trajectory(scans, drive.carried(np.array(online))),
-        np.array([solution.covariance([pose_key(k)]) for k in range(count)]),
-        updated((mark for mark in landmark_map.landmarks if mark.confirmed), solution),
+        np.array([solution.marginal(pose_key(k)) for k in range(count)]),
+        updated(certain, solution),
         landmark_map.sightings,
         [each.extent for scan in seen for each in scan],
         loops,
@@ -153,39 +175,40 @@ def lidar_slam(
     )
 
 
-def graph_of(
-    sightings: Iterable[Sighting], loops: Sequence[LoopClosure], moments: Sequence[int], robust: Robust
-) -> tuple[gtsam.NonlinearFactorGraph, list[Linearisable]]:
-    """Factors of landmarks seen from keyframes and of loops between these, whose poses have the keys of `moments`."""
-    graph, factors = sighting_factors(
-        (pose_key(moments[s.pose]), landmark_key(s.landmark), s.observation) for s in sightings
-    )
-    for loop in loops:
-        keys = (pose_key(moments[loop.first]), pose_key(moments[loop.second]))
-        graph.add(between_factor(*keys, loop.first_T_second, loop.covariance + LEAST, robust))
-    return graph, [replace(f, robust=robust) if isinstance(f, ResidualFactors) else f for f in factors]
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Loops between keyframes, whose poses are those of `epochs`."""
+
+    loops: Sequence[LoopClosure]
+    epochs: Sequence[int]
+    robust: Robust
+    name: str = "loops"
+
+    def factors(self, view: GraphView) -> Additions:
+        mine = [loop for loop in self.loops if self.epochs[loop.second] == view.epoch]
+        pairs = [(pose_key(self.epochs[loop.first]), pose_key(view.epoch)) for loop in mine]
+        return Additions(
+            factors=[
+                between_factor(*pair, loop.first_T_second, loop.covariance + LEAST, self.robust)
+                for pair, loop in zip(pairs, mine, strict=True)
+            ]
+        )
 
 
-def _solved(
-    landmark_map: LandmarkMap,
-    motions: Sequence[tuple[FloatArray, FloatArray]],
+def known_providers(
+    landmarks: Sequence[Landmark],
+    sightings: Sequence[Sighting],
     loops: Sequence[LoopClosure],
-    robust: Robust,
-) -> Solution:
-    """The whole graph, from where the mapper left it."""
-    poses = landmark_map.world_T_pose
-    certain = {landmark.number: landmark for landmark in landmark_map.landmarks if landmark.confirmed}
-    sightings = (s for s in landmark_map.sightings if s.landmark in certain)
-    graph, factors = graph_of(sightings, loops, range(len(poses)), robust)
-    graph.add(pose_prior_factor(pose_key(0), poses[0], _START))
-    for k, (motion, covariance) in enumerate(motions):
-        graph.add(between_factor(pose_key(k), pose_key(k + 1), motion, covariance))
-    values = gtsam.Values()
-    for k, world_T_pose in enumerate(poses):
-        values.insert(pose_key(k), pose("world_T_pose", world_T_pose))
-    for number, landmark in certain.items():
-        values.insert(landmark_key(number), landmark.state)
-    return solve(graph, factors, values)
+    epochs: Sequence[int],
+    robust_scale: float,
+) -> list[FactorProvider]:
+    """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
+    robust, start = Robust("geman-mcclure", robust_scale), {mark.number: mark.state for mark in landmarks}
+    seen: dict[int, list[tuple[int, Observation]]] = {}
+    for sighting in sightings:
+        if sighting.landmark in start:
+            seen.setdefault(epochs[sighting.pose], []).append((sighting.landmark, sighting.observation))
+    return [Sightings(seen, start, robust), Loops(loops, epochs, robust)]
 
 
 def updated(landmarks: Iterable[Landmark], solution: Solution | GraphSolution) -> list[Landmark]:
@@ -193,7 +216,7 @@ def updated(landmarks: Iterable[Landmark], solution: Solution | GraphSolution) -
     found = []
     for mark in landmarks:
         key = landmark_key(mark.number)
-        state, covariance = mark.kind.variable.read(solution.values, key), solution.covariance([key])
+        state, covariance = mark.kind.variable.read(solution.values, key), solution.marginal(key)
         found.append(replace(mark, state=state, covariance=covariance))
     return found
 

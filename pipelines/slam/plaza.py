@@ -12,35 +12,27 @@ echoes are long.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from data_tools.plaza import BeaconRanges
 from data_tools.trajectories import absolute_errors, matched, rigid_alignment
-from factors import (
-    Robust,
-    Solution,
-    SolverSettings,
-    between_factor,
-    calibrated_range_factors,
-    nonlinear_graph,
-    pose,
-    pose_prior_factor,
-    prior_factor,
-    solve,
-)
+from factors import Robust, SolverSettings, calibrated_range_factors, prior_factor
 from pipelines.slam.landmark_results import planar_trajectory
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
+from saga_fg.estimators import BatchSolver
 from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
+from saga_fg.landmarks import MeasuredMotion, landmark_key, pose_key
 from saga_fg.settings import require_between, require_positive, setting
 
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
 _START = 1e-8  # variance of the first pose, m^2 and rad^2
 _RANGES = 10  # at least, to place a beacon by
-_CALIBRATION = int(gtsam.symbol("c", 0))
+_CALIBRATION = key_of(EGO_ERROR, 0, None)
 
 
 @dataclass(frozen=True)
@@ -86,27 +78,63 @@ def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> B
     reckoned = _chained(np.eye(3), steps[1:])
     at = np.clip(np.searchsorted(drive.time, drive.measured), 0, len(drive.time) - 1)
     end = int(np.searchsorted(np.cumsum(np.abs(drive.distance)), settings.beginning)) + 1
-    poses, beacons, calibration = reckoned[:1], dict[int, FloatArray](), np.zeros(2)
-    while True:
-        end = min(end, len(reckoned))
-        poses = _chained_on(poses, steps[:end])
-        for number in np.unique(drive.beacon).tolist():
-            if number not in beacons:
-                seen = (drive.beacon == number) & (at < end)
-                if np.count_nonzero(seen) >= _RANGES:
-                    beacons[number] = trilateration(poses[at[seen], :2, 2], drive.range[seen])
-        solution = _solved(drive, settings, steps, at, poses, beacons, calibration)
-        poses = np.stack([solution.values.atPose2(row).matrix() for row in range(end)])
-        beacons = {number: solution.values.atVector(_beacon(number)) for number in beacons}
-        calibration = solution.values.atVector(_CALIBRATION)
-        if end == len(reckoned):
-            break
+    graph, numbers = SceneFactorGraph(), np.unique(drive.beacon).tolist()
+    along = np.maximum(settings.distance_noise * np.abs(drive.distance), settings.least_noise)
+    while graph.epoch + 1 < len(reckoned):
+        for row in range(graph.epoch + 1, min(end, len(reckoned))):
+            noise = np.diag([along[row], settings.least_noise, settings.turn_noise]) ** 2
+            first = MeasuredMotion(np.eye(3), _START * np.eye(3))
+            graph.advance(max(drive.time[row], np.nextafter(graph.time, np.inf)))  # rows may have one time
+            ask_all([MeasuredMotion(steps[row], noise) if row else first], graph)
+        poses = np.stack([graph.state(pose_key(row)).matrix() for row in range(graph.epoch + 1)])
+        places: dict[int, FloatArray] = {}
+        for number in numbers:
+            seen = (drive.beacon == number) & (at <= graph.epoch)
+            if landmark_key(number) not in graph.variables and np.count_nonzero(seen) >= _RANGES:
+                places[number] = trilateration(poses[at[seen], :2, 2], drive.range[seen])
+        ask_all([_Ranges(drive, settings, at, places)], graph)
+        solver = BatchSolver(graph=graph, settings=_SOLVER)
+        solver.solve()
+        graph = solver.snapshot()
         end = max(end + 1, int(settings.growth * end))
-    missing = set(np.unique(drive.beacon).tolist()) - set(beacons)
+    beacons = {n: graph.state(landmark_key(n)) for n in numbers if landmark_key(n) in graph.variables}
+    missing = set(numbers) - set(beacons)
     if missing:
         raise InputError(f"beacon {min(missing)}: expected at least {_RANGES} ranges to place it")
-    covariances = {number: solution.covariance([_beacon(number)]) for number in beacons}
-    return BeaconMap(poses, beacons, covariances, float(calibration[0]), float(calibration[1]), reckoned)
+    poses = np.stack([graph.state(pose_key(row)).matrix() for row in range(len(reckoned))])
+    covariances = {number: solver.covariance(landmark_key(number)) for number in beacons}
+    scale, offset = graph.state(_CALIBRATION).tolist()
+    return BeaconMap(poses, beacons, covariances, scale, offset, reckoned)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ranges:
+    """All ranges of beacons in the graph from poses in it, those at new places among them, and the calibration.
+
+    at: (K,) the row of odometry that each range belongs to; places: (2,) by number
+    """
+
+    drive: BeaconRanges
+    settings: PlazaSettings
+    at: IntArray
+    places: Mapping[int, FloatArray]
+    name: str = "ranges"
+
+    def factors(self, view: GraphView) -> Additions:
+        drive, s = self.drive, self.settings
+        new = [NewVariable(LANDMARK, n, place, static=True, label="beacon") for n, place in self.places.items()]
+        factors = []
+        if _CALIBRATION not in view.variables:
+            new.append(NewVariable(EGO_ERROR, 0, np.zeros(2), static=True, label="calibration"))
+            factors.append(prior_factor(_CALIBRATION, np.zeros(2), np.diag([s.scale_noise, s.offset_noise]) ** 2))
+        used = (self.at <= view.epoch) & np.isin(drive.beacon, [*view.static(LANDMARK), *self.places])
+        rows = [
+            [pose_key(row), landmark_key(number), _CALIBRATION]
+            for row, number in zip(self.at[used].tolist(), drive.beacon[used].tolist(), strict=True)
+        ]
+        loss = Robust("cauchy", s.robust)
+        ranges = calibrated_range_factors(rows, drive.range[used], s.range_noise**2, loss)
+        return Additions(new, factors, {"ranges": [ranges]})
 
 
 def compared(drive: BeaconRanges, found: BeaconMap) -> tuple[dict[str, float], dict[str, FloatArray]]:
@@ -143,37 +171,6 @@ def trilateration(places: FloatArray, ranges: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(2 * (places - places.mean(axis=0)), b, rcond=None)[0])
 
 
-def _solved(
-    drive: BeaconRanges,
-    settings: PlazaSettings,
-    steps: FloatArray,
-    at: IntArray,
-    poses: FloatArray,
-    beacons: dict[int, FloatArray],
-    calibration: FloatArray,
-) -> Solution:
-    """Solve for the poses of a part of the drive, the beacons placed so far, and the calibration."""
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(pose_prior_factor(0, poses[0], _START * np.eye(3)))
-    for row, matrix in enumerate(poses):
-        start.insert(row, pose("pose", matrix))
-        if row:
-            along = max(settings.distance_noise * abs(drive.distance[row]), settings.least_noise)
-            sigmas = np.array([along, settings.least_noise, settings.turn_noise])
-            graph.add(between_factor(row - 1, row, steps[row], np.diag(sigmas**2)))
-    for number, place in beacons.items():
-        start.insert(_beacon(number), place)
-    start.insert(_CALIBRATION, calibration)
-    noise = np.diag([settings.scale_noise, settings.offset_noise]) ** 2
-    prior = nonlinear_graph([prior_factor(_CALIBRATION, np.zeros(2), noise)], {_CALIBRATION: 2})
-    graph.push_back(prior)
-    used = (at < len(poses)) & np.isin(drive.beacon, list(beacons))
-    rows = [[int(row), _beacon(number), _CALIBRATION] for row, number in zip(at[used], drive.beacon[used], strict=True)]
-    loss = Robust("cauchy", settings.robust)
-    ranges = calibrated_range_factors(rows, drive.range[used], settings.range_noise**2, loss)
-    return solve(graph, [ranges], start, _SOLVER)
-
-
 def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
     """The increment (N, 3, 3) that each row of odometry reports: half the turn, the distance, the other half."""
     T = np.tile(np.eye(3), (len(turn), 1, 1))
@@ -188,12 +185,3 @@ def _chained(start: FloatArray, steps: FloatArray) -> FloatArray:
     for step in steps:
         poses.append(poses[-1] @ step)
     return np.stack(poses)
-
-
-def _chained_on(poses: FloatArray, steps: FloatArray) -> FloatArray:
-    """As many poses as there are rows of odometry, those to come by dead reckoning."""
-    return np.concatenate([poses[:-1], _chained(poses[-1], steps[len(poses) :])])
-
-
-def _beacon(number: int) -> int:
-    return int(gtsam.symbol("l", number))

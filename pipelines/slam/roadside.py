@@ -6,12 +6,14 @@ within `reach` are observed, each with the chance `seen`, with independent noise
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.ego import Observations
+from saga_fg.frame import Frame
 from saga_fg.geometry import inverse_transform, transform_points
 from saga_fg.landmarks import Observation, PoleLandmark
 from saga_fg.settings import require_between, require_positive, setting
@@ -45,6 +47,11 @@ def observe_poles(world_T_ego: FloatArray, seed: int, settings: RoadsideSettings
         local[:, :2] += settings.noise * rng.standard_normal((len(local), 2))
         result.append([Observation(kind, point, R) for point in local[near]])
     return result
+
+
+def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
+    """What is seen of poles at frames, which have true poses."""
+    return observe_poles(np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None]), seed)
 
 
 def _poles(world_T_ego: FloatArray, settings: RoadsideSettings, rng: np.random.Generator) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from data_tools.lidar import (
     straight_edges,
 )
 from saga_fg.arrays import FloatArray
-from saga_fg.landmarks import LaneEdgeLandmark, Observation, PlaneLandmark, PoleLandmark
+from saga_fg.landmarks import LandmarkDetector, LaneEdgeLandmark, Observation, PlaneLandmark, PoleLandmark
 from saga_fg.settings import setting, settings_group
 
 GROUND = PlaneLandmark(name="ground")
@@ -46,14 +47,16 @@ class SightingSettings:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """An observation, and the ends (2, 3) of the piece of the landmark that was seen, m, in the sensor's frame."""
+    """An observation, and the ends (2, 3) of the piece of a wall or edge that was seen, m, in the sensor's frame."""
 
     observation: Observation
     extent: FloatArray
 
 
-def landmarks_seen(points: FloatArray, settings: SightingSettings | None = None) -> list[Seen]:
-    """Landmarks seen in points (N, 3) of a scan without skew, m, in the sensor's frame."""
+def landmarks_seen(
+    points: FloatArray, settings: SightingSettings | None = None, detectors: Sequence[LandmarkDetector] = ()
+) -> list[Seen]:
+    """Landmarks seen in points (N, 3) of a scan without skew, m, in the sensor's frame; by other detectors as well."""
     s = settings or SightingSettings()
     ground = segment_ground(points, s.segmentation)
     found = []
@@ -71,4 +74,5 @@ def landmarks_seen(points: FloatArray, settings: SightingSettings | None = None)
     curbs = extract_curbs(points, ground.height, s.curb) if s.edges else np.empty((0, 3))
     for edge in straight_edges(curbs, s.edges, s.edge):
         found.append(Seen(Observation(EDGE, edge.ends.ravel(), edge.covariance), edge.ends))
+    found += [Seen(other, np.zeros((2, 3))) for detector in detectors for other in detector.observations(points)]
     return found

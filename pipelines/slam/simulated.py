@@ -4,6 +4,7 @@ odometry.tum, joint.tum, truth.tum   the paths (TUM); joint.txt the estimated on
 online.tum, settled.tum              if estimated online as well: each pose as known at once, and a lag later
 covariances.csv                      of each estimated pose in its own frame: rotation vector (rad), translation (m)
 tracks.csv                           objects in the world at every moment: place, velocity and their deviations
+landmarks.json                       those that detectors of the configuration found: kind, place, covariance
 errors.json                          ATE and relative error of the odometry's path and of the estimated one
 above.png                            the paths and the objects from above
 """
@@ -23,6 +24,7 @@ from data_tools.simulator.settings import LightSettings, SurroundingSettings
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.figures import write_figures
 from pipelines.slam.joint import JointRun
+from pipelines.slam.landmark_results import records
 from pipelines.slam.object_tracks import tracks, tracks_csv
 
 
@@ -47,6 +49,7 @@ def write_joint(output: Path, run: JointRun) -> None:
         errors = {"odometry": asdict(odometry), "joint": asdict(joint)}
         errors |= {name: asdict(trajectory_errors(path, run.truth)) for name, path in online_paths(run).items()}
         write_figures(folder / "errors.json", errors)
+        write_figures(folder / "landmarks.json", [record.listed() for record in records(run.estimate.landmarks)])
         write_bytes(folder / "above.png", png(picture(run)))
 
 

@@ -8,23 +8,22 @@ frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from data_tools.trajectories import Trajectory
-from factors import Robust
 from pipelines.config import TrackConfig
 from pipelines.scan_sequence import ScanSequence
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, graph_of, updated
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers, updated
 from saga_fg.arrays import FloatArray
-from saga_fg.ego import JointEstimate, LandmarkPart, Odometry, estimate_jointly, estimate_online, landmark_key
+from saga_fg.ego import JointEstimate, Odometry, estimate_jointly, estimate_online
 from saga_fg.ego.record import in_ego
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.geometry import inverse_transform
+from saga_fg.graph import FactorProvider
 from saga_fg.landmarks import Observation
 from saga_fg.tracking import Tracker
 
@@ -50,10 +49,12 @@ def with_objects(
     config: TrackConfig,
     settings: LidarSlamSettings | None = None,
     lag: float | None = None,
+    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
 ) -> SlamWithObjects:
     """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
 
     lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `slam.online` is then by that.
+    new_providers: gives fresh providers of other factors.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
@@ -71,18 +72,17 @@ def with_objects(
         np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),
     )
     at = np.searchsorted(rows, result.keyframes)
-    known = {mark.number: mark for mark in result.landmarks}
-    graph, factors = graph_of(
-        (s for s in result.sightings if s.landmark in known),
-        result.loops,
-        at.tolist(),
-        Robust("geman-mcclure", s.robust_scale),
+    estimate = estimate_jointly(
+        seen,
+        odometry,
+        new_tracker,
+        s.objects,
+        result.drive.poses[0],
+        new_providers=lambda: [
+            *known_providers(result.landmarks, result.sightings, result.loops, at.tolist(), s.robust_scale),
+            *new_providers(),
+        ],
     )
-    start = gtsam.Values()
-    for number, mark in known.items():
-        start.insert(landmark_key(number), mark.state)
-    part = LandmarkPart(graph, factors, start)
-    estimate = estimate_jointly(seen, odometry, new_tracker, s.objects, result.drive.poses[0], part)
     poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
     slam = replace(
         result,
@@ -96,7 +96,7 @@ def with_objects(
         for sighting in result.sightings:
             observed[at[sighting.pose]].append(sighting.observation)
         online = estimate_online(
-            seen, odometry, new_tracker(), lag, s.objects, result.drive.poses[0], observed, s.mapper
+            seen, odometry, new_tracker(), lag, s.objects, result.drive.poses[0], observed, s.mapper, new_providers()
         )
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))

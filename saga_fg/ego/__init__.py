@@ -2,8 +2,7 @@
 
 from saga_fg.ego.batch import estimate_jointly
 from saga_fg.ego.estimate import JointEstimate, ObjectStates
-from saga_fg.ego.graph import pose_key
-from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_key
+from saga_fg.ego.landmarks import Observations
 from saga_fg.ego.lanes import lane_key
 from saga_fg.ego.odometry import Odometry, OdometryNoise
 from saga_fg.ego.online import OnlineEstimator, OnlineStep
@@ -13,7 +12,6 @@ from saga_fg.ego.settings import JointSettings, LaneSettings
 __all__ = [
     "JointEstimate",
     "JointSettings",
-    "LandmarkPart",
     "LaneSettings",
     "ObjectStates",
     "Observations",
@@ -24,7 +22,5 @@ __all__ = [
     "OnlineStep",
     "estimate_jointly",
     "estimate_online",
-    "landmark_key",
     "lane_key",
-    "pose_key",
 ]

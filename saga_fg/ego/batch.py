@@ -8,24 +8,24 @@ anew along the path found.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-import gtsam
 import numpy as np
 
-from factors import ERROR_DIM, SolverSettings, nonlinear_graph, solve
+from factors import SolverSettings
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.estimate import JointEstimate, read_estimate
-from saga_fg.ego.graph import Keyed, error_key, linear_graph, nonlinear_factors, object_key, pose_key, start_graph
-from saga_fg.ego.landmarks import LandmarkPart, Observations, landmark_part
-from saga_fg.ego.lanes import KnownLane, keepings, known_lanes, lane_factors, lane_key, lane_priors
+from saga_fg.ego.graph import Keyed, standing_factors
+from saga_fg.ego.landmarks import Observations, nearest_landmarks
+from saga_fg.ego.lane_keeping import LaneKeeping
 from saga_fg.ego.odometry import Odometry
+from saga_fg.ego.providers import Moments, Standing
 from saga_fg.ego.record import register
 from saga_fg.ego.settings import JointSettings
 from saga_fg.ego.standing import SlowErrors, standing_probabilities
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
-from saga_fg.geometry import transform_points
-from saga_fg.interactions import POSITION
+from saga_fg.graph import FactorProvider, SceneFactorGraph, ask_all
 from saga_fg.tracking import Tracker
 
 TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
@@ -37,36 +37,34 @@ def estimate_jointly(
     new_tracker: Callable[[], Tracker],
     settings: JointSettings | None = None,
     start: FloatArray | None = None,
-    landmarks: Observations | LandmarkPart | None = None,
+    landmarks: Observations | None = None,
+    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
 ) -> JointEstimate:
     """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
 
     odometry: between the frames' times; new_tracker: gives a fresh tracker, which registers detections; start: first
-    pose (4, 4), by default the identity; landmarks: what is observed of them at each of the n moments, or their part of
-    the graph where somebody knows already which observation is of which. Detections are in ego or sensor coordinates,
-    or in those of the world with the pose they were transformed by. Raises `InputError` where frames, odometry and
-    landmarks do not fit together.
+    pose (4, 4), by default the identity; landmarks: what is observed of them at each of the n moments; new_providers:
+    gives fresh providers of other factors, asked moment by moment (`saga_fg.landmarks.Sightings`, where somebody knows
+    which observation is of which). Detections are in ego or sensor coordinates, or in those of the world with the pose
+    they were transformed by. Raises `InputError` where frames, odometry and landmarks do not fit together.
     """
     settings = settings or JointSettings()
     check_times(frames, odometry)
-    if landmarks is None:
-        landmarks = [()] * len(frames)
-    if not isinstance(landmarks, LandmarkPart) and len(landmarks) != len(frames):
+    if landmarks is not None and len(landmarks) != len(frames):
         raise InputError(f"landmarks: expected what is observed at {len(frames)} moments, got {len(landmarks)}")
     path = odometry.path(start)
     slow = SlowErrors.at_start(settings)
     estimate = None
     for _ in range(settings.rounds):
         tracker = new_tracker()
-        lanes = known_lanes([tracker.settings.road_map, *(frame.road_map for frame in frames)])
+        lanes = LaneKeeping(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
         moments = register(frames, path, odometry, tracker, settings.motion_noise)
         standing = standing_probabilities(moments, path, slow, settings)
-        if isinstance(landmarks, LandmarkPart):
-            seen = landmarks
-        else:
-            seen = landmark_part(landmarks, path, settings.landmark_reach)
+        seen = nearest_landmarks(landmarks or [()] * len(frames), path, settings.landmark_reach)
         first = [None] if estimate is None else []
-        estimate = _solved(list(enumerate(moments)), path, [*first, standing], seen, lanes, settings)
+        record = list(enumerate(moments))
+        estimate = _solved(record, path, [*first, standing], lanes, [seen, *new_providers()], settings)
+        estimate = replace(estimate, sightings=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate
@@ -85,52 +83,24 @@ def _solved(
     record: Keyed,
     path: FloatArray,
     standing: Sequence[Sequence[FloatArray] | None],
-    landmarks: LandmarkPart,
-    lanes: Sequence[KnownLane],
+    lanes: LaneKeeping,
+    providers: Sequence[FactorProvider],
     settings: JointSettings,
 ) -> JointEstimate:
     """One solution after the other, each from the one before: all objects moving, which needs no good start (None), or
     with those that stand; at last with vehicles drawn to the lanes they are on by the solution before.
     """
-    graph = start_graph(0, path[0], settings)
-    graph.push_back(linear_graph(record))
-    graph.push_back(landmarks.graph)
-    solver = SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
-    values = start_values(record, path)
-    values.insert(landmarks.start)
+    graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
+    moments = Moments(record, path, settings)
+    for _, moment in record:
+        graph.advance(moment.time)
+        ask_all([moments, *providers], graph)
     for probabilities in standing:
-        factors = [*nonlinear_factors(record, settings, probabilities), *landmarks.factors]
-        solution = solve(graph, factors, values, solver)
-        values = solution.values
-    if settings.lanes is None or not lanes:
-        return read_estimate(record, solution)
-    graph.push_back(nonlinear_graph(lane_priors(lanes), {lane_key(lane.number): 1 for lane in lanes}))
-    for lane in lanes:
-        values.insert(lane_key(lane.number), np.zeros(1))
-    for _ in range(settings.lanes.rounds):
-        estimate = read_estimate(record, solution)
-        poses = zip(estimate.world_T_ego, estimate.pose_covariances, strict=True)
-        stands = standing[-1] or [np.zeros(len(moment.objects.id)) for _, moment in record]
-        kept = [
-            one
-            for (k, moment), objects, stand, pose in zip(record, estimate.objects, stands, poses, strict=True)
-            for one in keepings(k, objects, moment.seen.id, stand, pose, lanes, settings.lanes)
-        ]
-        solution = solve(graph, [*factors, *lane_factors(record, kept, settings.lanes)], values, solver)
-        values = solution.values
+        if probabilities is not None:
+            graph.add_factors(Standing.name, standing_factors(record, probabilities, settings), Standing.name)
+        solution = graph.solve(solver)
+    for _ in range(lanes.rounds):
+        lanes.assign(record, read_estimate(record, solution), standing[-1] or ())
+        ask_all([lanes], graph)
+        solution = graph.solve(solver)
     return read_estimate(record, solution)
-
-
-def start_values(record: Keyed, path: FloatArray) -> gtsam.Values:
-    """Where to begin: along a path (n, 4, 4), objects where they were last detected, at rest."""
-    values = gtsam.Values()
-    place: dict[int, FloatArray] = {}
-    for (k, moment), pose in zip(record, path, strict=True):
-        values.insert(pose_key(k), gtsam.Pose3(pose))
-        values.insert(error_key(k), np.zeros(ERROR_DIM))
-        place.update(zip(moment.seen.id.tolist(), transform_points(pose, moment.seen.z)[:, :2], strict=True))
-        for name, node_type in zip(moment.objects.id.tolist(), moment.objects.types, strict=True):
-            state = np.zeros(node_type.dim)
-            state[node_type.index(POSITION)] = place[name]
-            values.insert(object_key(k, name), state)
-    return values

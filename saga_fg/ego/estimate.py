@@ -10,11 +10,12 @@ import numpy as np
 
 from factors import Solution
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.ego.graph import Keyed, error_key, object_key, pose_key
+from saga_fg.ego.graph import Keyed, error_key, object_key
 from saga_fg.ego.record import EgoMoment
 from saga_fg.ego.standing import SlowErrors
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.interactions import POSITION, VELOCITY
+from saga_fg.landmarks import Landmark, Sightings, landmarks_of, pose_key
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,7 @@ class JointEstimate:
     objects       n tables
     converged     whether the last step was short enough
     solution      of the graph, with the keys of `saga_fg.ego.graph`
+    sightings     of landmarks, told apart by nobody else
     """
 
     timestamps: FloatArray
@@ -46,6 +48,7 @@ class JointEstimate:
     converged: bool
     solution: Solution | GraphSolution
     _record: Keyed
+    sightings: Sightings | None = None
 
     @cached_property
     def pose_covariances(self) -> FloatArray:
@@ -60,6 +63,12 @@ class JointEstimate:
             at = node_type.index(POSITION + VELOCITY)
             result[row] = self._covariance(object_key(k, name))[at[:, None], at]
         return result
+
+    @cached_property
+    def landmarks(self) -> list[Landmark]:
+        """Those that were told apart along the path."""
+        seen = {} if self.sightings is None else self.sightings.seen
+        return landmarks_of((one for now in seen.values() for one in now), self.solution)
 
     @cached_property
     def slow_errors(self) -> SlowErrors:

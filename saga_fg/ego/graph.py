@@ -26,7 +26,6 @@ from factors import (
     ResidualFactors,
     Robust,
     gaussian_factors,
-    nonlinear_graph,
     odometry_factors,
     prior_factor,
     relative_detection_factors,
@@ -37,19 +36,15 @@ from saga_fg.ego.settings import JointSettings
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
-from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, key_of
+from saga_fg.graph import EGO_ERROR, OBJECT, key_of
 from saga_fg.interactions import POSITION, VELOCITY
+from saga_fg.landmarks import pose_key
 from saga_fg.node import NodeType
 
 _LIKELY = 0.9  # an object that stands with less than this probability is taken to move
 _SURELY_MOVING = 4.0  # standard deviations from standing at which the loss gives up an object
 _ANY_SPEED = 100.0  # m/s, deviation of a velocity of which nothing is known
 Keyed = list[tuple[int, EgoMoment]]
-
-
-def pose_key(moment: int) -> int:
-    """Key of the vehicle's pose at a moment."""
-    return key_of(EGO_POSE, 0, moment)
 
 
 def error_key(moment: int) -> int:
@@ -72,45 +67,11 @@ def start_factors(
     return slow, gtsam.PriorFactorPose3(pose_key(moment), gtsam.Pose3(world_T_ego), sigma)
 
 
-def start_graph(moment: int, world_T_ego: FloatArray, settings: JointSettings) -> gtsam.NonlinearFactorGraph:
-    """The same as a graph."""
-    slow, first = start_factors(moment, world_T_ego, settings)
-    graph = nonlinear_graph([slow], {error_key(moment): ERROR_DIM})
-    graph.add(first)
-    return graph
-
-
-def linear_graph(record: Keyed) -> gtsam.NonlinearFactorGraph:
-    """The linear factors of consecutive moments of a record: births and interactions."""
-    factors: list[gtsam.JacobianFactor] = []
-    dims: dict[int, int] = {}
-    known: set[int] = set()
-    for k, moment in record:
-        names = moment.objects.id.tolist()
-        dims.update({object_key(k, name): t.dim for name, t in zip(names, moment.objects.types, strict=True)})
-        factors += linear_factors(k, moment, known)
-        known = set(names)
-    return nonlinear_graph(factors, dims)
-
-
 def linear_factors(k: int, moment: EgoMoment, known: set[int]) -> list[gtsam.JacobianFactor]:
     """Births and interactions of one moment; known: ids of the objects of the moment before, none at the first one."""
     new = np.flatnonzero(~np.isin(moment.objects.id, np.array(sorted(known), dtype=np.int64)))
     births = _births(k, moment, new)
     return births + _motions(k, moment) if known and moment.transition is not None else births
-
-
-def nonlinear_factors(
-    record: Keyed, settings: JointSettings, standing: Sequence[FloatArray] | None = None
-) -> list[Linearisable]:
-    """The nonlinear and robust factors of consecutive moments of a record.
-
-    standing: for each moment the probabilities that its objects stand; None if none is taken to
-    """
-    factors = [*odometry(record, settings), *detections(record, settings)]
-    if standing is not None:
-        factors += standing_factors(record, standing, settings)
-    return factors
 
 
 def odometry(record: Keyed, settings: JointSettings) -> list[Linearisable]:

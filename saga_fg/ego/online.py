@@ -17,12 +17,12 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, checked_covariances
 from saga_fg.ego.estimate import JointEstimate, read_estimate
+from saga_fg.ego.lane_keeping import LaneKeeping
 from saga_fg.ego.record import EgoMoment, Registration
 from saga_fg.ego.settings import JointSettings
 from saga_fg.ego.standing import SlowErrors, standing_probabilities
 from saga_fg.ego.window import Window
 from saga_fg.ego.window_landmarks import WindowLandmarks
-from saga_fg.ego.window_lanes import WindowLanes
 from saga_fg.errors import InputError
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.frame import Frame
@@ -51,6 +51,7 @@ class OnlineEstimator:
     lag        s; the window begins at the last moment that is at least so old
     settings   of the graph; mapper: `gate` of telling landmarks apart, `confirm` of the observations for a sure one
     start      first pose (4, 4), by default the identity
+    providers  of factors of your own, asked when vehicle and objects of a frame are in
 
     Raises `InputError` for a lag that is none, and a first pose that is none.
     """
@@ -62,15 +63,16 @@ class OnlineEstimator:
         settings: JointSettings | None = None,
         mapper: MapperSettings | None = None,
         start: FloatArray | None = None,
+        providers: Sequence[FactorProvider] = (),
     ) -> None:
         if not (math.isfinite(lag) and lag >= 0):
             raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._lag, self._settings = lag, settings or JointSettings()
         self._registration = Registration(tracker, self._settings.motion_noise)
         self._start = np.eye(4) if start is None else checked_transform("start", start)
-        self._window = Window(self._settings)
+        self._window = Window(self._settings, providers)
         self._landmarks = WindowLandmarks(mapper or MapperSettings())
-        self._lanes = WindowLanes(self._settings.lanes, tracker.settings.road_map)
+        self._lanes = LaneKeeping(self._settings.lanes, [tracker.settings.road_map])
         self._standing: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
         self._solution: GraphSolution | None = None
@@ -102,10 +104,11 @@ class OnlineEstimator:
         before = [] if not window.record else list(window.path)
         self._standing = self._judged([*(one for _, one in window.record), moment], np.stack([*before, pose]))
         solution = window.add(moment, pose, self._standing)
+        more: list[FactorProvider] = []
         if observations:
-            self._landmarks.observe(window.record[-1][0], solution, observations)
-        kept = self._lanes.keep(window.record, solution, self._standing[-1])
-        more: list[FactorProvider] = [*([self._landmarks] if observations else []), *([self._lanes] if kept else [])]
+            more.append(self._landmarks.observe(window.record[-1][0], solution, observations))
+        if self._lanes.assign(window.record, read_estimate(window.record[-1:], solution), self._standing[-1:]):
+            more.append(self._lanes)
         if more:
             self._standing = self._judged([one for _, one in window.record], window.path)
             solution = window.extend(self._standing, more)

@@ -15,6 +15,7 @@ from saga_fg.ego.online import OnlineEstimator
 from saga_fg.ego.settings import JointSettings
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
+from saga_fg.graph import FactorProvider
 from saga_fg.landmarks import Landmark, MapperSettings
 from saga_fg.tracking import Tracker
 
@@ -45,6 +46,7 @@ def estimate_online(
     start: FloatArray | None = None,
     landmarks: Observations | None = None,
     mapper: MapperSettings | None = None,
+    providers: Sequence[FactorProvider] = (),
 ) -> OnlineEstimate:
     """Feed n frames to an `OnlineEstimator`; landmarks: what is observed at each moment; the rest as there.
 
@@ -53,7 +55,7 @@ def estimate_online(
     check_times(frames, odometry)
     if landmarks is not None and len(landmarks) != len(frames):
         raise InputError(f"landmarks: expected what is observed at {len(frames)} moments, got {len(landmarks)}")
-    estimator = OnlineEstimator(tracker, lag, settings, mapper, start)
+    estimator = OnlineEstimator(tracker, lag, settings, mapper, start, providers)
     newest, covariances, settled = [], [], []
     for k, frame in enumerate(frames):
         increment = odometry.a_T_b[k - 1] if k else None

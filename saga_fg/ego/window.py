@@ -13,25 +13,26 @@ import gtsam
 import numpy as np
 
 from saga_fg.arrays import FloatArray
-from saga_fg.ego.graph import Keyed, error_key, object_key, pose_key
+from saga_fg.ego.graph import Keyed, error_key, object_key
+from saga_fg.ego.providers import Moments, Standing
 from saga_fg.ego.record import EgoMoment
 from saga_fg.ego.settings import JointSettings
-from saga_fg.ego.window_providers import NewMoment, Standing
 from saga_fg.estimators.graph_engine import RelinearisationSettings
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.geometry import yaw_transform
 from saga_fg.graph import FactorProvider, GraphError
+from saga_fg.landmarks import pose_key
 
 _THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
 
 
 class Window:
-    """Moments with their keys, `record`, in a running graph."""
+    """Moments with their keys, `record`, in a running graph; providers: others that are asked at every moment."""
 
-    def __init__(self, settings: JointSettings) -> None:
+    def __init__(self, settings: JointSettings, providers: Sequence[FactorProvider] = ()) -> None:
         relinearisation = RelinearisationSettings(_THRESHOLD, settings.max_iterations)
-        self._settings, self._smoother = settings, IncrementalSmoother(lag=None, settings=relinearisation)
+        self._settings, self._smoother = settings, IncrementalSmoother(providers, None, relinearisation)
         self._standing = Standing(settings)
         self.record: Keyed = []
 
@@ -57,10 +58,10 @@ class Window:
     def add(self, moment: EgoMoment, pose: FloatArray, standing: Sequence[FloatArray]) -> GraphSolution:
         """Add a moment, whose pose is expected there, and solve; standing: probabilities, of the new moment too."""
         record = [*self.record, (self.record[-1][0] + 1 if self.record else 0, moment)]
-        new = NewMoment(record, pose, self._settings)
+        new = Moments(record[-2:], [pose], self._settings, known=len(record[-2:]) - 1)
         given = self._standing.with_probabilities(record, standing)
         try:
-            self._smoother.step(moment.time, [new, given])
+            self._smoother.step(moment.time, [new, given, *self._smoother.providers])
         except GraphError:
             self._standing = Standing(self._settings)  # it does not know what has become of its factors
             raise

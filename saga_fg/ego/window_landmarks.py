@@ -6,58 +6,54 @@ from collections.abc import Sequence
 
 import gtsam
 
-from saga_fg.ego.graph import pose_key
-from saga_fg.ego.landmarks import landmark_key
 from saga_fg.estimators.graph_solution import GraphSolution
-from saga_fg.graph import LANDMARK, Additions, GraphView, NewVariable
 from saga_fg.landmarks import JointEstimate as LandmarkEstimate
-from saga_fg.landmarks import Landmark, LandmarkType, MapperSettings, Observation, associate, sighting_factors
+from saga_fg.landmarks import (
+    Landmark,
+    LandmarkType,
+    MapperSettings,
+    Observation,
+    Sightings,
+    associate,
+    landmark_key,
+    pose_key,
+)
 
 
 class WindowLandmarks:
     """Which were seen from the moments of the window, and how those were when they left it that are seen no more."""
 
-    name = "landmarks"
-
     def __init__(self, settings: MapperSettings) -> None:
         self._settings = settings
-        self._new = Additions()
-        self._sightings: list[tuple[int, int, Observation]] = []
+        self._last_seen: dict[int, int] = {}
         self._kinds: dict[int, LandmarkType] = {}
         self._count: dict[int, int] = {}
         self._gone: dict[int, Landmark] = {}
 
-    def factors(self, view: GraphView) -> Additions:
-        """New landmarks and the sightings of the newest moment, both as last observed."""
-        return self._new
-
-    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> None:
+    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> Sightings:
         """Tell which landmark each observation from the moment k is of; what is of none begins one."""
         numbers = sorted(self._kinds)
         P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
         states = {n: (self._kinds[n], self._state(n, solution.values)) for n in numbers}
         pose = solution.values.atPose3(pose_key(k)).matrix()
-        pairs = associate(LandmarkEstimate.of(pose, states, P), observations, self._settings.gate)
-        begun, seen = [], []
+        pairs = associate(LandmarkEstimate(pose, P, states), observations, self._settings.gate)
+        start: dict[int, object] = {}
+        seen: list[tuple[int, Observation]] = []
         for row, observation in enumerate(observations):
             if row in pairs:
                 number = pairs[row].landmark
             else:
-                number, kind = len(self._count) + 1, observation.kind
-                self._kinds[number] = kind
-                state = kind.initialise(pose, observation.value)
-                begun.append(NewVariable(LANDMARK, number, state, static=True, label=kind.name, type=kind.variable))
+                number = len(self._count) + 1
+                self._kinds[number] = observation.kind
+                start[number] = observation.kind.initialise(pose, observation.value)
             self._count[number] = self._count.get(number, 0) + 1
-            seen.append((k, number, observation))
-        self._sightings += seen
-        native, ours = sighting_factors((pose_key(k), landmark_key(n), z) for k, n, z in seen)
-        self._new = Additions(begun, [native, *ours])
+            self._last_seen[number] = k
+            seen.append((number, observation))
+        return Sightings({k: seen}, start)
 
     def leave(self, first: int, solution: GraphSolution) -> list[int]:
         """Forget what was seen before the moment `first`; returns the keys of the landmarks that are seen no more."""
-        self._sightings = [sighting for sighting in self._sightings if sighting[0] >= first]
-        still_seen = {number for _, number, _ in self._sightings}
-        gone = [number for number in self._kinds if number not in still_seen]
+        gone = [number for number in self._kinds if self._last_seen[number] < first]
         for number in gone:
             self._gone[number] = self._landmark(number, solution)
             del self._kinds[number]

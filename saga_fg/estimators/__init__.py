@@ -1,6 +1,7 @@
 """Estimators behind one protocol, and the textbook reference they must agree with."""
 
 from saga_fg.estimators.batch import BatchSmoother
+from saga_fg.estimators.batch_graph import BatchSolver
 from saga_fg.estimators.bounded import BoundedKalmanFilter
 from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
@@ -22,6 +23,7 @@ from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 
 __all__ = [
     "BatchSmoother",
+    "BatchSolver",
     "Births",
     "BoundedKalmanFilter",
     "Estimator",

@@ -106,6 +106,16 @@ def tree_covariances(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> 
     return blocks
 
 
+def width(tree: gtsam.GaussianBayesTree) -> int:
+    """Dimensions of the largest clique."""
+    widest, below = 0, list(tree.roots())
+    while below:
+        clique = below.pop()
+        widest = max(widest, clique.conditional().cols() - 1)
+        below += [clique[k] for k in range(clique.nrChildren())]
+    return widest
+
+
 def marginal_covariances(
     blocks: Mapping[int, FloatArray], keys: Sequence[Mapping[int, int]], layouts: Sequence[Layout]
 ) -> list[MarginalCovariances]:

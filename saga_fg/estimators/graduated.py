@@ -9,32 +9,46 @@ standard deviations and c the largest that an inlier may have:
                         0                    s^2 >= (mu+1)/mu c^2       mu from c^2 / (2 s_max^2 - c^2) up, by 1.4,
                         c/s sqrt(mu(mu+1)) - mu  in between              until every weight is 0 or 1
 
+A recording is weighed by `BatchSmoother`; in a factor graph, factors with such a loss (`robust=`) are reached so by
+`solve_graduated`, while other solvers take the loss itself, mu at its end.
+
 Source: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
+import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
+from factors import ResidualFactor, ResidualFactors, Solution, SolverSettings, solve
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+from saga_fg.graph.factor_groups import ActiveRows, SingleGroup, StackedGroup
 from saga_fg.settings import setting
+
+log = logging.getLogger(__name__)
 
 Loss = Literal["truncated", "geman-mcclure"]
 
 _STEP = 1.4  # of mu, as in the paper
 _BINARY = 1e-6  # distance from 0 or 1 at which a weight counts as there
+MAX_STAGES = 200
+_ITERATIONS = 3  # of a stage before the last one
 
 
 @dataclass(frozen=True)
 class GraduatedNonConvexity:
-    """A robust loss for `BatchSmoother`, reached by graduated non-convexity."""
+    """A robust loss that is reached by graduated non-convexity; mu: of the surrogate that this is, None: the end."""
 
     scale: float = setting(3.0, "c: largest distance of an inlier's residual, standard deviations")
     loss: Loss = setting("truncated", "truncated: outliers are rejected altogether; geman-mcclure: nearly")
+    mu: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.scale < np.inf:
@@ -70,3 +84,86 @@ class GraduatedNonConvexity:
             return np.asarray((s <= 1).astype(np.float64))
         between = np.sqrt(mu * (mu + 1)) / np.maximum(s, 1e-300) - mu
         return np.asarray(np.where(s**2 <= mu / (mu + 1), 1.0, np.where(s**2 >= (mu + 1) / mu, 0.0, between)))
+
+    def weight(self, distance: ArrayLike) -> FloatArray:
+        """w of the surrogate at each distance, as `factors.Robust`."""
+        return self.weights(self.last if self.mu is None else self.mu, np.asarray(distance, dtype=np.float64))
+
+    def cost(self, distance: ArrayLike) -> FloatArray:
+        """rho of the surrogate, rho'(s) = s w(s), at each distance."""
+        q = np.square(np.asarray(distance, dtype=np.float64) / self.scale)
+        mu, half = self.last if self.mu is None else self.mu, 0.5 * self.scale**2
+        if self.loss == "geman-mcclure":
+            return np.asarray(half * mu * q / (mu + q))
+        if np.isinf(mu):
+            return np.asarray(half * np.minimum(q, 1))
+        between = 2 * np.sqrt(mu * (mu + 1) * q) - mu * (1 + q)
+        return np.asarray(half * np.where(q <= mu / (mu + 1), q, np.where(q >= (mu + 1) / mu, 1.0, between)))
+
+    def model(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
+        """GTSAM's noise model for the loss itself over `noise`."""
+        kinds = gtsam.noiseModel.mEstimator
+        made = kinds.TruncatedLeastSquares if self.loss == "truncated" else kinds.GemanMcClure
+        return gtsam.noiseModel.Robust.Create(made.Create(self.scale), noise)
+
+
+def solve_graduated(
+    graph: gtsam.NonlinearFactorGraph, factors: Sequence[ActiveRows], start: gtsam.Values, settings: SolverSettings
+) -> Solution:
+    """The minimum as `factors.solve` finds it, those losses graduated that ask for it. Raises what `solve` raises."""
+    losses = {k: loss for k, rows in enumerate(factors) if (loss := _loss(rows)) is not None}
+    if not losses:
+        return solve(graph, factors, start, settings)
+
+    def solved(surrogates: Mapping[int, GraduatedNonConvexity | None], values: gtsam.Values, last: bool) -> Solution:
+        staged = [_with(rows, surrogates[k]) if k in losses else rows for k, rows in enumerate(factors)]
+        limit = settings.max_iterations if last else min(settings.max_iterations, _ITERATIONS)
+        return solve(graph, staged, values, replace(settings, max_iterations=limit))
+
+    def distances(values: gtsam.Values) -> dict[GraduatedNonConvexity, FloatArray]:
+        parts = {loss: [_distances(factors[k], values) for k in losses if losses[k] == loss] for loss in kinds}
+        return {loss: np.concatenate(parts[loss]) for loss in kinds}
+
+    kinds = list(dict.fromkeys(losses.values()))
+    solution = solved(dict.fromkeys(losses), start, last=True)
+    found = distances(solution.values)
+    mu: dict[GraduatedNonConvexity, float | None] = {loss: loss.first(found[loss]) for loss in kinds}
+    for _ in range(MAX_STAGES):
+        last = all(at is None for at in mu.values())
+        solution = solved({k: replace(loss, mu=mu[loss]) for k, loss in losses.items()}, solution.values, last)
+        if last:
+            return solution
+        found = distances(solution.values)
+        for loss, at in mu.items():
+            mu[loss] = None if at is None else loss.next(at, loss.weights(at, found[loss]))
+    log.warning("graduated non-convexity has not settled in %d stages", MAX_STAGES)
+    return solution
+
+
+def _loss(rows: ActiveRows) -> GraduatedNonConvexity | None:
+    loss = getattr(_factor(rows), "robust", None)
+    return loss if isinstance(loss, GraduatedNonConvexity) else None
+
+
+def _factor(rows: ActiveRows) -> ResidualFactors | ResidualFactor | None:
+    if isinstance(rows.group, StackedGroup):
+        return rows.group.factors
+    single = rows.group.factor if isinstance(rows.group, SingleGroup) else None
+    return single if isinstance(single, ResidualFactor) else None
+
+
+def _with(rows: ActiveRows, loss: GraduatedNonConvexity | None) -> ActiveRows:
+    """The same factors under another loss."""
+    if isinstance(rows.group, StackedGroup):
+        return replace(rows, group=replace(rows.group, factors=replace(rows.group.factors, robust=loss)))
+    assert isinstance(rows.group, SingleGroup)
+    assert isinstance(rows.group.factor, ResidualFactor)
+    return replace(rows, group=replace(rows.group, factor=replace(rows.group.factor, robust=loss)))
+
+
+def _distances(rows: ActiveRows, values: gtsam.Values) -> FloatArray:
+    """Of the residuals (n,), standard deviations: without a loss the cost is s^2 / 2."""
+    plain = _with(rows, None)
+    if isinstance(plain.group, StackedGroup):
+        return np.sqrt(2 * plain.group.factors.errors(values, rows.chosen))
+    return np.sqrt([2 * plain.error(values)])

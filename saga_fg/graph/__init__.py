@@ -3,7 +3,7 @@
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.keys import EGO_ERROR, EGO_POSE, LANDMARK, MAP_NODE, OBJECT, KeyId, Kind, key_id, key_of
 from saga_fg.graph.parts import FactorEntry, NewVariable
-from saga_fg.graph.providers import Additions, FactorProvider, GraphView
+from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable
 
@@ -24,6 +24,7 @@ __all__ = [
     "NewVariable",
     "SceneFactorGraph",
     "UndeterminedError",
+    "ask_all",
     "key_id",
     "key_of",
 ]

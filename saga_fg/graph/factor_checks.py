@@ -20,7 +20,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import Linearisable, ResidualFactor, ResidualFactors, Vector
+from factors import Linearisable, OrientedPlane, PlanarPose, ResidualFactor, ResidualFactors, SpatialPose, Vector
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_groups import CustomGroup, FactorGroup, LinearGroup, NativeGroup, SingleGroup, StackedGroup
 from saga_fg.graph.keys import described
@@ -128,7 +128,10 @@ def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) ->
             return "expected finite numbers"
     elif isinstance(group, StackedGroup):
         expected = [Vector(dim) if isinstance(dim, int | np.integer) else dim for dim in group.factors.dims]
-        return _types(expected, types) if row == 0 or expected != types else ""
+        plain = [
+            kind if isinstance(kind, PlanarPose | SpatialPose | OrientedPlane) else Vector(kind.dim) for kind in types
+        ]
+        return _types(expected, plain) if row == 0 or expected != plain else ""
     elif isinstance(group, SingleGroup) and isinstance(group.factor, ResidualFactor):
         return _types(group.factor.variables, types)
     elif isinstance(group, NativeGroup):

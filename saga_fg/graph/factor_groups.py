@@ -16,7 +16,7 @@ import numpy as np
 
 from factors import FactorError, Linearisable, ResidualFactors
 from factors.differences import central_differences
-from factors.gaussian import native_factor, whitened_factors
+from factors.gaussian import gaussian_graph, native_factor, whitened_factors
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.graph.point import Point
 
@@ -36,11 +36,7 @@ class FactorGroup(Protocol):
     def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
         """The rows `chosen`, on increments from the base. Raises what the factors raise."""
 
-
-class SolvableGroup(FactorGroup, Protocol):
-    """A group whose cost is known without the base."""
-
-    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+    def error(self, chosen: IntArray, point: Point) -> float:
         """The cost, -log phi, of the rows `chosen` together."""
 
 
@@ -62,11 +58,11 @@ class LinearGroup:
             result.append(native_factor(keys, point.dims(keys), augmented))
         return result
 
-    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
+    def error(self, chosen: IntArray, point: Point) -> float:
         total = 0.0
         for row in chosen.tolist():
             augmented = self.factors[row].augmentedJacobian()
-            x = np.concatenate([values.atVector(key) for key in self.rows[row]])
+            x = np.concatenate([point.values.atVector(key) for key in self.rows[row]])
             total += 0.5 * float(np.sum((augmented[:, :-1] @ x - augmented[:, -1]) ** 2))
         return total
 
@@ -83,12 +79,22 @@ class PriorGroup:
     def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
         return [self.factors[row] for row in chosen.tolist()]
 
-    def native(self, chosen: IntArray, base: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """The same for GTSAM's solvers."""
-        linear = gtsam.GaussianFactorGraph()
+    def here(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+        """The same on increments from the point."""
+        result = []
         for row in chosen.tolist():
-            linear.push_back(self.factors[row])
-        return gtsam.LinearContainerFactor.ConvertLinearGraph(linear, base)
+            keys, augmented = self.rows[row], np.array(self.factors[row].augmentedJacobian(), order="F")
+            augmented[:, -1] -= augmented[:, :-1] @ np.concatenate([point.increment(key) for key in keys])
+            dims = point.dims(keys)
+            for key, end in zip(keys, np.cumsum(dims).tolist(), strict=True):
+                columns, D = slice(end - point.variables[key].dim, end), point.transport(key)
+                if D is not None:
+                    augmented[:, columns] = augmented[:, columns] @ np.linalg.inv(D)
+            result.append(native_factor(keys, dims, augmented))
+        return result
+
+    def error(self, chosen: IntArray, point: Point) -> float:
+        return 0.5 * sum(float(np.sum(f.augmentedJacobian()[:, -1] ** 2)) for f in self.here(chosen, point))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +112,8 @@ class StackedGroup:
     def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
         W, jacobians, residuals = self.factors.linearisation(point.values, chosen)
         keys, rhs, blocks = self.factors.rows[chosen], -residuals, []
+        if point.base is point.values:
+            return whitened_factors(keys, W, jacobians, rhs)
         states, origins = self.factors.states(point.values, chosen), self.factors.states(point.base, chosen)
         for k, J in enumerate(jacobians):
             column = keys[:, k].tolist()
@@ -119,8 +127,8 @@ class StackedGroup:
             blocks.append(J)
         return whitened_factors(keys, W, blocks, rhs)
 
-    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
-        return float(self.factors.errors(values, chosen).sum())
+    def error(self, chosen: IntArray, point: Point) -> float:
+        return float(self.factors.errors(point.values, chosen).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +145,7 @@ class SingleGroup:
         (keys,) = self.rows
         if not isinstance(made, gtsam.GaussianFactor | gtsam.GaussianFactorGraph):
             raise FactorError(f"expected linearise to give a gtsam.GaussianFactor, got {type(made).__name__}")
-        if isinstance(made, gtsam.GaussianFactor):
-            graph = gtsam.GaussianFactorGraph()
-            graph.push_back(made)
-        else:
-            graph = made
+        graph = gaussian_graph([made]) if isinstance(made, gtsam.GaussianFactor) else made
         if set(graph.keyVector()) != set(keys):
             raise FactorError("expected linearise to speak of all of the factor's keys, and of no others")
         if isinstance(made, gtsam.GaussianFactor):
@@ -149,8 +153,8 @@ class SingleGroup:
         A, b = made.jacobian(gtsam.Ordering(list(keys)))
         return [point.from_base(keys, np.column_stack([A, b]))]
 
-    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
-        return self.factor.error(values)
+    def error(self, chosen: IntArray, point: Point) -> float:
+        return self.factor.error(point.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +170,8 @@ class NativeGroup:
         made = self.factor.linearize(point.values)
         return [point.from_base(list(made.keys()), made.augmentedJacobian())]
 
-    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
-        return float(self.factor.error(values))
+    def error(self, chosen: IntArray, point: Point) -> float:
+        return float(self.factor.error(point.values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +200,8 @@ class CustomGroup:
             whitened *= np.sqrt(noise.weight(whitened[:, -1]))
         return [point.from_base(keys, whitened)]
 
-    def error(self, chosen: IntArray, values: gtsam.Values) -> float:
-        return float(self.factor.error(values))
+    def error(self, chosen: IntArray, point: Point) -> float:
+        return float(self.factor.error(point.values))
 
     def _residual(self, keys: Sequence[int], states: Sequence[Any]) -> FloatArray:
         values = gtsam.Values()  # its own variables alone: GTSAM copies all of them for every call
@@ -215,7 +219,7 @@ class CustomGroup:
 class ActiveRows:
     """The rows of a group that are still there, for `factors.solve`."""
 
-    group: SolvableGroup
+    group: FactorGroup
     chosen: IntArray
     point: Point
 
@@ -224,10 +228,9 @@ class ActiveRows:
         return tuple({key for row in self.chosen.tolist() for key in self.group.rows[row]})
 
     def error(self, values: gtsam.Values) -> float:
-        return self.group.error(self.chosen, values)
+        return self.group.error(self.chosen, Point(self.point.variables, self.point.base, values))
 
     def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        graph = gtsam.GaussianFactorGraph()
-        for factor in self.group.linearised(self.chosen, Point(self.point.variables, values, values)):
-            graph.push_back(factor)
-        return graph
+        if isinstance(self.group, PriorGroup):
+            return gaussian_graph(self.group.here(self.chosen, Point(self.point.variables, self.point.base, values)))
+        return gaussian_graph(self.group.linearised(self.chosen, Point(self.point.variables, values, values)))

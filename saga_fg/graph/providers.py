@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import gtsam
+import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.graph.errors import GraphError
@@ -108,6 +109,17 @@ class GraphView:
     def covariance(self, key: int) -> FloatArray:
         """Marginal covariance (d, d) of a variable, as known before this frame."""
         return self._covariance(key)
+
+
+def ask_all(providers: Iterable[FactorProvider], graph: SceneFactorGraph) -> None:
+    """Add what providers give at the present epoch of a recording that is solved as a whole."""
+    view = GraphView(graph, _unknown, np.zeros(2))
+    for provider in providers:
+        ask(provider, graph, view)
+
+
+def _unknown(key: int) -> FloatArray:
+    raise GraphError("covariance: a recording is solved as a whole, no marginal is known before")
 
 
 def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:

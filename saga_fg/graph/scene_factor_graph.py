@@ -23,14 +23,14 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
+from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, nonlinear_graph, solve
 from factors.marginal import Elimination
 from factors.validation import format_key
 from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_checks import Factor, grouped
-from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, NativeGroup, PriorGroup
+from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, LinearGroup, NativeGroup, PriorGroup
 from saga_fg.graph.keys import Kind, described, key_of
 from saga_fg.graph.parts import FactorEntry, HeldGroup, NewVariable
 from saga_fg.graph.point import Point
@@ -254,13 +254,15 @@ class SceneFactorGraph:
     def parts(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
-        for held in self._groups.values():
+        for held in sorted(self._groups.values(), key=lambda held: held.sharpness):
             if isinstance(held.factors, NativeGroup):
                 native.add(held.factors.factor)
-            elif isinstance(held.factors, PriorGroup):
-                native.push_back(held.factors.native(held.rows, self._base))
+            elif isinstance(held.factors, LinearGroup):
+                rows, held_rows = held.rows.tolist(), held.factors.rows
+                dims = {key: self._variables[key].dim for row in rows for key in held_rows[row]}
+                native.push_back(nonlinear_graph([held.factors.factors[row] for row in rows], dims))
             else:
-                ours.append(ActiveRows(held.factors, held.rows, point))  # type: ignore[arg-type]
+                ours.append(ActiveRows(held.factors, held.rows, point))
         return native, ours
 
     def copy(self) -> SceneFactorGraph:

@@ -1,10 +1,14 @@
-"""SLAM with landmarks whose identities nobody tells: online, with everything smoothed again from time to time.
+"""SLAM with landmarks whose identities nobody tells: online, in a running graph that iSAM2 keeps smoothed.
 
-Between two smoothings the pose and the landmarks are one Gaussian (`JointEstimate`), which is what gates need: the
-innovation of an observation takes the correlation of pose and landmark into account. Everything is kept as factors,
-and every `smooth_every` observations the whole graph is solved anew from where it stood, so that linearisation errors
-do not add up; the joint marginal of the newest pose and all landmarks then replaces the Gaussian. At the same time
-landmarks that turn out to be one are merged (see `merging`).
+Every pose, landmark and observation is in the graph (`saga_fg.graph`), and every estimate is that of all of it. Which
+observation is of which landmark is told by the joint marginal of the newest pose and those landmarks that come into
+question: as a covariance P of two parts is never larger than twice its diagonal blocks,
+
+    d^2 = r^T (A P A^T + 1)^-1 r   >=   r^T (2 A_p P_pp A_p^T + 2 A_l P_ll A_l^T + 1)^-1 r
+
+a landmark whose right side is outside the gate is outside it for sure. What is known of a landmark only grows, so P_ll
+may be an old one. Every `smooth_every` observations landmarks that turn out to be one are merged (see `merging`), with
+the same bound on the pairs.
 
 How far odometry and sensor are to be believed is itself a hypothesis, and the probability of all that was measured says
 which is the better one, without any truth (Laplace's approximation at the solution x* with information matrix H):
@@ -14,31 +18,30 @@ which is the better one, without any truth (Laplace's approximation at the solut
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
-import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
-from factors import (
-    Linearisable,
-    SolverSettings,
-    between_factor,
-    marginal_moments,
-    pose,
-    pose_prior_factor,
-    solve,
-)
+from factors import ResidualFactor, Solution, Variable
 from saga_fg.arrays import FloatArray
+from saga_fg.association import gate
+from saga_fg.estimators.graph_engine import RelinearisationSettings
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.incremental_graph import IncrementalSmoother
+from saga_fg.graph import Additions, GraphView
 from saga_fg.landmarks.association import associate
-from saga_fg.landmarks.factors import sighting_factors
 from saga_fg.landmarks.joint_estimate import JointEstimate
-from saga_fg.landmarks.merging import duplicates
+from saga_fg.landmarks.merging import duplicates, possible_duplicates
 from saga_fg.landmarks.protocol import LandmarkType, Observation
+from saga_fg.landmarks.providers import MeasuredMotion, Sightings, landmark_key, pose_key, sighting_factors
 from saga_fg.settings import require_between, setting
 
-_SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
+_THRESHOLD = 0.05  # standard deviations that a variable moves before its factors are linearised anew
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,27 @@ class LandmarkMap:
     sightings: list[Sighting]
 
 
+def landmarks_of(
+    seen: Iterable[tuple[int, Observation]], solution: Solution | GraphSolution, confirm: int = 1
+) -> list[Landmark]:
+    """The landmarks, by number, of which these observations are, where a solution has them."""
+    kinds, counts = dict[int, LandmarkType](), Counter[int]()
+    for number, observation in seen:
+        kinds[number] = observation.kind
+        counts[number] += 1
+    return [
+        Landmark(
+            number,
+            kinds[number],
+            kinds[number].variable.read(solution.values, landmark_key(number)),
+            solution.marginal(landmark_key(number)),
+            count,
+            count >= confirm,
+        )
+        for number, count in sorted(counts.items())
+    ]
+
+
 class LandmarkMapper:
     """Builds a map from odometry and observations, one pose after the other.
 
@@ -100,130 +124,142 @@ class LandmarkMapper:
     ) -> None:
         """world_T_pose: the first pose, (3, 3) in the plane or (4, 4); covariance: of its tangent."""
         self.settings = settings or MapperSettings()
-        self.estimate = JointEstimate(world_T_pose, covariance)
-        self._native = gtsam.NonlinearFactorGraph()
-        self._native.add(pose_prior_factor(_pose_key(0), world_T_pose, covariance))
-        self._values = gtsam.Values()
-        self._values.insert(_pose_key(0), pose("world_T_pose", world_T_pose))
-        self._poses = 1
+        self._smoother = IncrementalSmoother(lag=None, settings=RelinearisationSettings(_THRESHOLD))
         self._sightings: list[Sighting] = []
-        self._numbers = 0
-        self._since = 0
-        self._normaliser = _log_det(covariance)
+        self._kinds: dict[int, LandmarkType] = {}
+        self._bounds: dict[int, FloatArray] = {}  # covariances (d, d) of landmarks as known once
+        self._numbers = self._since = 0
+        self._normaliser = 0.0
+        self.move(world_T_pose, covariance)
+
+    @property
+    def pose(self) -> FloatArray:
+        """The newest pose (d + 1, d + 1)."""
+        return np.asarray(self._pose(self._smoother.graph().epoch).matrix())
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on to the next pose by odometry: a_T_b (d + 1, d + 1), covariance of its tangent."""
-        self._native.add(between_factor(_pose_key(self._poses - 1), _pose_key(self._poses), a_T_b, covariance))
-        self.estimate.move(a_T_b, covariance)
+        self._smoother.step(float(self._smoother.graph().epoch + 1), [MeasuredMotion(a_T_b, covariance)])
         self._normaliser += _log_det(covariance)
-        self._values.insert(_pose_key(self._poses), self.estimate.pose)
-        self._poses += 1
 
     def observe(self, observations: Sequence[Observation]) -> list[int]:
         """Take in what is seen from the present pose.
 
         Returns the number of the landmark of each; what is not surely a known one begins a new one.
         """
-        pairs = associate(self.estimate, observations, self.settings.gate)
-        if pairs:
-            self.estimate.update(list(pairs.values()))
+        if not observations:
+            return []
+        pairs = associate(self.estimate(self._in_question(observations)), observations, self.settings.gate)
         taken: list[int] = []
+        start: dict[int, Any] = {}
         for row, observation in enumerate(observations):
-            if row in pairs:
-                taken.append(pairs[row].landmark)
-                continue
-            self._numbers += 1
-            self.estimate.append(self._numbers, observation)
-            self._values.insert(_landmark_key(self._numbers), self.estimate.state(self._numbers))
-            taken.append(self._numbers)
-        self._sightings += [
-            Sighting(self._poses - 1, observation, number)
-            for observation, number in zip(observations, taken, strict=True)
-        ]
+            if row not in pairs:
+                self._numbers += 1
+                self._kinds[self._numbers] = observation.kind
+                start[self._numbers] = observation.kind.initialise(self.pose, observation.value)
+            taken.append(pairs[row].landmark if row in pairs else self._numbers)
+        epoch = self._smoother.graph().epoch
+        self._smoother.extend([Sightings({epoch: list(zip(taken, observations, strict=True))}, start)])
+        for number in taken:
+            self._bounds[number] = self._smoother.covariance(landmark_key(number))
+        self._sightings += [Sighting(epoch, z, number) for z, number in zip(observations, taken, strict=True)]
         self._normaliser += sum(_log_det(observation.covariance) for observation in observations)
         self._since += len(observations)
         if self._since >= self.settings.smooth_every:
-            self.smooth()
+            self.merge()
         return taken
 
-    def smooth(self) -> None:
-        """Solve for all poses and landmarks, and merge what turns out to be one."""
+    def estimate(self, numbers: Iterable[int] | None = None) -> JointEstimate:
+        """The newest pose and landmarks, by default all, with their joint covariance."""
+        chosen = sorted(self._kinds if numbers is None else numbers)
+        newest = pose_key(self._smoother.graph().epoch)
+        return self._gaussian(self._smoother.joint_covariance([newest, *map(landmark_key, chosen)]), chosen)
+
+    def merge(self) -> None:
+        """Merge landmarks that turn out to be one."""
         self._since = 0
-        self._solve()
-        while merged := duplicates(self.estimate, self.settings.merge, self._apart()):
+        while merged := self._duplicates():
+            seen: dict[int, list[tuple[int, Observation]]] = {}
+            changed = {s.pose for s in self._sightings if s.landmark in merged}
             self._sightings = [replace(s, landmark=merged.get(s.landmark, s.landmark)) for s in self._sightings]
+            for s in self._sightings:
+                if s.pose in changed:
+                    seen.setdefault(s.pose, []).append((s.landmark, s.observation))
+            self._smoother.extend([_Merged(seen, [(n, self._kinds[n].variable) for n in merged])])
+            self._smoother.marginalise(map(landmark_key, merged))
             for number in merged:
-                self._values.erase(_landmark_key(number))
-            self._solve()
+                del self._kinds[number], self._bounds[number]
 
     def log_evidence(self) -> float:
-        """log p(z) of everything measured so far, smoothed."""
-        self.smooth()
-        graph, factors = self._graph()
-        solution = solve(graph, factors, self._values, _SOLVER)
+        """log p(z) of everything measured so far."""
+        self.merge()
+        solution = self._smoother.snapshot().solve()
         half_log_det = float(solution.linear.eliminateMultifrontal().logDeterminant())
-        free = sum(self._values.dims().values())
-        expected = sum(float(np.log(kind.density)) for kind in self.estimate.kinds.values())
+        free = sum(solution.values.dims().values())
+        expected = sum(float(np.log(kind.density)) for kind in self._kinds.values())
         volume = 0.5 * free * float(np.log(2 * np.pi))
         return -solution.error - half_log_det + volume - 0.5 * self._normaliser + expected
 
     def map(self) -> LandmarkMap:
-        """Everything, smoothed."""
-        self.smooth()
-        seen = [s.landmark for s in self._sightings]
-        landmarks = [
-            Landmark(
-                number,
-                kind,
-                self.estimate.state(number),
-                self.estimate.covariance([number]),
-                seen.count(number),
-                seen.count(number) >= self.settings.confirm,
-            )
-            for number, kind in sorted(self.estimate.kinds.items())
-        ]
-        at = self._values.atPose2 if self.estimate.planar else self._values.atPose3
-        poses = np.stack([at(_pose_key(i)).matrix() for i in range(self._poses)])
+        """Everything."""
+        self.merge()
+        seen = ((s.landmark, s.observation) for s in self._sightings)
+        landmarks = landmarks_of(seen, self._smoother.solution(), self.settings.confirm)
+        poses = np.stack([self._pose(epoch).matrix() for epoch in range(self._smoother.graph().epoch + 1)])
         return LandmarkMap(poses, landmarks, list(self._sightings))
 
-    def _solve(self) -> None:
-        graph, factors = self._graph()
-        solution = solve(graph, factors, self._values, _SOLVER)
-        self._values = solution.values
-        kinds = {s.landmark: s.observation.kind for s in self._sightings}
-        numbers = sorted(kinds)
-        keys = [_pose_key(self._poses - 1), *map(_landmark_key, numbers)]
-        _, covariance = marginal_moments(solution.linear, keys)
-        at = self._values.atPose2 if self.estimate.planar else self._values.atPose3
-        states = {
-            number: (kinds[number], kinds[number].variable.read(self._values, _landmark_key(number)))
-            for number in numbers
-        }
-        self.estimate = JointEstimate.of(at(keys[0]).matrix(), states, covariance)
+    def _pose(self, epoch: int) -> Any:
+        return self._smoother.state(pose_key(epoch))
 
-    def _graph(self) -> tuple[gtsam.NonlinearFactorGraph, list[Linearisable]]:
-        graph = self._native.clone()
-        seen, factors = sighting_factors(
-            (_pose_key(s.pose), _landmark_key(s.landmark), s.observation) for s in self._sightings
-        )
-        graph.push_back(seen)
-        return graph, factors
+    def _gaussian(self, covariance: FloatArray, numbers: Iterable[int]) -> JointEstimate:
+        landmarks = {n: (self._kinds[n], self._smoother.state(landmark_key(n))) for n in numbers}
+        return JointEstimate(self.pose, covariance, landmarks)
 
-    def _apart(self) -> set[tuple[int, int]]:
-        """Pairs of landmarks that were seen from one pose."""
+    def _bound(self) -> JointEstimate:
+        """The newest pose and all landmarks with a covariance that is larger than theirs, in blocks."""
+        P = self._smoother.covariance(pose_key(self._smoother.graph().epoch))
+        numbers = sorted(self._kinds)
+        return self._gaussian(2 * block_diag(P, *(self._bounds[n] for n in numbers)), numbers)
+
+    def _in_question(self, observations: Sequence[Observation]) -> set[int]:
+        """The landmarks that any of the observations may be of."""
+        bound, found = self._bound(), set[int]()
+        for observation in observations:
+            kind = observation.kind
+            innovations = bound.innovations(observation, (n for n, other in self._kinds.items() if other == kind))
+            if innovations:
+                inside = bound.squared_distances(innovations)[0] < gate(self.settings.gate, kind.variable.dim)
+                found |= {innovations[k].landmark for k in np.flatnonzero(inside).tolist()}
+        return found
+
+    def _duplicates(self) -> dict[int, int]:
+        """Which landmark is to become which."""
         seen: dict[int, set[int]] = {}
         for sighting in self._sightings:
             seen.setdefault(sighting.pose, set()).add(sighting.landmark)
-        return {(i, j) for together in seen.values() for i in together for j in together if i < j}
+        apart = {(i, j) for together in seen.values() for i in together for j in together if i < j}
+        pairs = possible_duplicates(self._bound(), self.settings.merge, apart)
+        return (
+            duplicates(self.estimate({n for pair in pairs for n in pair}), self.settings.merge, apart) if pairs else {}
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Merged:
+    """What was seen, of landmarks under other numbers; the old ones are held where they are until they leave."""
+
+    seen: Mapping[int, Sequence[tuple[int, Observation]]]
+    old: Sequence[tuple[int, Variable]]
+    name: str = Sightings.name
+
+    def factors(self, view: GraphView) -> Additions:
+        held = []
+        for number, variable in self.old:
+            key = landmark_key(number)
+            off = partial(variable.local, view.state(key))
+            held.append(ResidualFactor((key,), (variable,), off, np.eye(variable.dim), name="held"))
+        return Additions(factors=held, named={k: sighting_factors({k: now}) for k, now in self.seen.items()})
 
 
 def _log_det(covariance: FloatArray) -> float:
     return float(np.linalg.slogdet(2 * np.pi * np.asarray(covariance))[1])
-
-
-def _pose_key(index: int) -> int:
-    return int(gtsam.symbol("x", index))
-
-
-def _landmark_key(number: int) -> int:
-    return int(gtsam.symbol("l", number))

@@ -21,6 +21,7 @@ import gtsam
 
 from factors import Linearisable, PlanarPose, SpatialPose, Variable
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances
+from saga_fg.frame import Frame
 
 LandmarkFactors = Sequence[Linearisable] | gtsam.NonlinearFactorGraph
 
@@ -73,3 +74,10 @@ class Observation:
         object.__setattr__(self, "value", checked(f"observed {self.kind.name}", self.value, (None,)))
         covariance = checked_covariances(f"covariance of a {self.kind.name}", [self.covariance], 1, d)[0]
         object.__setattr__(self, "covariance", covariance)
+
+
+class LandmarkDetector(Protocol):
+    """What finds landmarks in the data of a moment: a frame, or the points (N, 3), m, of a scan."""
+
+    def observations(self, seen: Frame | FloatArray) -> Sequence[Observation]:
+        """Return what is observed, in the coordinates that the data are in, from the pose of vehicle or sensor."""

@@ -17,8 +17,8 @@ from saga_fg.ego import (
     OdometryNoise,
     estimate_jointly,
     estimate_online,
+    lane_keeping,
     lane_key,
-    window_lanes,
 )
 from saga_fg.ego.lanes import KnownLane, keepings, known_lanes
 from saga_fg.geometry import inverse_transform, yaw_transform
@@ -142,8 +142,8 @@ def test_a_map_that_every_frame_brings_is_read_once(monkeypatch: pytest.MonkeyPa
         read.append(len(maps))
         return known_lanes(maps)
 
-    monkeypatch.setattr(window_lanes, "known_lanes", counted)
-    lanes, same = window_lanes.WindowLanes(LaneSettings(), None), road()
+    monkeypatch.setattr(lane_keeping, "known_lanes", counted)
+    lanes, same = lane_keeping.LaneKeeping(LaneSettings(), []), road()
     for _ in range(3):
         lanes.learn(same)
-    assert read == [1, 2]  # at the start, and with the first map
+    assert read == [1]

@@ -14,9 +14,9 @@ USUAL = (0.02, 0.1, 0.37, 0.5, 1.2)
 MILLISECONDS = (1e-3, 0.05, 1.0)
 
 
-def largest_errors(program, lag):
+def largest_errors(program, estimator):
     """Of means in posterior sigmas, of joint and of single covariances relative, after every operation."""
-    estimator, textbook = GraphEstimator(lag), TextbookEstimator()
+    textbook = TextbookEstimator()
     errors = np.zeros(3)
     for operation in program:
         operation.run(textbook)
@@ -38,7 +38,9 @@ def largest_errors(program, lag):
 @pytest.mark.parametrize("seed", range(10))
 def test_random_programs_agree_with_the_textbook(seed, lag):
     """Births, deaths, misses, several sensors, graphs that change, nodes of four kinds."""
-    mean, joint, single = largest_errors(random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), lag)
+    mean, joint, single = largest_errors(
+        random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), GraphEstimator(lag)
+    )
     assert mean < (1e-9 if lag == 0.0 else 5e-9)
     assert joint < 1e-9
     assert single < 1e-8  # iSAM2's marginals have one digit less
@@ -49,13 +51,13 @@ def test_random_programs_agree_with_the_textbook(seed, lag):
 def test_milliseconds_beside_seconds(seed, lag):
     """With constant velocity. The noise of constant acceleration falls with the fifth power of the interval."""
     program = random_program(np.random.default_rng(seed), moments=9, intervals=MILLISECONDS, kinds=(CAR, CONE))
-    mean, joint, single = largest_errors(program, lag)
+    mean, joint, single = largest_errors(program, GraphEstimator(lag))
     assert max(mean, joint, single) < 1e-9
 
 
 def test_a_long_program_does_not_drift_away():
     program = random_program(np.random.default_rng(100), moments=60, kinds=(CAR, CONE), intervals=USUAL, density=0.15)
-    mean, joint, single = largest_errors(program, 0.0)
+    mean, joint, single = largest_errors(program, GraphEstimator(0.0))
     assert max(mean, joint, single) < 1e-9
 
 

@@ -1,4 +1,4 @@
-"""Factor providers of the online window: a moment with its odometry, objects and detections, and who stands."""
+"""Factor providers of the vehicle and the objects around it, of a whole recording or of a moment that comes."""
 
 from __future__ import annotations
 
@@ -32,33 +32,41 @@ _SAME = 1e-3  # probability
 
 
 @dataclass(frozen=True, eq=False)
-class NewMoment:
-    """The last of `record`, after the one before: pose (4, 4) where the vehicle is expected."""
+class Moments:
+    """The moments of `record`, one a frame; the graph has the first `known` of them already.
+
+    path: poses (4, 4) where the vehicle is expected at the others. Odometry and detections come with the last moment,
+    so that all are linearised together.
+    """
 
     record: Keyed
-    pose: FloatArray
+    path: Sequence[FloatArray] | FloatArray
     settings: JointSettings
+    known: int = 0
     name: str = "vehicle and objects"
 
     def factors(self, view: GraphView) -> Additions:
-        (k, moment), before = self.record[-1], view.before(OBJECT)
-        last = self.record[-2:]
+        row = view.epoch - self.record[0][0]
+        (k, moment), pose = self.record[row], self.path[row - self.known]
+        before = set(self.record[row - 1][1].objects.id.tolist()) if row else set()
         slow = view.state(error_key(k - 1)) if k else np.zeros(ERROR_DIM)
-        new = [NewVariable(EGO_POSE, 0, gtsam.Pose3(self.pose), label="vehicle"), NewVariable(EGO_ERROR, 0, slow)]
-        seen = dict(zip(moment.seen.id.tolist(), transform_points(self.pose, moment.seen.z)[:, :2], strict=True))
+        new = [NewVariable(EGO_POSE, 0, gtsam.Pose3(pose), label="vehicle"), NewVariable(EGO_ERROR, 0, slow)]
+        seen = dict(zip(moment.seen.id.tolist(), transform_points(pose, moment.seen.z)[:, :2], strict=True))
         objects = moment.objects
         for name, kind, label in zip(objects.id.tolist(), objects.types, objects.label, strict=True):
+            state = np.zeros(kind.dim)
             if name in before:  # it goes on as it was going
                 state = np.array(view.state(object_key(k - 1, name)))
                 state[kind.index(POSITION)] += view.dt * state[kind.index(VELOCITY)]
-            else:
-                state = np.zeros(kind.dim)
+            if name in seen:
                 state[kind.index(POSITION)] = seen[name]
             new.append(NewVariable(OBJECT, name, state, label=label))
-        factors: list[Factor] = [*linear_factors(k, moment, set(before))]
-        factors += [*odometry(last, self.settings), *detections(last[-1:], self.settings)]
+        factors: list[Factor] = [*linear_factors(k, moment, before)]
         if k == 0:
-            factors += start_factors(k, self.pose, self.settings)
+            factors += start_factors(k, pose, self.settings)
+        if row + 1 == len(self.record):
+            factors += odometry(self.record[max(self.known - 1, 0) :], self.settings)
+            factors += detections(self.record[self.known :], self.settings)
         return Additions(new, factors)
 
 

@@ -1,0 +1,57 @@
+"""The configuration of SLAM: that of tracking, which registers detections, and a section of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from pipelines.config import Family, TrackConfig
+from pipelines.configuration import load_settings, read_settings
+from pipelines.slam.lidar_slam import LidarSlamSettings
+from saga_fg.ego import JointSettings
+from saga_fg.errors import InputError
+from saga_fg.graph import FactorProvider
+from saga_fg.landmarks import LandmarkDetector
+from saga_fg.settings import setting, settings_group
+from saga_fg.tracking.provider_names import made_by_name, new_provider
+
+
+@dataclass(frozen=True)
+class SlamSettings:
+    """What `saga-fg slam simulated` and `slam kitti` take."""
+
+    providers: tuple[str, ...] = setting((), "factor providers of your own as MODULE:NAME, asked at every pose")
+    landmarks: tuple[str, ...] = setting((), "detectors of landmarks of your own as MODULE:NAME, asked at every pose")
+    joint: JointSettings = settings_group(JointSettings, "simulated: vehicle and objects together")
+    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, objects among it")
+
+    def new_providers(self) -> list[FactorProvider]:
+        """Fresh providers. Raises `InputError` for a name that leads to none."""
+        return [new_provider(name) for name in self.providers]
+
+    def new_detectors(self) -> list[LandmarkDetector]:
+        """Fresh detectors of landmarks. Raises `InputError` for a name that leads to none."""
+        expected = "a detector of landmarks, which has a method observations"
+        return [made_by_name("landmarks", name, expected) for name in self.landmarks]
+
+
+@dataclass(frozen=True)
+class SlamConfig(TrackConfig):
+    """Everything that shapes SLAM with objects."""
+
+    slam: SlamSettings = settings_group(SlamSettings, "the graph")
+
+    def __post_init__(self) -> None:
+        if self.tracker.providers:
+            raise InputError("tracker.providers: expected under slam, for a graph of vehicle and objects")
+
+
+def load_slam_config(family: Family, path: Path | None = None) -> SlamConfig:
+    """The defaults shipped for a kind of data, with what a YAML file overrides.
+
+    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    """
+    shipped = files("pipelines") / "configs" / f"{family}.yaml"
+    config = read_settings(SlamConfig, shipped.read_text(encoding="utf-8"), shipped.name)
+    return config if path is None else load_settings(SlamConfig, path, config)
