@@ -242,6 +242,14 @@ class SceneFactorGraph:
                 ours.append(ActiveRows(held.factors, held.rows, point))
         return native, ours
 
+    def native(self) -> gtsam.NonlinearFactorGraph:
+        """All factors as GTSAM's own, for its solvers from `values`; ours call back into Python, which is slow."""
+        graph, point = gtsam.NonlinearFactorGraph(), self.point()
+        for held in self._groups.values():
+            for factor in held.factors.native(held.rows, point):
+                graph.add(factor)
+        return graph
+
     def copy(self) -> SceneFactorGraph:
         """A graph of its own with the same variables and factors, which are shared."""
         other = SceneFactorGraph()
