@@ -36,11 +36,15 @@ class FactorGroup(Protocol):
     def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
         """The rows `chosen`, on increments from the base. Raises what the factors raise."""
 
-    def error(self, chosen: IntArray, point: Point) -> float:
-        """The cost, -log phi, of the rows `chosen` together."""
-
     def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
         """The rows `chosen` as GTSAM's own factors."""
+
+
+class SolvableGroup(FactorGroup, Protocol):
+    """A group that GTSAM does not evaluate itself."""
+
+    def error(self, chosen: IntArray, point: Point) -> float:
+        """The cost, -log phi, of the rows `chosen` together."""
 
 
 def members(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
@@ -65,14 +69,6 @@ class LinearGroup:
             augmented[:, -1] -= augmented[:, :-1] @ base
             result.append(native_factor(keys, point.dims(keys), augmented))
         return result
-
-    def error(self, chosen: IntArray, point: Point) -> float:
-        total = 0.0
-        for row in chosen.tolist():
-            augmented = self.factors[row].augmentedJacobian()
-            x = np.concatenate([point.values.atVector(key) for key in self.rows[row]])
-            total += 0.5 * float(np.sum((augmented[:, :-1] @ x - augmented[:, -1]) ** 2))
-        return total
 
     def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
         keys = {key for row in chosen.tolist() for key in self.rows[row]}
@@ -193,9 +189,6 @@ class NativeGroup:
         made = self.factor.linearize(point.values)
         return [point.from_base(list(made.keys()), made.augmentedJacobian())]
 
-    def error(self, chosen: IntArray, point: Point) -> float:
-        return float(self.factor.error(point.values))
-
     def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
         return [self.factor]
 
@@ -248,7 +241,7 @@ class CustomGroup:
 class ActiveRows:
     """The rows of a group that are still there, for `factors.solve`."""
 
-    group: FactorGroup
+    group: SolvableGroup
     chosen: IntArray
     point: Point
 

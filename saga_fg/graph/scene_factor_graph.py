@@ -30,7 +30,7 @@ from saga_fg.arrays import BoolArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_checks import Factor, grouped
-from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, NativeGroup, PriorGroup
+from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, LinearGroup, NativeGroup, PriorGroup
 from saga_fg.graph.keys import Kind, described, key_of
 from saga_fg.graph.parts import FactorEntry, HeldGroup, NewVariable
 from saga_fg.graph.point import Point
@@ -236,10 +236,11 @@ class SceneFactorGraph:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
         for held in sorted(self._groups.values(), key=lambda held: held.sharpness):
-            if isinstance(held.factors, NativeGroup):
-                native.add(held.factors.factor)
+            if isinstance(held.factors, LinearGroup | NativeGroup):
+                for factor in held.factors.native(held.rows, point):
+                    native.add(factor)
             else:
-                ours.append(ActiveRows(held.factors, held.rows, point))
+                ours.append(ActiveRows(held.factors, held.rows, point))  # type: ignore[arg-type]
         return native, ours
 
     def native(self) -> gtsam.NonlinearFactorGraph:
