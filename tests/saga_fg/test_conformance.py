@@ -24,6 +24,7 @@ from estimator_programs import (
     run,
 )
 from estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
+from graph_keys import newest_key
 from random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
 from road_scenes import road_program
 
@@ -258,10 +259,10 @@ def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
     start = zeros(equivalent.values)
     settings = gtsam.GaussNewtonParams()
     settings.setLinearSolverType("MULTIFRONTAL_QR")
-    solved = gtsam.GaussNewtonOptimizer(equivalent.graph, start, settings).optimize()
-    marginals = gtsam.Marginals(equivalent.graph, solved)
+    solved = gtsam.GaussNewtonOptimizer(equivalent.native(), start, settings).optimize()
+    marginals = gtsam.Marginals(equivalent.native(), solved)
     for node in estimator.nodes.tolist():
-        key, P = equivalent.keys[-1][node], estimator.covariance([node])[0]
+        key, P = newest_key(equivalent, node), estimator.covariance([node])[0]
         for values in (solved, equivalent.values):
             assert np.abs((values.atVector(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 1e-7
         assert np.linalg.norm(marginals.marginalCovariance(key) - P) < 1e-6 * np.linalg.norm(P)
