@@ -24,9 +24,10 @@ from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.graph_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.point import Point
-from saga_fg.graph.providers import FactorProvider, GraphView, ask
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
 
@@ -51,6 +52,7 @@ class IncrementalSmoother:
             raise InputError(f"lag: expected a finite number of seconds >= 0, or None, got {lag!r}")
         self.providers = tuple(providers)
         self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
+        self.frame: Frame | None = None  # of the present epoch
         self._lag, self._settings = lag, settings or RelinearisationSettings()
         self._graph = SceneFactorGraph()
         self._engine: Engine | None = None
@@ -65,15 +67,24 @@ class IncrementalSmoother:
         """The running graph itself: its variables, factors and values. To be read, not changed."""
         return self._graph
 
-    def step(self, time: float, providers: Sequence[FactorProvider] | None = None) -> None:
-        """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve."""
-        unchanged = self._graph
+    def step(
+        self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None
+    ) -> None:
+        """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve.
+
+        frame: what they are told of the epoch
+        """
+        unchanged, asked = self._graph, self.providers if providers is None else providers
         graph = unchanged.copy()
         graph.advance(time)
-        self._asked(graph, self.providers if providers is None else providers)
+        self.frame = frame
         times = [*self._times, graph.time]
         first = 0 if self._lag is None else sum(t <= time - self._lag for t in times[1:])
         try:
+            if begun := beginnings(asked):
+                self._asked(graph, begun)
+                graph = self._graph.copy()
+            self._asked(graph, asked)
             self.marginalise(graph.older_than(times[first]))
         except GraphError:
             self._graph, self._engine = unchanged, None
@@ -132,7 +143,7 @@ class IncrementalSmoother:
         self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))
 
     def _asked(self, graph: SceneFactorGraph, providers: Sequence[FactorProvider]) -> None:
-        view = GraphView(graph, self.covariance, self.origin)
+        view = GraphView(graph, self.covariance, self.origin, self.frame)
         for provider in providers:
             ask(provider, graph, view)
         self._engine = self._solved(graph)
