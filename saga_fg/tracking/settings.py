@@ -11,6 +11,7 @@ from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
+from saga_fg.graph import FactorProvider
 from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
 from saga_fg.rigid_coupling import Attached
 from saga_fg.road import RoadMap, SignalSettings
@@ -185,9 +186,10 @@ class TrackerSettings:
         lambda: None, "lights, stop lines and lanes, world coordinates; null: none but those that frames bring along"
     )
     estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
-    providers: tuple[str, ...] = setting(
+    providers: tuple[str | FactorProvider, ...] = setting(
         (),
-        "factor providers of your own as MODULE:NAME, imported when a tracker is made; with estimator: isam2",
+        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, of saga_fg.providers or your "
+        "own; the modules are imported; with estimator: isam2",
     )
     lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
