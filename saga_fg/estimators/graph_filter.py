@@ -19,8 +19,9 @@ from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.frame import Frame
 from saga_fg.graph.keys import OBJECT, key_of
-from saga_fg.graph.providers import FactorProvider
+from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
@@ -51,10 +52,29 @@ class GraphFilter:
     def time(self) -> float:
         return self._smoother.time
 
-    def ask(self, origin: FloatArray) -> None:
-        """Let the users' providers add their factors; origin (2,): of the states' positions in the world, m."""
-        self._smoother.origin = origin
-        self._changed().extend(self.providers)
+    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        self._smoother.origin, self._smoother.frame = origin, frame
+        graph = self._smoother.graph()
+        if graph.epoch == 0 and not graph.variables:
+            self.extend(beginnings(self.providers))
+
+    def ask(self) -> None:
+        """Let the users' providers add their factors."""
+        self.extend(self.providers)
+
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Let some providers add their factors at the present epoch."""
+        self._changed().extend(providers)
+
+    @property
+    def others(self) -> list[int]:
+        """Keys of all variables but objects: poses, landmarks."""
+        return [key for key, one in self._smoother.graph().variables.items() if one.kind != OBJECT]
+
+    def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
+        """Joint covariance of other variables and some nodes, in the order given."""
+        return self._smoother.joint_covariance([*keys, *self._keys(nodes)])
 
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
@@ -69,7 +89,9 @@ class GraphFilter:
 
     def predict(self, transition: Transition) -> None:
         require_kind("transition", transition, Transition)
-        self._changed().step(self.time + transition.dt, [Interactions(transition)])
+        smoother = self._changed()
+        begun = [Interactions(transition), *beginnings(self.providers)]
+        smoother.step(self.time + transition.dt, begun, smoother.frame)
 
     def update(self, measurements: Measurements) -> None:
         require_kind("measurements", measurements, Measurements)

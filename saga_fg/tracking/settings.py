@@ -156,6 +156,23 @@ class ClockSettings:
 
 
 @dataclass(frozen=True)
+class EgoNodeSettings:
+    """The vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
+
+    estimated: bool = setting(
+        False,
+        "its pose is a variable of the running graph, which providers move, and detections in its frame are seen from "
+        "there; false: it is where frames say",
+    )
+    label: str = setting("car", "its class for edge rules")
+    length: float = setting(4.5, "m")
+    deviation: float = setting(0.02, "standard deviation of its place about its pose, m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "length", "deviation")
+
+
+@dataclass(frozen=True)
 class TrackerSettings:
     """Everything the tracker can be told; `edges` empty is the classical filter of independent objects.
 
@@ -191,6 +208,9 @@ class TrackerSettings:
         "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, of saga_fg.providers or your "
         "own; the modules are imported; with estimator: isam2",
     )
+    ego: EgoNodeSettings | None = settings_group(
+        lambda: None, "the vehicle as a node that leads and follows; null: it is none"
+    )
     lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
@@ -216,6 +236,8 @@ class TrackerSettings:
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))
+        if self.ego is not None and self.ego.estimated and self.association.method == "graph":
+            raise InputError("ego.estimated: expected association by pairs alone, got association.method graph")
         self._require_groups_that_move_alike()
         require_stable(self.edges, self.max_step)
 

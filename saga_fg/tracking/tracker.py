@@ -23,7 +23,6 @@ from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
 from saga_fg.tracking.clock import Clock, TimeVerdict
-from saga_fg.tracking.observation import observe
 from saga_fg.tracking.observer import Observer
 from saga_fg.tracking.provider_names import new_provider
 from saga_fg.tracking.roadside import Roadside
@@ -166,14 +165,15 @@ class Tracker:
     def max_delay(self) -> float:
         """How late a frame may come and still be used, s."""
         settings = self.settings
+        if settings.ego is not None and settings.ego.estimated:
+            return 0.0  # nobody knows where the vehicle was
         return max(settings.max_delay, settings.lag) if settings.estimator == "fixed-lag" else settings.max_delay
 
     def _step(self, frame: Frame) -> Tracks:
         sensor = self.sensor(frame.sensor)
-        observed = observe(frame, sensor, self.settings.classes)
         timestamp = frame.timestamp + sensor.time_offset
         if self._keep_time(timestamp, frame.sensor):
-            self.assignment = self._tracks.take_in(frame, sensor, observed, timestamp)
+            self.assignment = self._tracks.take_in(frame, sensor, timestamp)
         else:
             self.assignment = Assignment.empty()
         return self._tracks.report(self._clock.newest)
