@@ -43,8 +43,8 @@ def relative_detection_factors(
     """Return n factors of objects seen from the vehicle.
 
     rows: (n, 2) keys of the pose (`gtsam.Pose3`) and of the object (vector of `state_dim`); z: (n, 3), m, in the
-    vehicle's frame, or (n, 2) from a `gtsam.Pose2`; covariances: (n, 2, 2), or one for all, m^2, in the vehicle's axes ahead and left; position: where
-    the world position sits in the object's state. Raises `FactorError`.
+    vehicle's frame, or (n, 2) from a `gtsam.Pose2`; covariances: (n, 2, 2), or one for all, m^2, in the vehicle's axes
+    ahead and left; position: where the world position sits in the object's state. Raises `FactorError`.
     """
     planar = np.ndim(z) == 2 and np.shape(z)[1] == 2
     measured = checked("z", z, (None, 2 if planar else 3)).copy()

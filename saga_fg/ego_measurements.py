@@ -1,4 +1,4 @@
-"""What the vehicle measured of itself by the time of a frame: odometry, satellite fixes, inertial samples, landmarks."""
+"""What the vehicle measured of itself by the time of a frame: odometry, GPS, inertial samples, landmarks."""
 
 from __future__ import annotations
 

@@ -29,7 +29,9 @@ class EgoColumns:
             if part.any():
                 row = int(np.argmax(part))
                 missing = names[int(np.argmin(given[row]))]
-                raise raw.fault(row, f"{missing}: expected a number, since {names[int(np.argmax(given[row]))]} is given")
+                raise raw.fault(
+                    row, f"{missing}: expected a number, since {names[int(np.argmax(given[row]))]} is given"
+                )
             columns.append(values)
         short = columns[0][:, 3] <= 0
         if short.any():

@@ -10,7 +10,7 @@ H P = R K^T, so that the measured rows are as exact as in Joseph's form.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -71,6 +71,42 @@ def correct(
         log_det = 2 * np.log(np.diagonal(gain.L, axis1=1, axis2=2)).sum()
         log_likelihood -= 0.5 * float(np.vdot(gain.whitened, gain.whitened) + log_det)
     return replace(x, mean=mean, blocks=tuple(blocks)), tuple(gains), log_likelihood
+
+
+class WhitenedFactor(NamedTuple):
+    """|| H x - z || of several nodes: rows (k,) of these, H (m, D') over their states, innovation (m,) z - H m."""
+
+    rows: IntArray
+    H: FloatArray
+    innovation: FloatArray
+
+
+def correct_whitened(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> BlockGaussian:
+    """The posterior given factors on any nodes, whose components become one; noise of variance 1."""
+    if not factors:
+        return x
+    ties = [np.array([[factor.rows[0], row] for row in factor.rows[1:]]).reshape(-1, 2) for factor in factors]
+    x = x.over(x.partition.joined(*np.concatenate(ties).astype(np.int64).T))
+    partition, mean, blocks = x.partition, x.mean.copy(), list(x.blocks)
+    first = np.array([factor.rows[0] for factor in factors])
+    for number in np.unique(partition.group[first]).tolist():
+        mine = np.flatnonzero(partition.group[first] == number)
+        active, component = np.unique(partition.row[first[mine]], return_inverse=True)
+        lengths = np.array([len(factors[k].innovation) for k in mine.tolist()])
+        most = int(np.bincount(component, weights=lengths).max())
+        P, places, used = blocks[number][active], partition.groups[number][active], [0] * len(active)
+        H, innovation = np.zeros((len(active), most, P.shape[1])), np.zeros((len(active), most, 1))
+        for k, c in zip(mine.tolist(), component.tolist(), strict=True):
+            factor, at = factors[k], slice(used[c], used[c] + len(factors[k].innovation))
+            within = [np.arange(x.layout.dims[row]) + partition.offset[row] for row in factor.rows]
+            H[c][at, np.concatenate(within)] = factor.H
+            innovation[c, at, 0], used[c] = factor.innovation, at.stop
+        R = np.broadcast_to(np.eye(most), (len(active), most, most))
+        gain, P = _corrected(P, places, _Stacked(H @ P, H, R, innovation))
+        mean[places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
+        blocks[number] = blocks[number].copy()
+        blocks[number][active] = P
+    return replace(x, mean=mean, blocks=tuple(blocks))
 
 
 def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> float:

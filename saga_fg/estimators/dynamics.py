@@ -48,6 +48,12 @@ class Dynamics:
         b[layout.places(rows)] = transition.b
         return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
 
+    def beside(self, layout: Layout, others: IntArray) -> Dynamics:
+        """Over `layout`, which has further nodes at the rows `others`: these stay as they are."""
+        rows, b = np.delete(np.arange(len(layout)), others), np.zeros(layout.size)
+        b[layout.places(rows)] = self.b
+        return Dynamics(layout, (*_renamed(self.F, rows), *identity(layout, others)), b, _renamed(self.Q, rows))
+
     def only(self, rows: IntArray) -> Dynamics:
         """Without the dynamics of all nodes but those at `rows`; itself if these are all."""
         if len(rows) == len(self.layout):
@@ -189,6 +195,12 @@ def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
     if not (np.isfinite(mean).all() and all(np.isfinite(block).all() for block in blocks)):
         raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
     return BlockGaussian(partition, mean, blocks)
+
+
+def identity(layout: Layout, rows: IntArray) -> tuple[Blocks, ...]:
+    """Blocks of the nodes at `rows` that stay as they are."""
+    alike = [rows[layout.dims[rows] == d] for d in np.unique(layout.dims[rows])]
+    return tuple(Blocks(k, k, np.tile(np.eye(layout.dims[k[0]]), (len(k), 1, 1))) for k in alike)
 
 
 def _symmetric(product: FloatArray) -> FloatArray:

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.frame import Frame
-from saga_fg.graph.keys import OBJECT, key_of
+from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
@@ -30,18 +30,23 @@ class GraphFilter:
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
+    lag        s; how long epochs stay in the graph, at least until they have been asked once at the next one
+
+    What is told and reported is the newest state, at any lag.
     """
 
-    def __init__(self, providers: Sequence[FactorProvider]) -> None:
-        self.providers = tuple(providers)
-        self._smoother = IncrementalSmoother()
+    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
+        self.providers, self._lag = tuple(providers), lag
+        self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
+        self._beside: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._layout = Layout()
         self._posterior: BlockGaussian | None = None  # until the graph changes
 
     def __copy__(self) -> GraphFilter:
-        twin = GraphFilter(self.providers)
+        twin = GraphFilter(self.providers, self._lag)
         twin._smoother, twin._layout, twin._posterior = self._smoother.handed_over(), self._layout, self._posterior
+        twin._beside = self._beside
         return twin
 
     @property
@@ -61,7 +66,11 @@ class GraphFilter:
 
     def ask(self) -> None:
         """Let the users' providers add their factors."""
-        self.extend(self.providers)
+        smoother = self._changed()
+        smoother.extend(self.providers)
+        smoother.forget()
+        graph, nodes = smoother.graph(), set(self._keys(self.nodes))
+        self._beside = tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Let some providers add their factors at the present epoch."""
@@ -69,8 +78,9 @@ class GraphFilter:
 
     @property
     def others(self) -> list[int]:
-        """Keys of all variables but objects: poses, landmarks."""
-        return [key for key, one in self._smoother.graph().variables.items() if one.kind != OBJECT]
+        """Keys of the variables beside the nodes: poses, landmarks."""
+        every = self._smoother.graph().variables
+        return [key for key, one in every.items() if one.epoch is None or one.kind not in (OBJECT, MAP_NODE)]
 
     def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
         """Joint covariance of other variables and some nodes, in the order given."""
@@ -82,16 +92,16 @@ class GraphFilter:
         mean, covariance = checked_prior(nodes, means, covariances)
         layout = self._layout.extended(nodes, mean.shape[1])
         added = layout.nodes[len(self._layout) :]
-        if (added < 0).any():
-            raise InputError("providers: expected no road map, its nodes are not in the running graph of the tracker")
-        self._changed().extend([Births(added, mean, covariance, labels or {})])
+        smoother = self._changed()
+        smoother.marginalise(key for key in self._keys_of(added) if key in smoother.graph().variables)  # gone and back
+        smoother.extend([Births(added, mean, covariance, labels or {})])
         self._layout, self._posterior = layout, None
 
     def predict(self, transition: Transition) -> None:
-        require_kind("transition", transition, Transition)
+        Dynamics.of(transition, self._layout)  # or an error
         smoother = self._changed()
-        begun = [Interactions(transition), *beginnings(self.providers)]
-        smoother.step(self.time + transition.dt, begun, smoother.frame)
+        smoother.forget(self._beside)
+        smoother.begin(self.time + transition.dt, [Interactions(transition), *beginnings(self.providers)])
 
     def update(self, measurements: Measurements) -> None:
         require_kind("measurements", measurements, Measurements)
@@ -148,8 +158,11 @@ class GraphFilter:
 
     def _keys(self, nodes: ArrayLike) -> list[int]:
         self._layout.rows(nodes)
+        return self._keys_of(nodes)
+
+    def _keys_of(self, nodes: ArrayLike) -> list[int]:
         epoch = self._smoother.graph().epoch
-        return [key_of(OBJECT, node, epoch) for node in np.asarray(nodes).tolist()]
+        return [node_key(node, epoch) for node in np.asarray(nodes).tolist()]
 
     def _state(self, key: int) -> FloatArray:
         return np.asarray(self._smoother.state(key))

@@ -18,7 +18,7 @@ from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.graph.keys import OBJECT
+from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.transition import Transition
@@ -36,12 +36,13 @@ class Births:
 
     def factors(self, view: GraphView) -> Additions:
         ids = np.asarray(self.nodes).tolist()
-        born = [
-            NewVariable(OBJECT, i, mean, label=self.labels.get(i, "")) for i, mean in zip(ids, self.means, strict=True)
-        ]
         if not ids:
             return Additions()
-        return Additions(born, prior_factors([view.key(OBJECT, i) for i in ids], self.means, self.covariances))
+        born = [
+            NewVariable(*node_kind(i), mean, label=self.labels.get(i, ""))
+            for i, mean in zip(ids, self.means, strict=True)
+        ]
+        return Additions(born, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +57,15 @@ class Interactions:
         nodes = transition.nodes.tolist()
         if not nodes:
             return Additions()
-        before = view.before(OBJECT)
         layout = Layout(nodes, transition.graph.dims)
-        mean = np.concatenate([view.state(before[node].key) for node in nodes])
+        now, earlier = ({node: node_key(node, epoch) for node in nodes} for epoch in (view.epoch, view.epoch - 1))
+        mean = np.concatenate([view.state(key) for key in earlier.values()])
         moved = transition.F_matrix @ mean + transition.b
         states = np.split(moved, transition.offsets[1:-1])
-        new = [NewVariable(OBJECT, n, x, label=before[n].label) for n, x in zip(nodes, states, strict=True)]
-        now = {node: view.key(OBJECT, node) for node in nodes}
-        earlier = {node: before[node].key for node in nodes}
+        new = [
+            NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
+            for n, x in zip(nodes, states, strict=True)
+        ]
         return Additions(new, motion_factors(Motion(transition), layout, mean, earlier, now)[0])
 
 
@@ -76,5 +78,5 @@ class LinearDetections:
 
     def factors(self, view: GraphView) -> Additions:
         m = self.measurements
-        keys = np.array([[view.key(OBJECT, node)] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
+        keys = np.array([[node_key(node, view.epoch)] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
         return Additions(factors=gaussian_factors(keys, [m.H], m.z, m.R))

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -67,29 +67,37 @@ class IncrementalSmoother:
         """The running graph itself: its variables, factors and values. To be read, not changed."""
         return self._graph
 
-    def step(
-        self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None
-    ) -> None:
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
         """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve.
 
         frame: what they are told of the epoch
         """
-        unchanged, asked = self._graph, self.providers if providers is None else providers
-        graph = unchanged.copy()
-        graph.advance(time)
+        unchanged, times, asked = self._graph, self._times, self.providers if providers is None else providers
         self.frame = frame
-        times = [*self._times, graph.time]
-        first = 0 if self._lag is None else sum(t <= time - self._lag for t in times[1:])
+        begun = beginnings(asked)
         try:
-            if begun := beginnings(asked):
-                self._asked(graph, begun)
-                graph = self._graph.copy()
-            self._asked(graph, asked)
-            self.marginalise(graph.older_than(times[first]))
+            self.begin(time, begun or asked)
+            if begun:
+                self.extend(asked)
+            self.forget()
         except GraphError:
-            self._graph, self._engine = unchanged, None
+            self._graph, self._times, self._engine = unchanged, times, None
             raise
-        self._times = times[first:]
+
+    def begin(self, time: float, providers: Sequence[FactorProvider]) -> None:
+        """The same, but keep all that is older than the lag."""
+        graph = self._graph.copy()
+        graph.advance(time)
+        self._asked(graph, providers)
+        self._times = [*self._times, graph.time]
+
+    def forget(self, kept: Collection[int] = ()) -> None:
+        """Marginalise what is older than the lag, but for the variables `kept`."""
+        if self._lag is None:
+            return
+        first = sum(t <= self.time - self._lag for t in self._times[1:])
+        self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
+        self._times = self._times[first:]
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch, and solve again."""

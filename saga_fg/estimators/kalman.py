@@ -10,18 +10,23 @@ measured so rarely, or left its neighbours so long ago, that its correlation has
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
+from saga_fg.estimators.kalman_factors import Beside, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.frame import Frame
+from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.transition import Transition
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
@@ -29,35 +34,64 @@ _DECOUPLE_EVERY = 10  # predictions between looks for components that have falle
 
 @dataclass(frozen=True, eq=False)
 class KalmanState:
-    """The filter as a value: its Gaussian, how many predictions it has made, and the time, s."""
+    """The filter as a value: its Gaussian, how many predictions it has made, the time, s, and what `asked` keeps."""
 
     x: BlockGaussian
     predictions: int
     time: float
+    beside: Beside
 
 
 class JointKalmanFilter:
-    """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods."""
+    """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
-    def __init__(self) -> None:
+    providers  asked by `ask`, once a frame, for factors on the newest variables: an extended Kalman filter
+    """
+
+    def __init__(self, providers: Sequence[FactorProvider] = ()) -> None:
+        self.providers = tuple(providers)
         self._state = BlockGaussian.empty()
         self._predictions = 0
         self._time = 0.0
+        self._beside = Beside()
+        self._frame: Frame | None = None
+        self._origin = np.zeros(2)
 
     @property
     def nodes(self) -> IntArray:
-        return self._state.layout.nodes
+        return np.delete(self._state.layout.nodes, self._beside.rows(self._state.layout))
 
     @property
     def time(self) -> float:
         return self._time
 
-    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+    def add(
+        self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
+    ) -> None:
         mean, covariance = checked_prior(nodes, means, covariances)
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
+        if self.providers:
+            self._beside = replace(self._beside, labels={**self._beside.labels, **(labels or {})})
+
+    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        self._frame, self._origin = frame, origin
+
+    def ask(self) -> None:
+        """Take in the providers' factors. Raises `GraphError` for one that is not on the newest variables alone."""
+        x, beside = self._state, self._beside
+        for providers, last in ((beginnings(self.providers), False), (self.providers, True)):
+            if providers:
+                x, beside = asked(x, beside, providers, self._time, self._origin, self._frame, last)
+        self._state, self._beside = x, beside
+
+    @property
+    def others(self) -> IntArray:
+        """Rows of the variables beside the nodes, in the joint state: poses, landmarks."""
+        return self._beside.rows(self._state.layout)
 
     def predict(self, transition: Transition) -> None:
-        dynamics = Dynamics.of(transition, self._state.layout)
+        dynamics = self._beside.dynamics(transition, self._state.layout)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
         self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         self._predictions += 1
@@ -77,6 +111,10 @@ class JointKalmanFilter:
 
     def marginalise(self, nodes: ArrayLike) -> None:
         self._state = self._state.without(self._state.layout.rows(nodes))
+        if self.providers:
+            gone = set(np.asarray(nodes).tolist())
+            labels = {node: label for node, label in self._beside.labels.items() if node not in gone}
+            self._beside = replace(self._beside, labels=labels)
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
         layout = self._state.layout
@@ -107,9 +145,10 @@ class JointKalmanFilter:
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""
-        return KalmanState(self._state, self._predictions, self._time)
+        return KalmanState(self._state, self._predictions, self._time, self._beside)
 
     def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
         require_kind("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
+        self._beside = state.beside

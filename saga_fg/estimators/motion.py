@@ -16,7 +16,7 @@ from factors import FactorError, NonlinearInteraction
 from saga_fg.arrays import FloatArray
 from saga_fg.discretisation import discretise
 from saga_fg.errors import InputError
-from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.dynamics import Dynamics, identity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.transition import Blocks, Transition
@@ -98,11 +98,7 @@ class Standstill:
 
     def dynamics(self, layout: Layout, mean: FloatArray) -> Dynamics:
         """The identity."""
-        F = []
-        for d in np.unique(layout.dims).tolist():
-            rows = np.flatnonzero(layout.dims == d)
-            F.append(Blocks(rows, rows, np.broadcast_to(np.eye(d), (len(rows), d, d))))
-        return Dynamics(layout, tuple(F), np.zeros(len(mean)), ())
+        return Dynamics(layout, identity(layout, np.arange(len(layout))), np.zeros(len(mean)), ())
 
 
 def _affine(

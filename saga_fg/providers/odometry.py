@@ -49,7 +49,9 @@ class Odometry:
         last, key = before[0].key, view.key(EGO_POSE, 0)
         planar = isinstance(view.state(last), gtsam.Pose2)
         motion, covariance = self._motion(view, planar)
-        new = [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, view.state(last).compose(motion), label="vehicle")]
+        new = (
+            [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, view.state(last).compose(motion), label="vehicle")]
+        )
         return Additions(new, [between_factor(last, key, motion.matrix(), covariance)])
 
     def factors(self, view: GraphView) -> Additions:

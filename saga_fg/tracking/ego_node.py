@@ -27,7 +27,7 @@ _ID = np.array([EGO_ID])
 
 @dataclass(eq=False)
 class EgoNode:
-    """settings: None if there is no such node; present; yaw, rad; time of its latest place, s; whether it ever moved."""
+    """settings: None if there is no such node; motion: of its class; yaw, rad; time of its latest place, s."""
 
     settings: EgoNodeSettings | None
     motion: ClassSettings

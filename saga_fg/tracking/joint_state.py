@@ -42,12 +42,12 @@ TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | Grap
 
 
 def new_estimator(name: EstimatorName, lag: float, providers: Sequence[FactorProvider] = ()) -> TrackEstimator:
-    """A fresh estimator; `lag` (s) is the fixed-lag smoother's; with `providers` it is a running graph, by iSAM2."""
+    """A fresh estimator; `lag` (s) is the fixed-lag smoother's; with `providers`, iSAM2 and it are a running graph."""
+    if name == "kalman":
+        return JointKalmanFilter(providers)
     if providers:
-        return GraphFilter(providers)
-    if name == "isam2":
-        return IncrementalFilter()
-    return FixedLagSmoother(lag) if name == "fixed-lag" else JointKalmanFilter()
+        return GraphFilter(providers, lag if name == "fixed-lag" else 0.0)
+    return FixedLagSmoother(lag) if name == "fixed-lag" else IncrementalFilter()
 
 
 class JointTrackState:
@@ -99,7 +99,7 @@ class JointTrackState:
                 F, Q = _own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
             estimator = self._changed()
-            if isinstance(estimator, GraphFilter):
+            if isinstance(estimator, GraphFilter | JointKalmanFilter):
                 estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
             else:
                 estimator.add(ids[rows], mean, P)
@@ -189,21 +189,24 @@ class JointTrackState:
 
     def hear(self, frame: Frame | None, origin: FloatArray) -> None:
         """What providers are told from now on; positions are from `origin` (2,)."""
-        if isinstance(self._estimator, GraphFilter):
-            self._estimator.hear(frame, origin)
+        estimator = self._estimator
+        if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
+            estimator.hear(frame, origin)
             self._changed()
 
     def ask_providers(self) -> None:
         """Let users' providers add their factors."""
-        if isinstance(self._estimator, GraphFilter):
-            self._estimator.ask()
+        estimator = self._estimator
+        if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
+            estimator.ask()
             self._changed()
 
     @property
     def bare(self) -> bool:
         """Whether nothing in it has a place."""
         estimator = self._estimator
-        return len(estimator.nodes) == 0 and not (isinstance(estimator, GraphFilter) and estimator.others)
+        beside = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
+        return len(estimator.nodes) + len(beside) == 0
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""

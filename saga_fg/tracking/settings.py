@@ -206,12 +206,14 @@ class TrackerSettings:
     providers: tuple[str | FactorProvider, ...] = setting(
         (),
         "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, of saga_fg.providers or your "
-        "own; the modules are imported; with estimator: isam2",
+        "own; the modules are imported",
     )
     ego: EgoNodeSettings | None = settings_group(
         lambda: None, "the vehicle as a node that leads and follows; null: it is none"
     )
-    lag: float = setting(2.0, "window of the fixed-lag estimator, s; frames this late are put where they belong")
+    lag: float = setting(
+        2.0, "window of the fixed-lag estimator, s; without providers, frames this late are put where they belong"
+    )
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     flow: FlowSettings = settings_group(FlowSettings, "the speed of new tracks from traffic around them")
@@ -236,8 +238,11 @@ class TrackerSettings:
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))
-        if self.ego is not None and self.ego.estimated and self.association.method == "graph":
-            raise InputError("ego.estimated: expected association by pairs alone, got association.method graph")
+        if self.ego is not None and self.ego.estimated:
+            if self.association.method == "graph":
+                raise InputError("ego.estimated: expected association without pairs, got association.method graph")
+            if self.estimator == "kalman":
+                raise InputError("ego.estimated: expected the estimator isam2 or fixed-lag, got kalman")
         self._require_groups_that_move_alike()
         require_stable(self.edges, self.max_step)
 

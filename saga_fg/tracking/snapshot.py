@@ -26,7 +26,7 @@ Table = TypeVar("Table")
 
 @dataclass(eq=False)
 class TrackTables:
-    """What is kept of n tracks, of the road and of the vehicle, besides the joint state; belief (n, C) of the tracks' classes."""
+    """What is kept of n tracks, road and vehicle besides the joint state; belief (n, C) of the tracks' classes."""
 
     columns: TrackColumns
     box: BoxFilter

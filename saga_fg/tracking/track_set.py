@@ -171,7 +171,9 @@ class TrackSet:
             return frame
         pose = self._state.pose()
         if pose is None:
-            raise InputError("ego.estimated: expected a provider that adds the vehicle's pose, as saga_fg.providers has")
+            raise InputError(
+                "ego.estimated: expected a provider that adds the vehicle's pose, as saga_fg.providers has"
+            )
         world_T_ego = pose.copy()
         world_T_ego[:2, 3] += self._origin
         return replace(frame, world_T_ego=world_T_ego)

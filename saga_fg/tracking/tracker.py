@@ -40,11 +40,11 @@ class Tracker:
     sensors   models by sensor name; the entry named "default" serves all others
     rules     edge rules, in place of `settings.edges`
     observer  is told how things stand at the end of every stage
-    providers add factors of your own to the running graph of the tracks, once a frame (`saga_fg.graph`); with the
-              estimator "isam2"
+    providers add factors of your own to the running graph of the tracks, once a frame (`saga_fg.graph`)
 
     A frame older than the newest one by up to `max_delay` is used: the fixed-lag estimator puts its measurements where
-    they belong, a filter moves them to the present along the objects' own motion. An older one is left out and counted
+    they belong, a filter, and with `providers` any estimator, moves them to the present along the objects' own motion.
+    An older one is left out and counted
     in `late_frames`; so is, uncounted, one from another time until a second one confirms that the clock was set.
     `time_verdict` tells of the latest frame (see `saga_fg.tracking.clock`).
 
@@ -68,10 +68,6 @@ class Tracker:
         self._clock = Clock()
         self._clock_settings = replace(self.settings.clock, max_jump=self.max_jump)
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        if self.providers and self.settings.estimator != "isam2":
-            raise InputError(
-                f"providers: expected the estimator isam2, which takes any factor, got {self.settings.estimator}"
-            )
         self._tracks = TrackSet(self.settings, self.rules, observer, self.providers)
         self._failed = False  # the latest step
 
@@ -167,7 +163,8 @@ class Tracker:
         settings = self.settings
         if settings.ego is not None and settings.ego.estimated:
             return 0.0  # nobody knows where the vehicle was
-        return max(settings.max_delay, settings.lag) if settings.estimator == "fixed-lag" else settings.max_delay
+        whole = settings.estimator == "fixed-lag" and not self.providers
+        return max(settings.max_delay, settings.lag) if whole else settings.max_delay
 
     def _step(self, frame: Frame) -> Tracks:
         sensor = self.sensor(frame.sensor)

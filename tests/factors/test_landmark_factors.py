@@ -124,8 +124,10 @@ def detection(rng, keys, covariance):
 CASES = {
     "point in the plane": point(2), "point in space": point(3), "plane": plane, "range in the plane": distance(True),
     "range in space": distance(False), "bearing in the plane": bearing(True), "bearing in space": bearing(False),
-    "position in the plane": satellite(2), "position in space": satellite(3), "attitude": attitude, "lane boundary": boundary, "lane keeping": keeping,
-    "lane keeping, seen at each foot": keeping_bend, "on a plane": standing, "straight edge": edge, "object in the plane": detection,
+    "position in the plane": satellite(2), "position in space": satellite(3),
+    "attitude": attitude, "lane boundary": boundary, "lane keeping": keeping,
+    "lane keeping, seen at each foot": keeping_bend, "on a plane": standing, "straight edge": edge,
+    "object in the plane": detection,
 }  # fmt: skip
 
 

@@ -137,12 +137,6 @@ def test_trackers_with_providers_can_be_copied_and_look_ahead(copied: Callable[[
         same(tracker.step(f), twin.step(f), 1e-4)
 
 
-def test_other_estimators_refuse_providers_by_name() -> None:
-    for name in ("kalman", "fixed-lag"):
-        with pytest.raises(InputError, match=f"providers: expected the estimator isam2, .* got {name}"):
-            Tracker(TrackerSettings(estimator=name), providers=[Quiet()])
-
-
 def test_providers_from_the_configuration() -> None:
     named = TrackerSettings(estimator="isam2", providers=(f"{__name__}:Range",))
     by_name, by_hand = Tracker(named), Tracker(ISAM2, providers=[Range()])
