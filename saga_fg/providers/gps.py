@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from factors import Robust, position_factor
-from saga_fg.arrays import FloatArray
 from saga_fg.chi_square import chi_square_quantile
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE
@@ -53,12 +53,10 @@ class Gps:
         robust = None if math.isinf(self.outlier_scale) else Robust("cauchy", self.outlier_scale)
         factor = position_factor(pose.key, z, R, self.antenna, robust)
         if self.gate < 1:
-            state = view.state(pose.key).matrix()[None]
-            (J,), r = factor.jacobians(state), factor.residual(state)[0]
-            if _distance(r, J[0] @ view.covariance(pose.key) @ J[0].T + R) > chi_square_quantile(self.gate, dim):
+            values = gtsam.Values()
+            values.insert(pose.key, view.state(pose.key))
+            _, (J,), (r,) = factor.linearisation(values)
+            S = J[0] @ view.covariance(pose.key) @ J[0].T + R
+            if float(r @ np.linalg.solve(S, r)) > chi_square_quantile(self.gate, dim):
                 return Additions()
         return Additions(factors=[factor])
-
-
-def _distance(r: FloatArray, S: FloatArray) -> float:
-    return float(r @ np.linalg.solve(S, r))

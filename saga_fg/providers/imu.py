@@ -55,10 +55,11 @@ class Imu:
         before = view.before(EGO_VELOCITY)
         if not before:
             return self._start(view)
-        pose, velocity, bias = (view.before(kind)[0].key for kind in (EGO_POSE, EGO_VELOCITY, EGO_BIAS))
+        kinds = (EGO_POSE, EGO_VELOCITY, EGO_BIAS)
+        pose, velocity, bias = (view.before(kind)[0].key for kind in kinds)
         if not isinstance(view.state(pose), gtsam.Pose3):
             raise InputError("imu: expected the vehicle's pose in space (start.planar: false), got one in the plane")
-        now = tuple(view.key(kind, 0) for kind in (EGO_POSE, EGO_VELOCITY, EGO_BIAS))
+        now = [view.key(kind, 0) for kind in kinds]
         measured = self._preintegrated(view, view.state(pose), view.state(bias))
         moved = measured.predict(gtsam.NavState(view.state(pose), view.state(velocity)), view.state(bias))
         new = [
@@ -84,7 +85,7 @@ class Imu:
                 NewVariable(EGO_BIAS, 0, gtsam.imuBias.ConstantBias(), label="imu bias"),
             ],
             [
-                *first.factors,
+                *list(first.factors),  # type: ignore[arg-type]
                 prior_factor(velocity, start, self.start_velocity_deviation**2 * np.eye(3)),
                 gtsam.PriorFactorConstantBias(
                     bias, gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(deviations)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
+from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import EGO_POSE, LANDMARK
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
@@ -36,17 +38,17 @@ class Landmarks:
         if pose is None or view.frame is None:
             return Additions()
         known, world_T_pose = view.static(LANDMARK), view.state(pose.key).matrix()
-        new, factors = [], []
+        new: dict[int, NewVariable] = {}
+        factors: list[Factor] = []
         for name, seen in self._sightings(view, planar=pose.dim == 3):
-            key = view.key(LANDMARK, name, static=True)
-            if name not in known and key not in {view.key(LANDMARK, one.id, static=True) for one in new}:
-                start = seen.kind.initialise(world_T_pose, seen.value)
-                new.append(
-                    NewVariable(LANDMARK, name, start, static=True, label=seen.kind.name, type=seen.kind.variable)
-                )
-            rows = np.array([[pose.key, key]], dtype=np.uint64)
-            factors += list(seen.kind.factors(rows, seen.value[None], seen.covariance[None]))
-        return Additions(new, factors)
+            kind = seen.kind
+            if name not in known and name not in new:
+                start = kind.initialise(world_T_pose, seen.value)
+                new[name] = NewVariable(LANDMARK, name, start, static=True, label=kind.name, type=kind.variable)
+            rows = np.array([[pose.key, view.key(LANDMARK, name, static=True)]], dtype=np.int64)
+            given = kind.factors(rows, seen.value[None], seen.covariance[None])
+            factors += [given] if isinstance(given, gtsam.NonlinearFactorGraph) else given
+        return Additions(list(new.values()), factors)
 
     def _sightings(self, view: GraphView, planar: bool) -> Iterator[tuple[int, Observation]]:
         frame = view.frame

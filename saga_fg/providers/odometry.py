@@ -9,6 +9,7 @@ motion's logarithm times the share, its covariance as well. Without an increment
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -71,8 +72,8 @@ class Odometry:
         share = view.dt / said.dt
         if abs(share - 1) <= _SAME:
             return motion, covariance
-        kind = type(motion)
-        return kind.Expmap(share * kind.Logmap(motion)), share * max(share, 1.0) * covariance
+        still: Any = type(motion)()
+        return still.expmap(share * still.logmap(motion)), share * max(share, 1.0) * covariance
 
     def _covariance(self, place: float, heading: float, planar: bool) -> FloatArray:
         sigmas = [place, place, heading] if planar else 3 * [heading] + 3 * [place]

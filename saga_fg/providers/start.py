@@ -43,8 +43,7 @@ class StartSettings:
         world_T_ego = self.transform(view.frame)
         world_T_ego[:2, 3] -= view.origin
         if self.planar:
-            yaw = float(yaw_of(world_T_ego[:3, :3]))
-            start: Pose = gtsam.Pose2(*world_T_ego[:2, 3], yaw)
+            start: Pose = gtsam.Pose2(float(yaw_of(world_T_ego[:3, :3])), world_T_ego[:2, 3])
             sigmas = [self.deviation, self.deviation, self.heading_deviation]
         else:
             start = pose("start", world_T_ego)

@@ -304,7 +304,7 @@ class TrackSet:
         accepted: bool,
         delay: float,
         said: FloatArray,
-        seen: Sightings | None,
+        sightings: Sightings | None,
     ) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
 
@@ -321,7 +321,7 @@ class TrackSet:
         kinematics, stands = newborn(
             observed, born, self._origin, self.settings.classes, self._tables.flow, self.settings.standing.prior
         )
-        mine = None if seen is None else seen.select(born)
+        mine = None if sightings is None else sightings.select(born)
         self._state.add(ids, boxes.label, kinematics, delay, mine)
         if mine is not None:
             still = np.zeros((len(born), 4))
