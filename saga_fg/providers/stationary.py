@@ -38,7 +38,9 @@ class Stationary:
         R, robust = self.deviation**2 / view.dt * np.eye(2), Robust("geman-mcclure", self.surely_moving)
         return Additions(
             factors=[
-                ResidualFactors(np.array(rows, dtype=np.uint64), (dim,), _velocity, R, _by_velocity, robust, name="standing object")
+                ResidualFactors(
+                    np.array(rows, dtype=np.uint64), (dim,), _velocity, R, _by_velocity, robust, name="standing object"
+                )
                 for dim, rows in dims.items()
             ]
         )
