@@ -88,6 +88,14 @@ class TrackSet:
         return list(self._columns.id.tolist())
 
     @property
+    def world_T_ego(self) -> FloatArray | None:
+        """The vehicle's pose (4, 4) as estimated in the running graph; None where it is not."""
+        pose = self._state.pose()
+        if pose is not None:
+            pose[:2, 3] += self._origin
+        return pose
+
+    @property
     def _columns(self) -> TrackColumns:
         return self._tables.columns
 
@@ -169,13 +177,11 @@ class TrackSet:
         """The frame with the vehicle's pose, where that is estimated."""
         if self.settings.ego is None or not self.settings.ego.estimated:
             return frame
-        pose = self._state.pose()
-        if pose is None:
+        world_T_ego = self.world_T_ego
+        if world_T_ego is None:
             raise InputError(
                 "ego.estimated: expected a provider that adds the vehicle's pose, as saga_fg.providers has"
             )
-        world_T_ego = pose.copy()
-        world_T_ego[:2, 3] += self._origin
         return replace(frame, world_T_ego=world_T_ego)
 
     def _seen_from_ego(self, frame: Frame, observed: Observed) -> Sightings | None:

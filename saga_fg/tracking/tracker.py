@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from saga_fg.arrays import FloatArray
 from saga_fg.association import Assignment
 from saga_fg.by_class import class_settings
 from saga_fg.edge_rules import EdgeRule
@@ -145,6 +146,11 @@ class Tracker:
     def graph(self) -> SceneGraph | None:
         """The scene graph of the latest interval."""
         return self._tracks.graph
+
+    @property
+    def world_T_ego(self) -> FloatArray | None:
+        """The vehicle's pose (4, 4) as factor providers and the objects have it; None where it is not estimated."""
+        return self._tracks.world_T_ego
 
     @property
     def roadside(self) -> Roadside:

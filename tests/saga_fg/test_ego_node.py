@@ -20,8 +20,7 @@ from saga_fg.geometry import inverse_transform, yaw_transform
 from saga_fg.graph import EGO_POSE
 from saga_fg.providers import Gps, Odometry, StartSettings
 from saga_fg.sensor import NoiseModel
-from saga_fg.tracking import AssociationSettings, ClassSettings
-from saga_fg.tracking.settings import EgoNodeSettings
+from saga_fg.tracking import AssociationSettings, ClassSettings, EgoNodeSettings
 
 PLACE = np.array([4000.0, -7000.0])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
