@@ -191,7 +191,9 @@ class Engine:
         parameters, last = gtsam.ISAM2UpdateParams(), gtsam.KeyGroupMap()
         parameters.removeFactorIndices = removed
         for key, one in graph.variables.items():
-            if one.epoch == graph.epoch:  # at the root, where the next frame's factors will touch the tree
+            if (
+                one.epoch == graph.epoch or key in graph.standing
+            ):  # at the root, where the next frame's factors will touch the tree
                 last.insert2(key, 1)
         parameters.constrainedKeys = last
         try:

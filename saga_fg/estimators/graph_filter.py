@@ -1,24 +1,29 @@
 """The tracker's filter as a running graph, in which factors of users' own take part.
 
-The calls of an estimator become providers of an `IncrementalSmoother` of lag 0: what is added is a birth, a prediction
-an epoch with its interaction factors, an update detections. Between them users' providers are asked.
+The calls of an estimator become providers of an `IncrementalSmoother`: what is added is a birth, a prediction an epoch
+with its interaction factors, an update detections. Between them users' providers are asked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.graph_moments import condense, in_moments, lossy, stays
 from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.partition import Partition
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.sighting import Sighting
+from saga_fg.estimators.smoothed import Newest
 from saga_fg.frame import Frame
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
@@ -26,27 +31,40 @@ from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 
+@dataclass(frozen=True, eq=False)
+class GraphState:
+    """The filter as a value: the graph; its nodes, in order; their variables, by id; variables beside them that stay
+    until providers are asked again."""
+
+    graph: SceneFactorGraph
+    layout: Layout
+    keys: Mapping[int, int]
+    beside: tuple[int, ...]
+
+
 class GraphFilter:
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
-    lag        s; how long epochs stay in the graph, at least until they have been asked once at the next one
+    lag        s; how long epochs stay in the graph, at least until providers have been asked at the next one
 
-    What is told and reported is the newest state, at any lag.
+    What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
+    stands still; where noise is so small that factors would lose digits, it is predicted in moments.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
         self.providers, self._lag = tuple(providers), lag
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
-        self._beside: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._layout = Layout()
+        self._keys: Mapping[int, int] = {}
+        self._beside: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._posterior: BlockGaussian | None = None  # until the graph changes
 
     def __copy__(self) -> GraphFilter:
         twin = GraphFilter(self.providers, self._lag)
-        twin._smoother, twin._layout, twin._posterior = self._smoother.handed_over(), self._layout, self._posterior
-        twin._beside = self._beside
+        twin.__dict__ |= self.__dict__
+        twin._smoother = self._smoother.handed_over()
         return twin
 
     @property
@@ -68,9 +86,8 @@ class GraphFilter:
         """Let the users' providers add their factors."""
         smoother = self._changed()
         smoother.extend(self.providers)
-        smoother.forget()
-        graph, nodes = smoother.graph(), set(self._keys(self.nodes))
-        self._beside = tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
+        smoother.forget(self._keys.values())
+        self._beside = self._beside_now()
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Let some providers add their factors at the present epoch."""
@@ -84,7 +101,8 @@ class GraphFilter:
 
     def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
         """Joint covariance of other variables and some nodes, in the order given."""
-        return self._smoother.joint_covariance([*keys, *self._keys(nodes)])
+        mine = [self._keys[node] for node in np.asarray(nodes).tolist()]
+        return self._smoother.joint_covariance([*keys, *mine])
 
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
@@ -93,76 +111,124 @@ class GraphFilter:
         layout = self._layout.extended(nodes, mean.shape[1])
         added = layout.nodes[len(self._layout) :]
         smoother = self._changed()
-        smoother.marginalise(key for key in self._keys_of(added) if key in smoother.graph().variables)  # gone and back
+        keys = {node: node_key(node, smoother.graph().epoch) for node in added.tolist()}
+        back = [key for key in keys.values() if key in smoother.graph().variables]
+        if back:  # gone and back at the same epoch: iSAM2 has to forget them first
+            smoother.marginalise(back)
+            smoother.extend([])
         smoother.extend([Births(added, mean, covariance, labels or {})])
-        self._layout, self._posterior = layout, None
+        self._layout, self._keys = layout, {**self._keys, **keys}
 
     def predict(self, transition: Transition) -> None:
-        Dynamics.of(transition, self._layout)  # or an error
+        require_kind("transition", transition, Transition)
+        motion = Motion(transition)
+        motion.check(self._layout)
+        x, nodes = self.posterior(), self._layout.nodes
+        dynamics = motion.dynamics(self._layout, x.mean)
+        still = stays(dynamics)
+        if transition.dt == 0 and still.all():
+            return
+        standing, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
+        keys = {n: key if n in standing else node_key(n, epoch) for n, key in self._keys.items()}
+        chosen = lossy(x, dynamics, still)
+        unused = np.isin(transition.nodes, nodes[still | chosen])
+        change = self._in_moments(dynamics, chosen, keys) if chosen.any() else None
         smoother = self._changed()
-        smoother.forget(self._beside)
-        smoother.begin(self.time + transition.dt, [Interactions(transition), *beginnings(self.providers)])
+        smoother.forget({*self._keys.values(), *self._beside})
+        moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, standing)
+        begun = [moved, *beginnings(self.providers)]
+        smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in standing], change)
+        self._keys = keys
+        self._beside += self._beside_now()
 
-    def update(self, measurements: Measurements) -> None:
+    def update(self, measurements: Measurements) -> float:
         require_kind("measurements", measurements, Measurements)
-        if len(measurements):
-            self._layout.rows(measurements.nodes)
-            self._changed().extend([LinearDetections(measurements)])
+        sighting = Sighting(measurements)
+        sighting.check(self._layout)
+        if len(measurements) == 0:
+            return 0.0
+        x = self.posterior()
+        likelihood = innovation_likelihood(x, *sighting.linearised(x.layout, x.mean))
+        self._changed().extend([LinearDetections(measurements, self._keys)])
+        return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Nodes that disappear have no state at the next epoch; what they told of their neighbours stays."""
         self._layout = self._layout.without(self._layout.rows(nodes))
+        self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
         self._posterior = None
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
-        keys = self._keys(nodes)
-        return np.stack([self._state(key) for key in keys]) if keys else np.empty((0, 0))
+        return self._newest().mean(nodes)
 
     def covariance(self, nodes: ArrayLike) -> FloatArray:
-        rows = self._layout.rows(nodes)
-        self._layout.spans(rows)
-        return self.posterior().covariances(rows)
+        return self._newest().covariance(nodes)
 
     def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return np.concatenate([np.empty(0), *(self._state(key) for key in self._keys(nodes))])
+        return self._newest().joint_mean(nodes)
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self.posterior().joint(self._layout.rows(nodes))
+        return self._newest().joint_covariance(nodes)
 
     def posterior(self) -> BlockGaussian:
-        """The joint Gaussian of all nodes, as one component: all together cost little more than one alone."""
+        """The joint Gaussian of all nodes."""
         if self._posterior is None:
-            nodes = self._layout.nodes
-            partition = Partition(self._layout, np.zeros(len(nodes), dtype=np.int64))
-            blocks = (self._smoother.joint_covariance(self._keys(nodes))[None],) if len(nodes) else ()
-            self._posterior = BlockGaussian(partition, self.joint_mean(nodes), blocks)
+            self._posterior = self._joint()
         return self._posterior
 
     def graph(self) -> SceneFactorGraph:
         """The running graph itself."""
         return self._smoother.graph()
 
-    def snapshot(self) -> tuple[SceneFactorGraph, Layout]:
-        """The graph and its nodes as values, which can be pickled."""
-        return self._smoother.snapshot(), self._layout
+    def snapshot(self) -> GraphState:
+        """The whole state as a value. iSAM2 begins anew from it, so that both go on to the same bits."""
+        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._beside)
+        self.restore(state)
+        return state
 
-    def restore(self, state: tuple[SceneFactorGraph, Layout]) -> None:
+    def restore(self, state: GraphState) -> None:
         """Continue from a snapshot."""
-        require_kind("state", state, tuple)
-        graph, self._layout = state
-        self._changed().restore(graph)
+        require_kind("state", state, GraphState)
+        self._changed().restore(state.graph)
+        self._layout, self._keys, self._beside = state.layout, state.keys, state.beside
+
+    def _beside_now(self) -> tuple[int, ...]:
+        """Variables of the present epoch beside the nodes."""
+        graph, nodes = self._smoother.graph(), set(self._keys.values())
+        return tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
+
+    def _in_moments(
+        self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
+    ) -> Callable[[SceneFactorGraph], None]:
+        """What is to be done to the graph to move the components of the `chosen` nodes (n,) in moments."""
+        every = self._smoother.graph().variables
+        beside = {key: key for key, one in every.items() if one.epoch is None or key in self._beside}
+        x = self._joint(beside)
+        others = np.arange(len(self._layout), len(x.layout))
+        moved = in_moments(x, dynamics.beside(x.layout, others), chosen)
+        earlier, now = ({**beside, **nodes} for nodes in (self._keys, keys))
+        return lambda graph: condense(graph, moved, earlier, now)
+
+    def _joint(self, beside: Iterable[int] = ()) -> BlockGaussian:
+        """The joint Gaussian of all nodes, then of other variables, by increments from the base."""
+        layout, every = self._layout, self._smoother.graph().variables
+        for key in beside:
+            layout = layout.extended([key], every[key].dim)
+        keys = {**dict.fromkeys(beside), **self._keys}
+        return self._smoother.joint_gaussian(layout, [keys[node] or node for node in layout.nodes.tolist()])
+
+    def _newest(self) -> Newest:
+        return Newest(self._layout, self.posterior())
 
     def _changed(self) -> IncrementalSmoother:
         self._posterior = None
         return self._smoother
 
-    def _keys(self, nodes: ArrayLike) -> list[int]:
-        self._layout.rows(nodes)
-        return self._keys_of(nodes)
 
-    def _keys_of(self, nodes: ArrayLike) -> list[int]:
-        epoch = self._smoother.graph().epoch
-        return [node_key(node, epoch) for node in np.asarray(nodes).tolist()]
-
-    def _state(self, key: int) -> FloatArray:
-        return np.asarray(self._smoother.state(key))
+def _with_noise(transition: Transition, rows: BoolArray) -> Transition:
+    """The same with noise of variance 1 for some nodes (n,), so that there are factors of it, which are not used."""
+    Q = [
+        replace(group, values=np.where(rows[group.target][:, None, None], np.eye(group.values.shape[1]), group.values))
+        for group in transition.Q
+    ]
+    return replace(transition, Q=tuple(Q))

@@ -7,7 +7,7 @@ detection    || z - H x_i ||_R                           `LinearDetections`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,9 +47,15 @@ class Births:
 
 @dataclass(frozen=True, eq=False)
 class Interactions:
-    """Objects of the epoch before move by a transition over those that stay; nonlinear motion goes beside it."""
+    """Objects move by a transition over those that stay.
+
+    earlier    by id, the keys of their variables, by default those of the epoch before
+    standing   ids of those whose variables stay as they are
+    """
 
     transition: Transition
+    earlier: Mapping[int, int] | None = None
+    standing: Collection[int] = ()
     name: str = "interactions"
 
     def factors(self, view: GraphView) -> Additions:
@@ -57,26 +63,34 @@ class Interactions:
         nodes = transition.nodes.tolist()
         if not nodes:
             return Additions()
+        earlier = self.earlier or {node: node_key(node, view.epoch - 1) for node in nodes}
+        now = {node: node_key(node, view.epoch) for node in nodes}
         layout = Layout(nodes, transition.graph.dims)
-        now, earlier = ({node: node_key(node, epoch) for node in nodes} for epoch in (view.epoch, view.epoch - 1))
-        mean = np.concatenate([view.state(key) for key in earlier.values()])
-        moved = transition.F_matrix @ mean + transition.b
+        mean = np.concatenate([view.state(earlier[node]) for node in nodes])
+        motion = Motion(transition)
+        dynamics = motion.dynamics(layout, mean)
+        moved = dynamics.moved(mean) + dynamics.b
         states = np.split(moved, transition.offsets[1:-1])
         new = [
             NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
             for n, x in zip(nodes, states, strict=True)
+            if n not in self.standing
         ]
-        return Additions(new, motion_factors(Motion(transition), layout, mean, earlier, now)[0])
+        native, nonlinear = motion_factors(motion, layout, mean, dict(earlier), now)
+        still = {now[node] for node in self.standing}
+        return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
 
 
 @dataclass(frozen=True, eq=False)
 class LinearDetections:
-    """Linear measurements of objects at this epoch."""
+    """Linear measurements of objects; keys: of their variables by id, by default those of this epoch."""
 
     measurements: Measurements
+    keys: Mapping[int, int] | None = None
     name: str = "detections"
 
     def factors(self, view: GraphView) -> Additions:
         m = self.measurements
-        keys = np.array([[node_key(node, view.epoch)] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
+        now = self.keys or {node: node_key(node, view.epoch) for node in m.nodes.tolist()}
+        keys = np.array([[now[node]] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
         return Additions(factors=gaussian_factors(keys, [m.H], m.z, m.R))

@@ -16,14 +16,17 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graph_engine import Engine, RelinearisationSettings
+from saga_fg.estimators.graph_moments import joint_gaussian
 from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.layout import Layout
 from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.point import Point
@@ -84,11 +87,20 @@ class IncrementalSmoother:
             self._graph, self._times, self._engine = unchanged, times, None
             raise
 
-    def begin(self, time: float, providers: Sequence[FactorProvider]) -> None:
-        """The same, but keep all that is older than the lag."""
+    def begin(
+        self,
+        time: float,
+        providers: Sequence[FactorProvider],
+        standing: Iterable[int] = (),
+        change: Callable[[SceneFactorGraph], None] | None = None,
+    ) -> None:
+        """The same, but keep all that is older than the lag.
+
+        standing: variables that are those of the new epoch, too; change: of the graph, after the first provider
+        """
         graph = self._graph.copy()
-        graph.advance(time)
-        self._asked(graph, providers)
+        graph.advance(time, standing)
+        self._asked(graph, providers, change)
         self._times = [*self._times, graph.time]
 
     def forget(self, kept: Collection[int] = ()) -> None:
@@ -132,6 +144,11 @@ class IncrementalSmoother:
         engine, graph = self._ready(), self._graph
         return GraphSolution(Point(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged)
 
+    def joint_gaussian(self, layout: Layout, keys: Sequence[int]) -> BlockGaussian:
+        """The joint Gaussian of variables by components, as `saga_fg.estimators.graph_moments` has it."""
+        engine = self._ready()
+        return joint_gaussian(self._graph, engine.linear(), layout, keys)
+
     def handed_over(self) -> IncrementalSmoother:
         """A smoother that goes on from here with the same iSAM2; this one builds another when it is asked again."""
         twin = copy.copy(self)
@@ -150,10 +167,17 @@ class IncrementalSmoother:
         times = {one.time for one in graph.variables.values() if one.time is not None}
         self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))
 
-    def _asked(self, graph: SceneFactorGraph, providers: Sequence[FactorProvider]) -> None:
+    def _asked(
+        self,
+        graph: SceneFactorGraph,
+        providers: Sequence[FactorProvider],
+        change: Callable[[SceneFactorGraph], None] | None = None,
+    ) -> None:
         view = GraphView(graph, self.covariance, self.origin, self.frame)
-        for provider in providers:
+        for k, provider in enumerate(providers):
             ask(provider, graph, view)
+            if k == 0 and change is not None:
+                change(graph)
         self._engine = self._solved(graph)
         self._graph = graph
 

@@ -91,7 +91,7 @@ class JointKalmanFilter:
         return self._beside.rows(self._state.layout)
 
     def predict(self, transition: Transition) -> None:
-        dynamics = self._beside.dynamics(transition, self._state.layout)
+        dynamics = self._beside.dynamics(transition, self._state)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
         self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         self._predictions += 1

@@ -29,6 +29,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import WhitenedFactor, correct_whitened
 from saga_fg.estimators.dynamics import Dynamics, identity, predict
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.partition import Partition
 from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError
@@ -63,12 +64,13 @@ class Beside:
         every = enumerate(layout.nodes.tolist()) if known else ()
         return np.array([row for row, node in every if node in known], dtype=np.int64)
 
-    def dynamics(self, transition: Transition, layout: Layout) -> Dynamics:
+    def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
         """Those of a transition over the nodes; the variables beside them stay as they are."""
-        others = self.rows(layout)
+        motion, others = Motion(transition), self.rows(x.layout)
         if len(others) == 0:
-            return Dynamics.of(transition, layout)
-        return Dynamics.of(transition, layout.without(others)).beside(layout, others)
+            return motion.dynamics(x.layout, x.mean)
+        nodes = x.without(others)
+        return motion.dynamics(nodes.layout, nodes.mean).beside(x.layout, others)
 
     def at(self, x: BlockGaussian, time: float) -> tuple[SceneFactorGraph, dict[int, int]]:
         """The variables at `time`, and the id in the joint state of each that is in it, by key."""

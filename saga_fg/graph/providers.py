@@ -109,7 +109,8 @@ class GraphView:
 
     def key(self, kind: Kind, id: int, static: bool = False) -> int:  # noqa: A002 -- an id is what it is
         """The key of a variable of this epoch, or of one for all time; whether it is there or only to be added."""
-        return key_of(kind, id, None if static else self.epoch)
+        key = key_of(kind, id, None if static else self.epoch)
+        return self._graph.standing.get(key, key)
 
     def state(self, key: int) -> Any:
         """Where a variable is."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -26,7 +26,7 @@ import numpy as np
 from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
 from factors.marginal import Elimination
 from factors.validation import format_key
-from saga_fg.arrays import BoolArray, IntArray
+from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_checks import Factor, grouped
@@ -53,6 +53,7 @@ class SceneFactorGraph:
         self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
         self._count = 0
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
+        self.standing: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
 
     @property
     def variables(self) -> Mapping[int, GraphVariable]:
@@ -91,11 +92,13 @@ class SceneFactorGraph:
                 mine = tuple(self._variables[key] for key in held.factors.rows[row])
                 yield FactorEntry(held.provider, held.factors.name, mine)
 
-    def advance(self, time: float) -> int:
-        """Begin the next epoch at `time`, s; returns its number."""
+    def advance(self, time: float, standing: Iterable[int] = ()) -> int:
+        """Begin the next epoch at `time`, s; returns its number. standing: variables that are those of it, too."""
         if not math.isfinite(time) or time <= self.time:
             raise GraphError(f"time: expected a finite number after {self.time:.6f} s, got {time!r}")
         self.epoch, self.previous_time, self.time = self.epoch + 1, self.time, float(time)
+        its = ((self._variables[key], key) for key in standing)
+        self.standing = {key_of(one.kind, one.id, self.epoch): key for one, key in its}
         return self.epoch
 
     def add_variables(self, provider: str, variables: Iterable[NewVariable]) -> list[int]:
@@ -151,33 +154,47 @@ class SceneFactorGraph:
         gone = {key: self.variable(key) for key in keys}
         if not gone:
             return
-        touched, point = gtsam.GaussianFactorGraph(), self.point()
-        rest: dict[int, BoolArray] = {}
-        leaving: dict[int, list[int]] = {}
-        numbers = {number for key in gone for number in self._touching[key]}
-        for number in sorted(numbers, key=lambda number: self._groups[number].sharpness):
-            held = self._groups[number]
-            mine = [row for row in held.rows.tolist() if not gone.keys().isdisjoint(held.factors.rows[row])]
-            if not mine:
-                continue
-            for factor in self.linearised(held, np.array(mine), point):
+        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._rows_on(gone)
+        for number, mine in rows.items():
+            for factor in self.linearised(self._groups[number], np.array(mine), point):
                 touched.push_back(factor)
-            rest[number] = held.active.copy()
-            rest[number][mine] = False
-            leaving[number] = mine
         spoken = set(touched.keyVector())
         factors = self._eliminated(touched, sorted(gone.keys() & spoken))
-        for number, active in rest.items():
+        self._replace(rows, factors, gone)
+        if factors:
+            self._choose(max(factor.cols() - 1 for factor in factors))
+
+    def condense(self, gone: Collection[int], prior: gtsam.JacobianFactor) -> None:
+        """Put a prior, on increments from the base, in the place of all factors on its variables and those `gone`."""
+        self._replace(self._rows_on({*gone, *prior.keys()}), [prior], gone)
+        self._choose(prior.cols() - 1)
+
+    def _rows_on(self, keys: Collection[int]) -> dict[int, list[int]]:
+        """Rows of groups on any of some variables, by the number of the group, the sharpest first."""
+        numbers = {number for key in keys for number in self._touching[key]}
+        result = {}
+        for number in sorted(numbers, key=lambda number: self._groups[number].sharpness):
+            held = self._groups[number]
+            mine = [row for row in held.rows.tolist() if any(key in keys for key in held.factors.rows[row])]
+            if mine:
+                result[number] = mine
+        return result
+
+    def _replace(
+        self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], gone: Iterable[int]
+    ) -> None:
+        """Take rows of groups out and put priors in, then take out the variables that nothing speaks of any more."""
+        for number, mine in rows.items():
             self._fresh.pop(number, None)
-            self._count_rows(self._groups[number].factors, leaving[number], -1)
+            active = self._groups[number].active.copy()
+            active[mine] = False
+            self._count_rows(self._groups[number].factors, mine, -1)
             self._groups[number] = replace(self._groups[number], active=active)
             if not active.any():
                 self._drop(number)
         if factors:
-            rows = tuple(tuple(factor.keys()) for factor in factors)
-            prior = PriorGroup(tuple(factors), rows)
-            self._hold(HeldGroup(_MARGINALS, None, prior, np.ones(len(rows), dtype=bool)))
-            self._choose(max(factor.cols() - 1 for factor in factors))
+            prior = PriorGroup(tuple(factors), tuple(tuple(factor.keys()) for factor in factors))
+            self._hold(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
         for key in gone:
             del self._variables[key], self._touching[key], self._factor_counts[key]
             self._values.erase(key)
@@ -193,7 +210,9 @@ class SceneFactorGraph:
 
     def of(self, kind: Kind, epoch: int | None) -> dict[int, GraphVariable]:
         """The variables of a kind and an epoch, None for those for all time, by id."""
-        return {one.id: one for one in self._variables.values() if one.kind == kind and one.epoch == epoch}
+        standing = set(self.standing.values()) if epoch == self.epoch else ()
+        every = (one for one in self._variables.values() if one.epoch == epoch or one.key in standing)
+        return {one.id: one for one in every if one.kind == kind}
 
     def older_than(self, time: float) -> list[int]:
         """Keys of the variables of moments before `time`."""

@@ -3,12 +3,16 @@
 import copy
 import itertools
 import pickle
+from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
 import pytest
 from estimator_programs import Add, Marginalise, TextbookEstimator, random_program
-from random_graphs import CAR, CONE
+from random_graphs import CAR, POLE, TRAM
+from test_tracker_road import SENSORS, queue_frames
+from test_tracker_road import SETTINGS as ROAD
 from traffic_frames import run, seen, straight
 
 from factors import (
@@ -24,7 +28,7 @@ from factors import (
 )
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
-from saga_fg.graph import EGO_POSE, LANDMARK, OBJECT, Additions, GraphError, NewVariable
+from saga_fg.graph import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, Additions, GraphError, NewVariable
 
 BACK_ENDS = {
     "kalman": JointKalmanFilter,
@@ -79,7 +83,7 @@ def test_linear_factors_of_providers_lead_to_one_estimate(seed, name):
     told = [Surroundings(), Surroundings()]
     kalman, other = JointKalmanFilter(told[:1]), BACK_ENDS[name](told[1:])
     apart = TextbookEstimator()
-    for operation in random_program(np.random.default_rng(seed), moments=8, kinds=(CAR, CONE)):
+    for operation in random_program(np.random.default_rng(seed), moments=8, kinds=(CAR, TRAM, POLE)):
         for estimator in (kalman, other, apart):
             operation.run(estimator)
         if not isinstance(operation, Add | Marginalise):
@@ -222,6 +226,28 @@ def test_a_linear_factor_leads_every_back_end_to_the_same_tracks():
             assert one.position_covariance == pytest.approx(other.position_covariance, rel=1e-8)
     untold = run(tracker("kalman"), FRAMES)[-1]
     assert np.abs(state(one) - state(untold)).max() > 0.1
+
+
+@pytest.mark.parametrize("name", BACK_ENDS)
+def test_nodes_of_a_road_map_are_variables_beside_the_tracks(name):
+    """Lights, lines and lanes stand still, so that each keeps one variable; cars brake for a line that is moved."""
+    seen_by = []
+
+    def line(view, objects, there=None):
+        nodes = view.now(MAP_NODE)
+        seen_by.append(sorted(map(str, nodes.values())))
+        keys = [key for number in nodes if view.variables[key := view.key(MAP_NODE, number)].label == "stop_line"]
+        return [gaussian_factor([key], [np.eye(2)], there - view.origin) for key in keys if there is not None]
+
+    settings = replace(ROAD, estimator=name)
+    plain, told, moved = (
+        run(Tracker(settings, SENSORS, providers=providers), list(queue_frames()))[-1]
+        for providers in ([], [Given(line)], [Given(partial(line, there=np.array([-8.0, 0.0])))])
+    )
+    assert told.id.tolist() == plain.id.tolist()
+    assert np.abs(state(told) - state(plain)).max() < 1e-6
+    assert np.abs(state(moved) - state(plain)).max() > 0.05
+    assert [name.split(" at")[0] for name in seen_by[-1]] == ["lane 3", "stop_line 2", "traffic_light 1"]
 
 
 def test_in_the_kalman_filter_robust_losses_are_weighted_at_the_prediction():

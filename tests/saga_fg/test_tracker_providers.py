@@ -159,12 +159,13 @@ def test_names_that_lead_to_no_provider(name: str, message: str) -> None:
         Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
 
 
-def test_tracks_come_and_go_in_a_graph_that_stays_small() -> None:
-    tracker = Tracker(ISAM2, providers=[Range()])
+@pytest.mark.parametrize(("name", "size"), [("isam2", 6), ("fixed-lag", 14)])
+def test_tracks_come_and_go_in_a_graph_that_stays_small(name: str, size: int) -> None:
+    tracker = Tracker(TrackerSettings(estimator=name, lag=0.5), providers=[Range()])
     sizes = []
     for k in range(60):
         where = CARS(0.1 * k)[[k // 20]] if k % 20 < 12 else np.empty((0, 2))
         tracker.step(frame(0.1 * k, where))
-        graph = tracker.snapshot().tracks.state[0][0]
+        graph = tracker.snapshot().tracks.state[0].graph
         sizes.append(len(graph.variables))
-    assert max(sizes) <= 6
+    assert max(sizes) <= size

@@ -1,0 +1,123 @@
+"""The running graph as a joint Gaussian by components, and intervals that are carried out on it, P <- F P F^T + Q.
+
+Interaction factors are information: noise without variance has none, and noise of variance Q between states of variance
+P costs QR digits, Cholesky twice as many. Components with a node that has lost too many are predicted in moments: all
+that is known of them becomes one prior on their newest states. A node that stays as it is, x' = x, needs neither: it
+keeps its variable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import gtsam
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
+
+from factors import FactorError, joint_prior_factor, marginal_moments
+from saga_fg.arrays import BoolArray
+from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.partition import Partition, zeros
+from saga_fg.estimators.prediction import Prediction
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+
+_SMALL = 64  # size of the largest component for which the first limit holds, since it is eliminated by QR
+_LIMITS = 1e11, 1e6  # variance predicted over process noise, up to which factors keep enough digits
+
+
+def joint_gaussian(
+    graph: SceneFactorGraph, linear: gtsam.GaussianFactorGraph, layout: Layout, keys: Sequence[int]
+) -> BlockGaussian:
+    """The joint Gaussian of variables, whose ids in `layout` are those of nodes or their keys.
+
+    Nodes with their states, other variables with increments from their base; linear: all factors of the graph.
+    """
+    factors = [linear.at(k) for k in range(linear.size())]
+    spoken = [factor.keys() for factor in factors]
+    label = components(spoken)
+    parts = {label[key]: gtsam.GaussianFactorGraph() for key in keys}
+    for factor, its in zip(factors, spoken, strict=True):
+        if (part := parts.get(label[its[0]])) is not None:
+            part.push_back(factor)
+    number, own = np.unique([label[key] for key in keys], return_inverse=True)
+    partition = Partition(layout, own.astype(np.int64))
+    blocks = zeros(partition)
+    for k, name in enumerate(number.tolist()):
+        rows = np.flatnonzero(own == k)
+        try:
+            P = marginal_moments(parts[name], [keys[row] for row in rows.tolist()], "qr")[1]
+        except FactorError as error:
+            raise graph.undetermined(error) from error
+        blocks[partition.group[rows[0]]][partition.row[rows[0]]] = P
+    base = graph.base
+    mean = [
+        np.asarray(graph.state(key))
+        if node != key
+        else (v := graph.variable(key)).type.local(v.type.read(base, key), graph.state(key))
+        for node, key in zip(layout.nodes.tolist(), keys, strict=True)
+    ]
+    return BlockGaussian(partition, np.concatenate([np.empty(0), *mean]), blocks)
+
+
+def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
+    """The component of every variable, by the keys of factors: what these tie together, directly or through others."""
+    row: dict[int, int] = {}
+    pairs = [(row.setdefault(keys[0], len(row)), row.setdefault(key, len(row))) for keys in factors for key in keys]
+    a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    matrix = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=(len(row), len(row)))
+    return dict(zip(row, connected_components(matrix, directed=False)[1].tolist(), strict=True))
+
+
+def stays(dynamics: Dynamics) -> BoolArray:
+    """(n,) whether nodes stay as they are: x' = x, without noise, whatever the others do."""
+    n = len(dynamics.layout)
+    same, told = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    for F in dynamics.F:
+        own = F.target == F.source
+        same[F.target[own & (F.values == np.eye(*F.values.shape[1:])).all(axis=(1, 2))]] = True
+        told[F.target[~own & F.values.any(axis=(1, 2))]] = True
+    for Q in dynamics.Q:
+        told[Q.target[Q.values.any(axis=(1, 2))]] = True
+    told[np.repeat(np.arange(n), dynamics.layout.dims)[dynamics.b != 0]] = True
+    return same & ~told
+
+
+def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray) -> BoolArray:
+    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable."""
+    prediction = Prediction.of(x, dynamics)
+    label = prediction.components.label
+    wide = np.bincount(label, weights=x.layout.dims)[label] > _SMALL
+    return np.isin(label, label[(prediction.ratio > np.where(wide, *_LIMITS[::-1])) & ~still])
+
+
+def in_moments(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:
+    """The prediction of those components of `x` that have one of the first nodes, which are `chosen` (n,)."""
+    label = dynamics.joined(x.partition).label
+    mine = np.isin(label, label[: len(chosen)][chosen])
+    return predict(x.without(np.flatnonzero(~mine)), dynamics.restricted(np.flatnonzero(mine)))
+
+
+def condense(graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, int], now: Mapping[int, int]) -> None:
+    """Put the joint Gaussian `x` in the place of all that the graph holds of its components.
+
+    Its variables by id, as they were and as they are now. Raises `InputError` where it has become singular.
+    """
+    label = components(held.factors.rows[row] for held in graph.groups.values() for row in held.rows.tolist())
+    ids = x.layout.nodes.tolist()
+    for number in range(x.partition.count):
+        rows = np.flatnonzero(x.partition.label == number)
+        keys = [now[ids[row]] for row in rows.tolist()]
+        old = {label[earlier[ids[row]]] for row in rows.tolist()}
+        gone = [key for key, part in label.items() if part in old and key not in keys]
+        mean = np.split(x.mean[x.layout.places(rows)], np.cumsum(x.layout.dims[rows])[:-1])
+        base = graph.base
+        increments = [m if key in ids else m - base.atVector(key) for key, m in zip(keys, mean, strict=True)]
+        try:
+            prior = joint_prior_factor(keys, increments, x.joint(rows))
+        except FactorError as error:
+            raise InputError(f"transition: {graph.worded(str(error), keys)}") from error
+        graph.condense(gone, prior)
