@@ -27,6 +27,7 @@ from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.frame import Frame
 from saga_fg.graph.providers import FactorProvider, beginnings
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
@@ -89,6 +90,11 @@ class JointKalmanFilter:
     def others(self) -> IntArray:
         """Rows of the variables beside the nodes, in the joint state: poses, landmarks."""
         return self._beside.rows(self._state.layout)
+
+    @property
+    def beside(self) -> SceneFactorGraph:
+        """These variables where they are, without factors."""
+        return self._beside.graph
 
     def predict(self, transition: Transition) -> None:
         dynamics = self._beside.dynamics(transition, self._state)

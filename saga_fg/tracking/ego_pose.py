@@ -16,7 +16,7 @@ from factors import relative_detection_factors
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators import GraphFilter
 from saga_fg.geometry import inverse_transform, transform_points, yaw_transform
-from saga_fg.graph import EGO_POSE, key_of
+from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
 from saga_fg.interactions import POSITION
 from saga_fg.node import NodeType
 
@@ -38,14 +38,9 @@ class Sightings(NamedTuple):
         return cls(transform_points(inverse_transform(world_T_ego), position), turn.T @ R @ turn)
 
 
-def pose_key(estimator: GraphFilter) -> int:
-    """Of the vehicle's present pose."""
-    return key_of(EGO_POSE, 0, estimator.graph().epoch)
-
-
-def local_pose(estimator: GraphFilter) -> FloatArray | None:
-    """The pose (4, 4), counted from the graph's origin; None where no provider has added one."""
-    graph, key = estimator.graph(), pose_key(estimator)
+def local_pose(graph: SceneFactorGraph) -> FloatArray | None:
+    """The vehicle's present pose (4, 4), counted from the graph's origin; None where no provider has added one."""
+    key = key_of(EGO_POSE, 0, graph.epoch) if graph.epoch >= 0 else -1
     if key not in graph.variables:
         return None
     pose = graph.state(key)
@@ -54,7 +49,8 @@ def local_pose(estimator: GraphFilter) -> FloatArray | None:
 
 def relative_covariances(estimator: GraphFilter, ids: IntArray, types: tuple[NodeType, ...]) -> FloatArray:
     """Covariances (n, 2, 2) of where objects are, seen from the vehicle, in the axes of the world."""
-    pose, key = estimator.graph().state(pose_key(estimator)), pose_key(estimator)
+    key = key_of(EGO_POSE, 0, estimator.graph().epoch)
+    pose = estimator.graph().state(key)
     planar = isinstance(pose, gtsam.Pose2)
     matrix = pose.matrix()[None]
     turn = matrix[0, :2, :2]

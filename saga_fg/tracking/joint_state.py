@@ -210,7 +210,10 @@ class JointTrackState:
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
-        return local_pose(self._estimator) if isinstance(self._estimator, GraphFilter) else None
+        estimator = self._estimator
+        if isinstance(estimator, JointKalmanFilter):
+            return local_pose(estimator.beside)
+        return local_pose(estimator.graph()) if isinstance(estimator, GraphFilter) else None
 
     def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
         """(n, 2, 2) of where tracks are, seen from the vehicle's pose in the running graph."""
