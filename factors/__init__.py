@@ -37,13 +37,14 @@ from factors.relative_polar import relative_range_bearing_factors
 from factors.robust import Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
-from factors.variables import PlanarPose, SpatialPose, Variable, Vector
+from factors.variables import ImuBias, PlanarPose, SpatialPose, Variable, Vector
 
 __all__ = [
     "ERROR_DIM",
     "Components",
     "FactorError",
     "HesseLine",
+    "ImuBias",
     "Linearisable",
     "MeasurementModel",
     "NonlinearInteraction",

@@ -1,13 +1,18 @@
 """What is known of a pose from outside: its place from a satellite receiver, its tilt from an accelerometer.
 
-    position   r = world_T_pose . translation - z                    GTSAM's `GPSFactor`, z in the local frame, m
+    position   r = t + R a - z                                       z in the local frame, a the antenna's place, m
     attitude   r = angle between R u_pose and u_world, two turns     GTSAM's `AttitudeFactorPose3`
+
+With the pose moved by its tangent to (R Exp(w), t + R v): dr/dv = R, dr/dw = -R [a]x (in the plane: R (-a_y, a_x)).
 
 An accelerometer at rest measures "up" in the frame of the pose, u_pose, where the world says u_world = (0, 0, 1); a
 compass does the same with north. Neither measures the turn about its own direction.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -16,21 +21,40 @@ from numpy.typing import ArrayLike
 from factors.between import noise_model
 from factors.errors import FactorError
 from factors.robust import RobustLoss
-from factors.validation import checked, checked_keys
+from factors.rotations import cross_matrix
+from factors.stacked import ResidualFactors
+from factors.validation import FloatArray, checked, checked_keys
+from factors.variables import PlanarPose, SpatialPose
 
 _UP = (0.0, 0.0, 1.0)
 
 
 def position_factor(
-    pose_key: int, position: ArrayLike, covariance: ArrayLike, robust: RobustLoss | None = None
-) -> gtsam.NonlinearFactor:
-    """Return GTSAM's factor of a measured place; position: (3,), m, local frame; covariance: (3, 3), m^2.
+    pose_key: int,
+    position: ArrayLike,
+    covariance: ArrayLike,
+    antenna: ArrayLike = (0.0, 0.0, 0.0),
+    robust: RobustLoss | None = None,
+) -> ResidualFactors:
+    """Return the factor of a measured place, of a `gtsam.Pose2` where it is (2,), of a `gtsam.Pose3` where it is (3,).
 
-    The variable is a `gtsam.Pose3`. Raises `FactorError`.
+    position: m, local frame; covariance: (2, 2) or (3, 3), m^2; antenna: (3,), where on the vehicle it is measured, m.
+    Raises `FactorError`.
     """
     (key,) = checked_keys("pose_key", [pose_key])
-    measured = checked("position", position, (3,))
-    return gtsam.GPSFactor(key, measured, noise_model("covariance", covariance, 3, robust))
+    z = checked("position", position, (None,))
+    if len(z) not in (2, 3):
+        raise FactorError(f"position: expected 2 or 3 coordinates, got {len(z)}")
+    function = _Place(z, checked("antenna", antenna, (3,))[: len(z)])
+    return ResidualFactors(
+        rows=np.array([[key]], dtype=np.uint64),
+        dims=(PlanarPose() if len(z) == 2 else SpatialPose(),),
+        residual=function.residual,
+        covariances=checked("covariance", covariance, (len(z), len(z))),
+        jacobians=function.jacobians,
+        robust=robust,
+        name="measured place",
+    )
 
 
 def attitude_factor(
@@ -55,3 +79,21 @@ def _direction(name: str, value: ArrayLike) -> gtsam.Unit3:
     if not np.linalg.norm(direction) > 0:
         raise FactorError(f"{name}: expected a direction, got a vector of length 0")
     return gtsam.Unit3(direction)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    z: FloatArray
+    antenna: FloatArray
+
+    def residual(self, pose: FloatArray) -> FloatArray:
+        d = len(self.z)
+        return pose[:, :d, d] + pose[:, :d, :d] @ self.antenna - self.z
+
+    def jacobians(self, pose: FloatArray) -> Sequence[FloatArray]:
+        d = len(self.z)
+        R = pose[:, :d, :d]
+        if d == 3:
+            return [np.concatenate([-R @ cross_matrix(self.antenna), R], axis=2)]
+        turned = R @ np.array([[-self.antenna[1]], [self.antenna[0]]])
+        return [np.concatenate([R, turned], axis=2)]

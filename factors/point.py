@@ -36,7 +36,7 @@ def point_factors(
     values = np.asarray(z)
     d = 2 if values.ndim == 2 and values.shape[1] == 2 else 3
     measured = checked("z", z, (None, d)).copy()
-    function = _Point(measured)
+    function = Point(measured)
     return ResidualFactors(
         rows=np.asarray(rows),
         dims=(PlanarPose() if d == 2 else SpatialPose(), d),
@@ -49,7 +49,9 @@ def point_factors(
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
+class Point:
+    """The residual and its derivatives, for n points (n, d) seen at `z` (n, d)."""
+
     z: FloatArray
 
     def residual(self, pose: FloatArray, point: FloatArray) -> FloatArray:

@@ -9,6 +9,8 @@ is how far off the object stands, in the axes of the vehicle, in which the senso
 matter: they are filtered object by object. The Jacobians, for a pose moved to (R Exp(w), t + R v), are
 
     dr/dw = [R^T d]x - R^T E R [z]x,    dr/dv = R^T E R,    dr/dp = -R^T E,        d = E (R z + t - (p, 0))
+
+From a pose in the plane, with z (2,), it is a point seen from it (`factors.point`).
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.measurement import checked_components
+from factors.point import Point
 from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
 from factors.stacked import ResidualFactors
 from factors.validation import FloatArray, checked, checked_covariances
-from factors.variables import SpatialPose
+from factors.variables import PlanarPose, SpatialPose
 
 _LEVEL = np.diag([1.0, 1.0, 0.0])
 
@@ -40,15 +43,17 @@ def relative_detection_factors(
     """Return n factors of objects seen from the vehicle.
 
     rows: (n, 2) keys of the pose (`gtsam.Pose3`) and of the object (vector of `state_dim`); z: (n, 3), m, in the
-    vehicle's frame; covariances: (n, 2, 2), or one for all, m^2, in the vehicle's axes ahead and left; position: where
-    the world position sits in the object's state. Raises `FactorError`.
+    vehicle's frame, or (n, 2) from a `gtsam.Pose2`; covariances: (n, 2, 2), or one for all, m^2, in the vehicle's axes
+    ahead and left; position: where the world position sits in the object's state. Raises `FactorError`.
     """
-    measured = checked("z", z, (None, 3))
+    planar = np.ndim(z) == 2 and np.shape(z)[1] == 2
+    measured = checked("z", z, (None, 2 if planar else 3)).copy()
     checked_components("position", position, state_dim, least=2)
-    function = _RelativeDetection(measured.copy(), state_dim, tuple(position))
+    kind = _PlanarDetection if planar else _RelativeDetection
+    function = kind(measured, state_dim, tuple(position))
     return ResidualFactors(
         rows=np.asarray(rows),
-        dims=(SpatialPose(), state_dim),
+        dims=(PlanarPose() if planar else SpatialPose(), state_dim),
         residual=function.residual,
         covariances=checked_covariances("covariances", covariances, len(measured), 2),
         jacobians=function.jacobians,
@@ -81,3 +86,19 @@ class _RelativeDetection:
         d[:, :2] -= state[:, list(self.position)]
         d[:, 2] = 0.0
         return np.asarray((R.swapaxes(1, 2) @ d[:, :, None])[:, :, 0])
+
+
+@dataclass(frozen=True, eq=False)
+class _PlanarDetection:
+    z: FloatArray
+    state_dim: int
+    position: tuple[int, ...]
+
+    def residual(self, pose: FloatArray, state: FloatArray) -> FloatArray:
+        return Point(self.z).residual(pose, state[:, list(self.position)])
+
+    def jacobians(self, pose: FloatArray, state: FloatArray) -> Sequence[FloatArray]:
+        J_pose, J_place = Point(self.z).jacobians(pose, state[:, list(self.position)])
+        J_state = np.zeros((len(pose), 2, self.state_dim))
+        J_state[:, :, list(self.position)] = J_place
+        return [J_pose, J_state]

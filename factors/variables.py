@@ -117,6 +117,30 @@ class SpatialPose:
         return state.matrix()
 
 
+@dataclass(frozen=True)
+class ImuBias:
+    """A `gtsam.imuBias.ConstantBias`; delta = (of accelerometers, m/s^2, of gyroscopes, rad/s), as numbers the same."""
+
+    @property
+    def dim(self) -> int:
+        return 6
+
+    def read(self, values: gtsam.Values, key: int) -> gtsam.imuBias.ConstantBias:
+        return values.atConstantBias(key)
+
+    def retract(self, state: gtsam.imuBias.ConstantBias, delta: FloatArray) -> gtsam.imuBias.ConstantBias:
+        return state.retract(delta)
+
+    def local(self, state: gtsam.imuBias.ConstantBias, other: gtsam.imuBias.ConstantBias) -> FloatArray:
+        return state.localCoordinates(other)
+
+    def size(self, state: gtsam.imuBias.ConstantBias) -> FloatArray:
+        return np.abs(state.vector())
+
+    def array(self, state: gtsam.imuBias.ConstantBias) -> FloatArray:
+        return state.vector()
+
+
 def read_states(values: gtsam.Values, keys: Sequence[int], variables: Sequence[Variable]) -> list[Any]:
     """Return the states of `keys`; raise `FactorError` for a missing one or one of another type or dimension."""
     try:

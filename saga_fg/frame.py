@@ -11,6 +11,7 @@ import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.boxes import MAX_POSITION, MAX_SPEED, Boxes
+from saga_fg.ego_measurements import EgoMeasurements
 from saga_fg.errors import InputError
 from saga_fg.geometry import checked_transform
 from saga_fg.road.road_map import RoadMap
@@ -137,9 +138,10 @@ class Frame:
     sensor       the sensor's name, e.g. "lidar"
     detections   boxes in `coordinates`: "world", "ego" (vehicle) or "sensor"
     world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world" and no range rate
-                 was measured
+                 was measured, or `ego` is there to estimate it from
     token        the dataset's own name of the record, "" if none
     road_map     what is known of the road from now on, besides what earlier frames brought; None: nothing new
+    ego          what the vehicle measured of itself, for factor providers (`saga_fg.providers`)
 
     Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
     that is not rigid or beyond all places.
@@ -152,6 +154,7 @@ class Frame:
     coordinates: Coordinates = "world"
     token: str = ""
     road_map: RoadMap | None = None
+    ego: EgoMeasurements | None = None
 
     def __post_init__(self) -> None:
         timestamp = finite_seconds(self.timestamp)
@@ -166,12 +169,16 @@ class Frame:
             raise InputError(
                 f"coordinates: expected one of {', '.join(get_args(Coordinates))}, got {self.coordinates!r}"
             )
+        if self.ego is not None and not isinstance(self.ego, EgoMeasurements):
+            raise InputError(f"ego: expected EgoMeasurements, got {type(self.ego).__name__}")
         if self.world_T_ego is not None:
             pose = checked_transform("world_T_ego", self.world_T_ego)
             if (np.abs(pose[:3, 3]) > MAX_POSITION).any():
                 place = pose[:3, 3].tolist()
                 raise InputError(f"world_T_ego: expected a place within {MAX_POSITION:g} m, got {place}")
             object.__setattr__(self, "world_T_ego", pose)
+        elif self.ego is not None:
+            return
         elif self.coordinates != "world":
             raise InputError(
                 f"world_T_ego: expected a pose, since the detections are in {self.coordinates} coordinates"

@@ -242,9 +242,11 @@ class Sensor:
         return scale * (1 + scale_growth * doubt), shared * (1 + shared_growth * doubt)
 
     def in_world(self, frame: Frame) -> Detections:
-        """The detections of a frame of this sensor, in world coordinates."""
-        if frame.world_T_ego is None or frame.coordinates == "world":
+        """The detections of a frame of this sensor, in world coordinates; `InputError` where nobody knows the pose."""
+        if frame.coordinates == "world":
             return frame.detections
+        if frame.world_T_ego is None:
+            raise InputError("world_T_ego: expected a pose, since nothing estimates it (tracker.ego.estimated)")
         ego_T_source = self.extrinsics.ego_T_sensor if frame.coordinates == "sensor" else np.eye(4)
         return frame.detections.transformed(frame.world_T_ego @ ego_T_source)
 

@@ -15,8 +15,11 @@ One row per detection. The same columns in every format; only the first three ar
     sensor                name of the sensor                         default "sensor"
     scene                 name of the recording                      default the file's name
     coordinates           "world", "ego" or "sensor"                 default "world"
-    ego_x, ego_y, ego_yaw pose of the vehicle, m and rad             required unless coordinates is "world"
-    ego_z                 m                                          default 0
+    ego_x, ego_y, ego_yaw pose of the vehicle, m and rad             required unless coordinates is "world", or the
+    ego_z                 m                                          vehicle measures itself; ego_z: default 0
+    odometry_x, odometry_y, odometry_yaw, odometry_dt                default unknown
+                          how the vehicle has moved over the last odometry_dt s, in its frame of then, m and rad
+    gps_x, gps_y, gps_z   its place as measured, m                   default unknown
 
 Rows with the same scene, timestamp and sensor are one frame. A row whose x and y are both left out says that the sensor
 looked and saw nothing (in NumPy arrays, which cannot leave anything out: a boolean array `empty`).

@@ -16,7 +16,9 @@ REQUIRED = ("timestamp", "x", "y")
 BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score")
 POSE = ("ego_x", "ego_y", "ego_z", "ego_yaw")
 TEXT = ("label", "sensor", "scene", "coordinates")
-COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, "empty")
+ODOMETRY = ("odometry_x", "odometry_y", "odometry_yaw", "odometry_dt")
+GPS = ("gps_x", "gps_y", "gps_z")
+COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, "empty")
 LONGEST_NAME = 256  # characters; NumPy stores all texts of an array as wide as the widest
 
 Values = Sequence[Any] | np.ndarray[Any, Any]

@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 
 from data_tools.detection_files.columns import POSE, RawTable
+from data_tools.detection_files.ego_columns import EgoColumns
 from data_tools.detection_files.formats import read_raw_parts, read_raw_table
 from data_tools.located import located, unknown
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
@@ -34,6 +35,7 @@ class _Rows:
     empty: BoolArray
     detections: Detections
     pose: FloatArray | None  # (N, 4): x, y, z, yaw
+    ego: EgoColumns | None
 
 
 class DetectionFile:
@@ -103,6 +105,7 @@ class DetectionFile:
                     detections=table.detections.select(members[~table.empty[members]]),
                     world_T_ego=None if poses is None else poses[k],
                     coordinates=cast(Coordinates, str(kind[0])),
+                    ego=None if table.ego is None else table.ego.measured(members),
                 )
             )
         return frames
@@ -162,10 +165,10 @@ def _checked(raw: RawTable) -> _Rows:
     if strange.any():
         row = int(np.argmax(strange))
         raise raw.fault(row, f"coordinates: expected world, ego or sensor, got {str(coordinates[row])!r}")
-    pose = _pose(raw, coordinates)
-    return _Rows(
-        raw, scene, timestamp, raw.texts("sensor", "sensor"), coordinates, empty, box_columns(raw, empty), pose
-    )
+    ego = EgoColumns.of(raw)
+    pose = _pose(raw, coordinates, ego is not None)
+    detections = box_columns(raw, empty)
+    return _Rows(raw, scene, timestamp, raw.texts("sensor", "sensor"), coordinates, empty, detections, pose, ego)
 
 
 def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
@@ -195,10 +198,11 @@ def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
     return Detections(boxes, score, np.where(empty, np.nan, raw.numbers("range_rate")))
 
 
-def _pose(raw: RawTable, coordinates: StrArray) -> FloatArray | None:
+def _pose(raw: RawTable, coordinates: StrArray, estimated: bool) -> FloatArray | None:
+    """(N, 4); None where there are none, as there may where the vehicle's own measurements stand in for them."""
     given = [name for name in POSE if raw.present(name).any()]
     if not given:
-        if (coordinates != "world").any():
+        if (coordinates != "world").any() and not estimated:
             row = int(np.argmax(coordinates != "world"))
             raise raw.fault(row, f"coordinates: {coordinates[row]} needs the columns ego_x, ego_y and ego_yaw")
         return None

@@ -18,6 +18,7 @@ import yaml
 from data_tools.input_files import read_text
 from pipelines.configuration.schema import (
     Choice,
+    Imported,
     Listing,
     Nullable,
     Scalar,
@@ -28,6 +29,7 @@ from pipelines.configuration.schema import (
     settings_of,
 )
 from saga_fg.errors import InputError
+from saga_fg.tracking.provider_names import named
 
 T = TypeVar("T")
 LARGEST = 2**63 - 1  # whole number
@@ -70,6 +72,8 @@ def _read(schema: Schema, data: Any, base: Any, where: str) -> Any:
             return _read_table(value, data, base, where)
         case Section():
             return _read_section(schema, data, base, where)
+        case Imported():
+            return data if isinstance(data, str) else _read_imported(data, where)
 
 
 def _read_scalar(kind: type, data: Any, where: str) -> Any:
@@ -131,6 +135,21 @@ def _read_section(schema: Section, data: Any, base: Any, where: str) -> Any:
         return cls(**values)
     except InputError as error:
         raise InputError(f"{where}: {error}" if where else str(error)) from error
+
+
+def _read_imported(data: Any, where: str) -> Any:
+    values = {key: data[key] for key in _text_keys(data, where)}
+    kind = values.pop("kind", None)
+    if not isinstance(kind, str):
+        raise _mismatch(f"{where}.kind", "MODULE:NAME", kind)
+    try:
+        cls = named(kind)
+        settings_of(cls)
+    except InputError as error:
+        raise InputError(f"{where}.kind: {error}") from error
+    except TypeError as error:
+        raise InputError(f"{where}.kind: {kind}: expected a dataclass of settings: {error}") from error
+    return _read_section(Section((cls,)), values, None, where)
 
 
 def _class_of_kind(schema: Section, data: dict[str, Any], where: str) -> type:

@@ -8,6 +8,7 @@ from typing import Any
 from pipelines.configuration.reading import DEFAULT_ENTRY
 from pipelines.configuration.schema import (
     Choice,
+    Imported,
     Listing,
     Nullable,
     Scalar,
@@ -99,12 +100,14 @@ def _type_text(schema: Schema) -> str:
             return f"table of {_plural(_type_text(inner))}"
         case Section(classes):
             return "section" if len(classes) == 1 else "section of a `kind`"
+        case Imported():
+            return "name, or section of a `kind`"
         case Nullable(inner):
             return f"{_type_text(inner)}, or `null`"
 
 
 def _plural(text: str) -> str:
-    for noun in ("section", "number", "list"):
+    for noun in ("section", "number", "list", "name"):
         if text.startswith((noun, f"whole {noun}")):
             return text.replace(noun, f"{noun}s", 1)
     return text

@@ -8,6 +8,7 @@
 | Mapping[str, X]                         | `Table`    | keys of one's own choice                                    |
 | a dataclass, or a union of dataclasses  | `Section`  | a section; of a union, its `kind:` says which dataclass     |
 | X | None                                | `Nullable` | null, or X                                                  |
+| str | FactorProvider                    | `Imported` | MODULE:NAME, or a section: `kind: MODULE:NAME`, and settings |
 
 The kind of a dataclass is its attribute `kind` if it has one, else its name in snake case without "Settings".
 """
@@ -20,6 +21,8 @@ import types
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from saga_fg.graph import FactorProvider
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,12 @@ class Nullable:
     value: Schema
 
 
-Schema = Scalar | Choice | Listing | Table | Section | Nullable
+@dataclass(frozen=True)
+class Imported:
+    """Something by the name of what makes it; with settings, which are a dataclass, itself."""
+
+
+Schema = Scalar | Choice | Listing | Table | Section | Nullable | Imported
 
 
 @dataclass(frozen=True)
@@ -126,6 +134,8 @@ def schema_of(hint: Any) -> Schema:
 
 
 def _union(arguments: tuple[Any, ...]) -> Schema:
+    if set(arguments) == {str, FactorProvider}:
+        return Imported()
     if type(None) in arguments:
         rest = tuple(a for a in arguments if a is not type(None))
         return Nullable(schema_of(rest[0]) if len(rest) == 1 else _union(rest))

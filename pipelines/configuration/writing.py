@@ -16,6 +16,7 @@ import yaml
 from pipelines.configuration.reading import DEFAULT_ENTRY
 from pipelines.configuration.schema import (
     Choice,
+    Imported,
     Listing,
     Nullable,
     Schema,
@@ -98,6 +99,10 @@ def _form(schema: Schema, value: Any, base: Any, comments: bool) -> str | list[s
     match schema:
         case Section():
             return _section_lines(schema, value, base, comments) or "{}"
+        case Imported() if not isinstance(value, str):
+            cls = type(value)
+            kind = scalar_text(f"{cls.__module__}:{cls.__qualname__}")
+            return [f"kind: {kind}", *_section_lines(Section((cls,)), value, None, comments)]
         case Table(value=inner):
             return _table_lines(inner, value, base, comments) or "{}"
         case Listing():

@@ -21,7 +21,9 @@ from saga_fg.tracking.provider_names import made_by_name, new_provider
 class SlamSettings:
     """What `saga-fg slam simulated` and `slam kitti` take."""
 
-    providers: tuple[str, ...] = setting((), "factor providers of your own as MODULE:NAME, asked at every pose")
+    providers: tuple[str | FactorProvider, ...] = setting(
+        (), "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked at every pose"
+    )
     landmarks: tuple[str, ...] = setting((), "detectors of landmarks of your own as MODULE:NAME, asked at every pose")
     joint: JointSettings = settings_group(JointSettings, "simulated: vehicle and objects together")
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, objects among it")

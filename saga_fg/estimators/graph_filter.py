@@ -24,8 +24,9 @@ from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Sighting
 from saga_fg.estimators.smoothed import Newest
-from saga_fg.graph.keys import node_key
-from saga_fg.graph.providers import FactorProvider
+from saga_fg.frame import Frame
+from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
+from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
@@ -74,14 +75,34 @@ class GraphFilter:
     def time(self) -> float:
         return self._smoother.time
 
-    def ask(self, origin: FloatArray) -> None:
-        """Let the users' providers add their factors; origin (2,): of the states' positions in the world, m."""
-        self._smoother.origin = origin
+    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        self._smoother.origin, self._smoother.frame = origin, frame
+        graph = self._smoother.graph()
+        if graph.epoch == 0 and not graph.variables:
+            self.extend(beginnings(self.providers))
+
+    def ask(self) -> None:
+        """Let the users' providers add their factors."""
         smoother = self._changed()
         smoother.extend(self.providers)
         smoother.forget(self._keys.values())
-        graph, nodes = smoother.graph(), set(self._keys.values())
-        self._beside = tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
+        self._beside = self._beside_now()
+
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Let some providers add their factors at the present epoch."""
+        self._changed().extend(providers)
+
+    @property
+    def others(self) -> list[int]:
+        """Keys of the variables beside the nodes: poses, landmarks."""
+        every = self._smoother.graph().variables
+        return [key for key, one in every.items() if one.epoch is None or one.kind not in (OBJECT, MAP_NODE)]
+
+    def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
+        """Joint covariance of other variables and some nodes, in the order given."""
+        mine = [self._keys[node] for node in np.asarray(nodes).tolist()]
+        return self._smoother.joint_covariance([*keys, *mine])
 
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
@@ -115,8 +136,10 @@ class GraphFilter:
         smoother = self._changed()
         smoother.forget({*self._keys.values(), *self._beside})
         moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, standing)
-        smoother.begin(self.time + transition.dt, [moved], [self._keys[node] for node in standing], change)
+        begun = [moved, *beginnings(self.providers)]
+        smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in standing], change)
         self._keys = keys
+        self._beside += self._beside_now()
         if not self.providers:  # nobody is to be asked for factors on the epoch before
             smoother.forget(keys.values())
 
@@ -170,6 +193,11 @@ class GraphFilter:
         require_kind("state", state, GraphState)
         self._changed().restore(state.graph)
         self._layout, self._keys, self._beside = state.layout, state.keys, state.beside
+
+    def _beside_now(self) -> tuple[int, ...]:
+        """Variables of the present epoch beside the nodes."""
+        graph, nodes = self._smoother.graph(), set(self._keys.values())
+        return tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
 
     def _in_moments(
         self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]

@@ -27,9 +27,10 @@ from saga_fg.estimators.graph_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.graph_moments import joint_gaussian
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.layout import Layout
+from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.point import Point
-from saga_fg.graph.providers import FactorProvider, GraphView, ask
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
 
@@ -54,6 +55,7 @@ class IncrementalSmoother:
             raise InputError(f"lag: expected a finite number of seconds >= 0, or None, got {lag!r}")
         self.providers = tuple(providers)
         self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
+        self.frame: Frame | None = None  # of the present epoch
         self._lag, self._settings = lag, settings or RelinearisationSettings()
         self._graph = SceneFactorGraph()
         self._engine: Engine | None = None
@@ -68,11 +70,18 @@ class IncrementalSmoother:
         """The running graph itself: its variables, factors and values. To be read, not changed."""
         return self._graph
 
-    def step(self, time: float, providers: Sequence[FactorProvider] | None = None) -> None:
-        """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve."""
-        unchanged, times = self._graph, self._times
-        self.begin(time, self.providers if providers is None else providers)
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
+        """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve.
+
+        frame: what they are told of the epoch
+        """
+        unchanged, times, asked = self._graph, self._times, self.providers if providers is None else providers
+        self.frame = frame
+        begun = beginnings(asked)
         try:
+            self.begin(time, begun or asked)
+            if begun:
+                self.extend(asked)
             self.forget()
         except GraphError:
             self._graph, self._times, self._engine = unchanged, times, None
@@ -164,7 +173,7 @@ class IncrementalSmoother:
         providers: Sequence[FactorProvider],
         change: Callable[[SceneFactorGraph], None] | None = None,
     ) -> None:
-        view = GraphView(graph, self.covariance, self.origin)
+        view = GraphView(graph, self.covariance, self.origin, self.frame)
         for k, provider in enumerate(providers):
             ask(provider, graph, view)
             if k == 0 and change is not None:

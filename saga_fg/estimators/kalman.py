@@ -25,7 +25,8 @@ from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.kalman_factors import Beside, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements, require_kind
-from saga_fg.graph.providers import FactorProvider
+from saga_fg.frame import Frame
+from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
@@ -54,6 +55,8 @@ class JointKalmanFilter:
         self._predictions = 0
         self._time = 0.0
         self._beside = Beside()
+        self._frame: Frame | None = None
+        self._origin = np.zeros(2)
 
     @property
     def nodes(self) -> IntArray:
@@ -71,12 +74,27 @@ class JointKalmanFilter:
         if self.providers:
             self._beside = replace(self._beside, labels={**self._beside.labels, **(labels or {})})
 
-    def ask(self, origin: FloatArray) -> None:
-        """Take in the providers' factors; origin (2,): of the states' positions in the world, m.
+    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        self._frame, self._origin = frame, origin
 
-        Raises `GraphError` for one that is not on the newest variables alone.
-        """
-        self._state, self._beside = asked(self._state, self._beside, self.providers, self._time, origin)
+    def ask(self) -> None:
+        """Take in the providers' factors. Raises `GraphError` for one that is not on the newest variables alone."""
+        x, beside = self._state, self._beside
+        for providers, last in ((beginnings(self.providers), False), (self.providers, True)):
+            if providers:
+                x, beside = asked(x, beside, providers, self._time, self._origin, self._frame, last)
+        self._state, self._beside = x, beside
+
+    @property
+    def others(self) -> IntArray:
+        """Rows of the variables beside the nodes, in the joint state: poses, landmarks."""
+        return self._beside.rows(self._state.layout)
+
+    @property
+    def beside(self) -> SceneFactorGraph:
+        """These variables where they are, without factors."""
+        return self._beside.graph
 
     def predict(self, transition: Transition) -> None:
         dynamics = self._beside.dynamics(transition, self._state)

@@ -31,6 +31,7 @@ from saga_fg.estimators.dynamics import Dynamics, identity, predict
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.partition import Partition
+from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import node_kind
 from saga_fg.graph.parts import NewVariable
@@ -91,12 +92,21 @@ class Beside:
 
 
 def asked(
-    x: BlockGaussian, beside: Beside, providers: Sequence[FactorProvider], time: float, origin: FloatArray
+    x: BlockGaussian,
+    beside: Beside,
+    providers: Sequence[FactorProvider],
+    time: float,
+    origin: FloatArray,
+    frame: Frame | None,
+    last: bool,
 ) -> tuple[BlockGaussian, Beside]:
-    """The joint state with what providers add at `time`. Raises `GraphError` for what the filter does not take."""
+    """The joint state with what providers add at `time`; the epoch before leaves where they are the `last` ones.
+
+    Raises `GraphError` for what the filter does not take.
+    """
     bare, ids = beside.at(x, time)
     graph, known, prior = bare.copy(), dict(ids), x
-    view = GraphView(graph, lambda key: _covariance(prior, known, graph.point(), key), origin)
+    view = GraphView(graph, lambda key: _covariance(prior, known, graph.point(), key), origin, frame)
     for provider in providers:
         ask(provider, graph, view)
     new = {key: one for key, one in graph.variables.items() if key not in bare.variables}
@@ -112,7 +122,7 @@ def asked(
         rows = x.layout.rows([ids[key] for key in keys])
         told.append(WhitenedFactor(rows, A[:, :-1], A[:, -1] - A[:, :-1] @ increment[x.layout.places(rows)]))
     x = correct_whitened(x, told)
-    gone = [key for key, one in bare.variables.items() if one.epoch not in (None, bare.epoch)]
+    gone = [key for key, one in bare.variables.items() if last and one.epoch not in (None, bare.epoch)]
     bare.marginalise(gone)
     x = x.without(x.layout.rows([key for key in gone if key in ids]))
     _move(bare, x, ids)

@@ -1,15 +1,29 @@
 """The running graph: one factor graph of objects, the vehicle and landmarks, fed by factor providers."""
 
 from saga_fg.graph.errors import GraphError, UndeterminedError
-from saga_fg.graph.keys import EGO_ERROR, EGO_POSE, LANDMARK, MAP_NODE, OBJECT, KeyId, Kind, key_id, key_of
+from saga_fg.graph.keys import (
+    EGO_BIAS,
+    EGO_ERROR,
+    EGO_POSE,
+    EGO_VELOCITY,
+    LANDMARK,
+    MAP_NODE,
+    OBJECT,
+    KeyId,
+    Kind,
+    key_id,
+    key_of,
+)
 from saga_fg.graph.parts import FactorEntry, NewVariable
-from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all
+from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable
 
 __all__ = [
+    "EGO_BIAS",
     "EGO_ERROR",
     "EGO_POSE",
+    "EGO_VELOCITY",
     "LANDMARK",
     "MAP_NODE",
     "OBJECT",
@@ -25,6 +39,7 @@ __all__ = [
     "SceneFactorGraph",
     "UndeterminedError",
     "ask_all",
+    "beginnings",
     "key_id",
     "key_of",
 ]

@@ -34,10 +34,12 @@ class Kind:
 
 OBJECT = Kind("object", "o")
 EGO_POSE = Kind("ego pose", "x")
-EGO_ERROR = Kind("ego error", "e")  # biases, scales: slow errors of the vehicle's sensors
+EGO_VELOCITY = Kind("ego velocity", "v")
+EGO_BIAS = Kind("ego bias", "b")  # of accelerometers and gyroscopes
+EGO_ERROR = Kind("ego error", "e")  # slow errors of the odometry
 LANDMARK = Kind("landmark", "l")
 MAP_NODE = Kind("map node", "m")
-KINDS = (OBJECT, EGO_POSE, EGO_ERROR, LANDMARK, MAP_NODE)
+KINDS = (OBJECT, EGO_POSE, EGO_VELOCITY, EGO_BIAS, EGO_ERROR, LANDMARK, MAP_NODE)
 
 
 @dataclass(frozen=True)

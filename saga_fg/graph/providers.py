@@ -9,6 +9,9 @@ and factors. What it sees is a `GraphView`, which it can read and not change; th
         def factors(self, view):
             rows = [[car.key] for car in view.now(OBJECT).values()]
             return Additions(factors=[ResidualFactors(rows, (4,), lambda x: x[:, 1:2] - 3.0, [[0.25]])])
+
+What goes on from epoch to epoch (a pose, a bias) is added by a method `predict(view)` that a provider may have as well:
+it is asked when an epoch begins, while the variables of the epoch before are still there, and before all `factors`.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import gtsam
 import numpy as np
 
 from saga_fg.arrays import FloatArray
+from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import Kind, key_of
@@ -59,11 +63,18 @@ class GraphView:
     """The graph at the present epoch, to read.
 
     covariance(key): marginal (d, d), as known before this frame; origin (2,): that positions of objects are counted
-    from, in the world, m (a tracker's is near its first frame, so that no digits are lost)
+    from, in the world, m (a tracker's is near its first frame, so that no digits are lost), places of the vehicle and
+    of landmarks as well; frame: what the epoch brings, None where nobody has said
     """
 
-    def __init__(self, graph: SceneFactorGraph, covariance: Callable[[int], FloatArray], origin: FloatArray) -> None:
-        self._graph, self._covariance, self.origin = graph, covariance, origin
+    def __init__(
+        self,
+        graph: SceneFactorGraph,
+        covariance: Callable[[int], FloatArray],
+        origin: FloatArray,
+        frame: Frame | None = None,
+    ) -> None:
+        self._graph, self._covariance, self.origin, self.frame = graph, covariance, origin, frame
 
     @property
     def epoch(self) -> int:
@@ -122,9 +133,29 @@ def _unknown(key: int) -> FloatArray:
     raise GraphError("covariance: a recording is solved as a whole, no marginal is known before")
 
 
+@dataclass(frozen=True, eq=False)
+class _Beginning:
+    """What a provider adds when an epoch begins, as a provider."""
+
+    provider: Any
+
+    @property
+    def name(self) -> str:
+        return _name(self.provider)
+
+    def factors(self, view: GraphView) -> Additions:
+        added: Additions = self.provider.predict(view)
+        return added
+
+
+def beginnings(providers: Iterable[FactorProvider]) -> list[FactorProvider]:
+    """Those of some providers that add something when an epoch begins, to be asked for that."""
+    return [_Beginning(provider) for provider in providers if callable(getattr(provider, "predict", None))]
+
+
 def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:
     """Add what a provider gives. Raises `GraphError` that names it, and may then have added some of it."""
-    name = str(getattr(provider, "name", type(provider).__name__))
+    name = _name(provider)
     try:
         additions = provider.factors(view)
     except GraphError:
@@ -141,6 +172,10 @@ def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> N
         raise GraphError(f"provider {name}: named: expected factors by name, got {type(additions.named).__name__}")
     for key, factors in additions.named.items():
         graph.add_factors(name, factors, key)
+
+
+def _name(provider: Any) -> str:
+    return str(getattr(provider, "name", type(provider).__name__))
 
 
 def _checked(name: str, what: str, value: Any) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
+from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from saga_fg.arrays import FloatArray
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import Kind
@@ -48,17 +48,19 @@ class GraphVariable:
 
 
 def variable_type(name: str, state: Any) -> Variable:
-    """Return the type of a state: a vector, a pose or an oriented plane; raises `GraphError` for anything else."""
+    """Return the type of a state: a vector, a pose, a plane or a bias; raises `GraphError` for anything else."""
     if isinstance(state, gtsam.Pose2):
         return PlanarPose()
     if isinstance(state, gtsam.Pose3):
         return SpatialPose()
     if isinstance(state, gtsam.OrientedPlane3):
         return OrientedPlane()
+    if isinstance(state, gtsam.imuBias.ConstantBias):
+        return ImuBias()
     if isinstance(state, np.ndarray) and state.ndim == 1 and len(state) > 0:
         return Vector(len(state))
     got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
-    raise GraphError(f"{name}: expected a vector, a pose or a plane as its state, got {got}")
+    raise GraphError(f"{name}: expected a vector, a pose, a plane or a bias as its state, got {got}")
 
 
 def insert_state(values: gtsam.Values, variable: GraphVariable, state: Any) -> None:
@@ -82,7 +84,7 @@ def insert_state(values: gtsam.Values, variable: GraphVariable, state: Any) -> N
 
 def transport(variable: Variable, base: Any, delta: FloatArray) -> FloatArray | None:
     """Return D (d, d) at the point retract(base, delta); None where it is the identity."""
-    if isinstance(variable, Vector) or not delta.any():
+    if isinstance(variable, Vector | ImuBias) or not delta.any():
         return None
     here = variable.retract(base, delta)
     columns = [

@@ -9,6 +9,7 @@ from typing import Literal
 
 from factors import Robust
 from saga_fg.by_class import DEFAULT
+from saga_fg.graph import FactorProvider
 from saga_fg.node import ConstantVelocity
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
@@ -94,9 +95,10 @@ class SmoothingSettings:
         "huber", "robust loss of the detections"
     )
     loss_scale: float = setting(2.0, "residual from which the loss differs from a square, standard deviations")
-    providers: tuple[str, ...] = setting(
+    providers: tuple[str | FactorProvider, ...] = setting(
         (),
-        "factor providers of your own as MODULE:NAME, asked once a moment for the final states, made anew every time",
+        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked once a moment for the final "
+        "states, made anew every time",
     )
     reweightings: int = setting(1, "times the weights of the loss, and the edges, are found again at the final states")
     extension: float = setting(1.5, "how far before its birth and after its end an object is looked for, s")

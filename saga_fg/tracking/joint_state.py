@@ -15,13 +15,17 @@ from factors import RangeRate
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.frame import Frame
 from saga_fg.graph import FactorProvider
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
+from saga_fg.providers import RelativeDetections
 from saga_fg.scene_graph import SceneGraph
+from saga_fg.tracking.ego_pose import Sightings, local_pose, relative_covariances
 from saga_fg.tracking.names import EstimatorName
 
+_ANYWHERE = 1e5  # m
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
 
@@ -69,8 +73,20 @@ class JointTrackState:
         types = [self.type_of(c) for c in classes]
         return tuple([types[k] for k in index.tolist()])
 
-    def add(self, ids: IntArray, label: StrArray, now: Kinematics, delay: float = 0.0) -> None:
-        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1."""
+    def add(
+        self,
+        ids: IntArray,
+        label: StrArray,
+        now: Kinematics,
+        delay: float = 0.0,
+        seen: Sightings | None = None,
+    ) -> None:
+        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1.
+
+        With sightings from the vehicle, of which they are to be told next, nothing is known of where they are.
+        """
+        if seen is not None:
+            now = now._replace(P=np.tile(_ANYWHERE**2 * np.eye(2), (len(ids), 1, 1)))
         for node_type, rows in self._by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
             P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
@@ -100,24 +116,40 @@ class JointTrackState:
         self._changed().predict(discretise(graph, dt))
 
     def update(
-        self, ids: IntArray, label: StrArray, z: FloatArray, R: FloatArray, with_velocity: BoolArray, delay: float
+        self,
+        ids: IntArray,
+        label: StrArray,
+        z: FloatArray,
+        R: FloatArray,
+        with_velocity: BoolArray,
+        delay: float,
+        seen: Sightings | None = None,
     ) -> None:
-        """Take in one measurement each of some tracks, made `delay` s ago.
+        """Take in one measurement each of some tracks, made `delay` s ago; of positions by `seen`, where it is given.
 
         z (k, 4) position and velocity, R (k, 4, 4); velocity counts where `with_velocity` (k,). A smoother puts a late
         measurement where it belongs; a filter, one of a track born since, moves it to the present along own motion.
         """
+        if seen is not None:
+            self._see(ids, label, seen)
         for node_type, of_type in self._by_type(label, delay > 0):
             measured = with_velocity[of_type] & node_type.has(VELOCITY)
             for velocity in (True, False):
                 rows = of_type[measured == velocity]
-                if len(rows) == 0:
+                names = (POSITION if seen is None else ()) + (VELOCITY if velocity else ())
+                if len(rows) == 0 or not names:
                     continue
-                k = 4 if velocity else 2
-                H = np.broadcast_to(
-                    node_type.selector(POSITION + VELOCITY if velocity else POSITION), (len(rows), k, node_type.dim)
-                )
-                self._measure(node_type, ids[rows], z[rows, :k], H, R[rows, :k, :k], delay)
+                k = slice(0 if seen is None else 2, 4 if velocity else 2)
+                H = np.broadcast_to(node_type.selector(names), (len(rows), len(names), node_type.dim))
+                self._measure(node_type, ids[rows], z[rows, k], H, R[rows, k, k], delay)
+
+    def _see(self, ids: IntArray, label: StrArray, seen: Sightings) -> None:
+        """Take in sightings from the vehicle."""
+        estimator = self._changed()
+        assert isinstance(estimator, GraphFilter)
+        for node_type, rows in self._by_type(label):
+            x, y = node_type.index(POSITION).tolist()
+            estimator.extend([RelativeDetections(ids[rows], seen.z[rows], seen.R[rows], node_type.dim, (x, y))])
 
     def update_range_rate(
         self,
@@ -155,18 +187,48 @@ class JointTrackState:
             z = innovation + (H @ x[:, :, None])[:, :, 0]
             self._measure(node_type, ids[rows][likely], z[likely], H[likely], R[likely], delay)
 
-    def ask_providers(self, origin: FloatArray) -> None:
-        """Let users' providers add their factors; positions are from `origin` (2,)."""
+    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+        """What providers are told from now on; positions are from `origin` (2,)."""
         estimator = self._estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.ask(origin)
+            estimator.hear(frame, origin)
             self._changed()
+
+    def ask_providers(self) -> None:
+        """Let users' providers add their factors."""
+        estimator = self._estimator
+        if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
+            estimator.ask()
+            self._changed()
+
+    @property
+    def bare(self) -> bool:
+        """Whether nothing in it has a place."""
+        estimator = self._estimator
+        beside = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
+        return len(estimator.nodes) + len(beside) == 0
+
+    def pose(self) -> FloatArray | None:
+        """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
+        estimator = self._estimator
+        if isinstance(estimator, JointKalmanFilter):
+            return local_pose(estimator.beside)
+        return local_pose(estimator.graph()) if isinstance(estimator, GraphFilter) else None
+
+    def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
+        """(n, 2, 2) of where tracks are, seen from the vehicle's pose in the running graph."""
+        assert isinstance(self._estimator, GraphFilter)
+        return relative_covariances(self._estimator, ids, self.types_of(label))
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
         if self._kinematics is None or len(self._kinematics.P) != len(ids):
             self._kinematics = self._read(ids, label)
         return self._kinematics
+
+    def node(self, ids: IntArray, label: StrArray) -> Kinematics:
+        """Of some nodes, which need not be tracks."""
+        return self._read(ids, label)
 
     def places(self, ids: IntArray, label: StrArray) -> tuple[FloatArray, FloatArray]:
         """Positions (k, 2) of some nodes now, and their covariances (k, 2, 2)."""

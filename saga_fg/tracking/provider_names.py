@@ -1,7 +1,8 @@
-"""Parts of users' own by name: MODULE:NAME of something that makes one when it is called without arguments."""
+"""Parts of users' own by name: MODULE:NAME of something that makes one when it is called with its settings."""
 
 from __future__ import annotations
 
+from copy import deepcopy
 from importlib import import_module
 from typing import Any
 
@@ -9,30 +10,41 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 
 
-def new_provider(name: str) -> FactorProvider:
+def new_provider(entry: str | FactorProvider) -> FactorProvider:
     """Make the factor provider of a name such as "my_module:WallDistance"; see `made_by_name`."""
-    provider: FactorProvider = made_by_name("providers", name, "a factor provider, which has a method factors")
+    provider: FactorProvider = made_by_name("providers", entry, "a factor provider, which has a method factors")
     return provider
 
 
-def made_by_name(setting: str, name: str, expected: str) -> Any:
-    """Make what a name in a setting stands for; `expected` ends in the method that it must have.
+def made_by_name(setting: str, entry: Any, expected: str) -> Any:
+    """Make what a name in a setting stands for, without arguments; a copy of what is made already.
 
-    Imports the module, which runs its code. Raises `InputError` for a name that leads to nothing of the kind.
+    `expected` ends in the method that it must have. Raises `InputError` for what has none.
+    """
+    made = deepcopy(entry)
+    if isinstance(entry, str):
+        try:
+            made = named(entry, setting)()
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{setting}: {entry}: expected a class to be made without arguments: {error}") from error
+    if isinstance(made, str) or not callable(getattr(made, expected.split()[-1], None)):
+        raise InputError(f"{setting}: {entry}: expected {expected}")
+    return made
+
+
+def named(name: str, setting: str = "providers") -> Any:
+    """What a name such as "my_module:WallDistance" in a setting is of.
+
+    Imports the module, which runs its code. Raises `InputError` for a name that leads to nothing.
     """
     module, colon, attribute = name.partition(":")
     if not colon or not module or not attribute.isidentifier():
         raise InputError(f"{setting}: expected MODULE:NAME, got {name!r}")
     try:
-        make = getattr(import_module(module), attribute)
+        return getattr(import_module(module), attribute)
     except ImportError as error:
         raise InputError(f"{setting}: {name}: expected a module that can be imported: {error}") from error
     except AttributeError as error:
         raise InputError(f"{setting}: {name}: the module has no {attribute}") from error
-    try:
-        made = make()
-    except Exception as error:
-        raise InputError(f"{setting}: {name}: expected a class to be made without arguments: {error}") from error
-    if not callable(getattr(made, expected.split()[-1], None)):
-        raise InputError(f"{setting}: {name}: expected {expected}")
-    return made

@@ -11,6 +11,7 @@ from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.errors import InputError
+from saga_fg.graph import FactorProvider
 from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
 from saga_fg.rigid_coupling import Attached
 from saga_fg.road import RoadMap, SignalSettings
@@ -153,6 +154,23 @@ class ClockSettings:
 
 
 @dataclass(frozen=True)
+class EgoNodeSettings:
+    """The vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
+
+    estimated: bool = setting(
+        False,
+        "its pose is a variable of the running graph, which providers move, and detections in its frame are seen from "
+        "there; false: it is where frames say",
+    )
+    label: str = setting("car", "its class for edge rules")
+    length: float = setting(4.5, "m")
+    deviation: float = setting(0.02, "standard deviation of its place about its pose, m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "length", "deviation")
+
+
+@dataclass(frozen=True)
 class TrackerSettings:
     """Everything the tracker can be told; `edges` empty is the classical filter of independent objects.
 
@@ -183,9 +201,13 @@ class TrackerSettings:
         lambda: None, "lights, stop lines and lanes, world coordinates; null: none but those that frames bring along"
     )
     estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
-    providers: tuple[str, ...] = setting(
+    providers: tuple[str | FactorProvider, ...] = setting(
         (),
-        "factor providers of your own as MODULE:NAME, imported when a tracker is made",
+        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, of saga_fg.providers or your "
+        "own; the modules are imported",
+    )
+    ego: EgoNodeSettings | None = settings_group(
+        lambda: None, "the vehicle as a node that leads and follows; null: it is none"
     )
     lag: float = setting(
         2.0, "window of the fixed-lag estimator, s; without providers, frames this late are put where they belong"
@@ -214,6 +236,11 @@ class TrackerSettings:
         require_positive(self, "confirmations")
         require_between(self, 0, 1, "unconfirmed_share")
         require_one_of(self, "estimator", get_args(EstimatorName))
+        if self.ego is not None and self.ego.estimated:
+            if self.association.method == "graph":
+                raise InputError("ego.estimated: expected association without pairs, got association.method graph")
+            if self.estimator == "kalman":
+                raise InputError("ego.estimated: expected the estimator isam2 or fixed-lag, got kalman")
         self._require_groups_that_move_alike()
         require_stable(self.edges, self.max_step)
 

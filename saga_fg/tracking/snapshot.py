@@ -14,6 +14,7 @@ from saga_fg.scene_graph import SceneGraph
 from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.columns import TrackColumns
+from saga_fg.tracking.ego_node import EgoNode
 from saga_fg.tracking.roadside import Roadside
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.settings import TrackerSettings
@@ -25,7 +26,7 @@ Table = TypeVar("Table")
 
 @dataclass(eq=False)
 class TrackTables:
-    """What is kept of n tracks, and of the road, besides the joint state; belief (n, C) of the tracks' classes."""
+    """What is kept of n tracks, road and vehicle besides the joint state; belief (n, C) of the tracks' classes."""
 
     columns: TrackColumns
     box: BoxFilter
@@ -34,6 +35,7 @@ class TrackTables:
     belief: FloatArray
     flow: TrafficFlow
     roadside: Roadside
+    ego: EgoNode
 
     @classmethod
     def empty(cls, settings: TrackerSettings, classes: int) -> TrackTables:
@@ -46,6 +48,7 @@ class TrackTables:
             np.empty((0, classes)),
             TrafficFlow(settings.flow),
             Roadside(settings.signals),
+            EgoNode.of(settings),
         )
 
     def keep(self, rows: BoolArray) -> None:

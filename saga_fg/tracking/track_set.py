@@ -20,6 +20,7 @@ from saga_fg.boxes import Boxes
 from saga_fg.by_class import class_values
 from saga_fg.chi_square import chi_square_quantile
 from saga_fg.edge_rules import EdgeRule, build_graph
+from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.graph import FactorProvider
 from saga_fg.interactions import NodeTable
@@ -31,12 +32,13 @@ from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.class_belief import ClassEvidence, ClassGroups
 from saga_fg.tracking.columns import TrackColumns
+from saga_fg.tracking.ego_pose import Sightings
 from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.limits import trackable
 from saga_fg.tracking.matching import associate
 from saga_fg.tracking.merging import duplicates
-from saga_fg.tracking.observation import Observed
+from saga_fg.tracking.observation import Observed, observe
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.occlusion import HIDDEN, covered
 from saga_fg.tracking.roadside import Roadside, motion_of
@@ -86,33 +88,48 @@ class TrackSet:
         return list(self._columns.id.tolist())
 
     @property
+    def world_T_ego(self) -> FloatArray | None:
+        """The vehicle's pose (4, 4) as estimated in the running graph; None where it is not."""
+        pose = self._state.pose()
+        if pose is not None:
+            pose[:2, 3] += self._origin
+        return pose
+
+    @property
     def _columns(self) -> TrackColumns:
         return self._tables.columns
 
-    def take_in(self, frame: Frame, sensor: Sensor, observed: Observed, timestamp: float) -> Assignment:
-        """Move on to a frame's `timestamp` (s), unless it is in the past, and use what was `observed` in it."""
-        if len(self) == 0 and len(self.roadside) == 0:
+    def take_in(self, frame: Frame, sensor: Sensor, timestamp: float) -> Assignment:
+        """Move on to a frame's `timestamp` (s), unless it is in the past, and use what is in it."""
+        if self._state.bare:
             self._origin = local_origin(frame)
         before, now = self._time, self.relative(timestamp)
         delay = max(0.0, before - now)
         for road_map in (self.settings.road_map, frame.road_map):
             if road_map is not None:
                 self.roadside.learn(road_map, self._origin, self._state)
+        self._state.hear(frame, self._origin)
         self.predict(max(now, before))
+        frame = self._located(frame)
+        if delay == 0:
+            self._tables.ego.place(frame, self._time, self._origin, self._state)
+        observed = observe(frame, sensor, self.settings.classes)
+        seen = self._seen_from_ego(frame, observed)
         self._tell("predict", frame)
         self.roadside.heed(frame, sensor, self._origin, self._state, delay)
         self._tell("observe", frame, observed)
         said = self._groups.likelihood(observed.boxes.label, sensor)
-        matching = self._associate(observed, sensor, delay, said)
+        matching = self._associate(observed, sensor, delay, said, seen)
         self._tell("associate", frame, observed, matching)
         self._classify(matching, said)
-        self._update(observed, matching, delay)
+        self._update(observed, matching, delay, seen)
         self._tell("update", frame, observed, matching)
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
         self._tell("believe", frame, observed, matching)
         self._watch_traffic(matching)
-        born = self._bear(observed, matching, frame.sensor, sensor.births == "alone", delay, said)
-        self._state.ask_providers(self._origin)
+        born = self._bear(observed, matching, frame.sensor, sensor.births == "alone", delay, said, seen)
+        self._state.ask_providers()
+        self._state.hear(None, self._origin)
         self._tell("births", frame, observed, matching, born)
         rows = np.concatenate([matching.detection, born])
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self) - len(born) :]])
@@ -129,7 +146,7 @@ class TrackSet:
     def predict(self, time: float) -> None:
         """Move on to a `time` in here, s."""
         dt = time - self._time
-        if dt > 0 and len(self) + len(self.roadside):
+        if dt > 0 and not self._state.bare:
             wanted = dt / self.settings.max_step
             steps = max(1, math.ceil(min(wanted, MOST_STEPS) - 1e-9))
             if wanted > MOST_STEPS:
@@ -153,14 +170,37 @@ class TrackSet:
         if settings.prior == 0:
             return None
         self._tables.standing.predict(dt, self._kinematics(), settings)
-        return np.concatenate([self._tables.standing.noise_scale(settings), np.ones(len(self.roadside))])
+        others = len(self._tables.ego) + len(self.roadside)
+        return np.concatenate([self._tables.standing.noise_scale(settings), np.ones(others)])
 
-    def _associate(self, observed: Observed, sensor: Sensor, delay: float, said: FloatArray) -> Matching:
+    def _located(self, frame: Frame) -> Frame:
+        """The frame with the vehicle's pose, where that is estimated."""
+        if self.settings.ego is None or not self.settings.ego.estimated:
+            return frame
+        world_T_ego = self.world_T_ego
+        if world_T_ego is None:
+            raise InputError(
+                "ego.estimated: expected a provider that adds the vehicle's pose, as saga_fg.providers has"
+            )
+        return replace(frame, world_T_ego=world_T_ego)
+
+    def _seen_from_ego(self, frame: Frame, observed: Observed) -> Sightings | None:
+        """What was observed, in the frame of the vehicle whose pose is estimated; None for what is not seen from it."""
+        if self.settings.ego is None or not self.settings.ego.estimated or frame.coordinates == "world":
+            return None
+        assert frame.world_T_ego is not None
+        return Sightings.of(frame.world_T_ego, observed.boxes.position, observed.R[:, :2, :2])
+
+    def _associate(
+        self, observed: Observed, sensor: Sensor, delay: float, said: FloatArray, seen: Sightings | None
+    ) -> Matching:
         """Register what was observed to the prediction, as of `delay` s ago; said (m, C) of classes."""
         columns = self._columns
         if len(columns.id) == 0 or len(observed) == 0:
             return Matching.empty()
         position, P, cross = self._predicted_positions(delay)
+        if seen is not None:
+            P = self._state.relative_covariances(columns.id, columns.label)
         predicted = self._boxes(position, np.full_like(position, np.nan))
         expected = columns.existence * sensor.detection_chance(columns.label)
         area = self.settings.association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
@@ -182,7 +222,7 @@ class TrackSet:
             self._tables.belief[t] = self._groups.updated(self._tables.belief[t], said[matching.detection])
             self._columns.label = self._groups.labels(self._tables.belief, self._columns.label)
 
-    def _update(self, observed: Observed, matching: Matching, delay: float) -> None:
+    def _update(self, observed: Observed, matching: Matching, delay: float, seen: Sightings | None) -> None:
         columns, boxes = self._columns, observed.boxes
         t, d = matching.track, matching.detection
         z = np.concatenate([boxes.position[d, :2] - self._origin, boxes.velocity[d]], axis=1)
@@ -191,7 +231,8 @@ class TrackSet:
             then = self._kinematics()._replace(position=position, P=P)
             moving = Kinematics._make(column[t] for column in then)
             self._tables.standing.update(t, z, observed.R[d], moving, observed.with_velocity[d])
-        self._state.update(columns.id[t], columns.label[t], z, observed.R[d], observed.with_velocity[d], delay)
+        mine = None if seen is None else seen.select(d)
+        self._state.update(columns.id[t], columns.label[t], z, observed.R[d], observed.with_velocity[d], delay, mine)
         self._update_range_rate(observed, d, columns.id[t], columns.label[t], delay)
         p = observed.probability[d]
         self._tables.box.update(
@@ -262,7 +303,14 @@ class TrackSet:
         self._tables.flow.pass_by(passages)
 
     def _bear(
-        self, observed: Observed, matching: Matching, sensor: str, accepted: bool, delay: float, said: FloatArray
+        self,
+        observed: Observed,
+        matching: Matching,
+        sensor: str,
+        accepted: bool,
+        delay: float,
+        said: FloatArray,
+        sightings: Sightings | None,
     ) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
 
@@ -279,7 +327,11 @@ class TrackSet:
         kinematics, stands = newborn(
             observed, born, self._origin, self.settings.classes, self._tables.flow, self.settings.standing.prior
         )
-        self._state.add(ids, boxes.label, kinematics, delay)
+        mine = None if sightings is None else sightings.select(born)
+        self._state.add(ids, boxes.label, kinematics, delay, mine)
+        if mine is not None:
+            still = np.zeros((len(born), 4))
+            self._state.update(ids, boxes.label, still, observed.R[born], np.zeros(len(born), dtype=bool), delay, mine)
         self._update_range_rate(observed, born, ids, boxes.label, delay)
         confirmed = p >= self.settings.existence.confirm
         seen, told = self._time - delay, (observed.told[0][born], observed.told[1][born])
@@ -415,7 +467,7 @@ class TrackSet:
         """The present estimates as edge rules see them: the tracks, then the nodes of the roadside."""
         types = self._state.types_of(self._columns.label)
         tracks = nodes_of(self._columns, self._tables.box, types, self._told(), self._time)
-        return self.roadside.beside(tracks, self._origin, self._state)
+        return self.roadside.beside(self._tables.ego.beside(tracks, self._state), self._origin, self._state)
 
     def _of_class(self, label: StrArray, *names: str) -> FloatArray:
         """(k, n) class settings for each label."""

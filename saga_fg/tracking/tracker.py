@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from saga_fg.arrays import FloatArray
 from saga_fg.association import Assignment
 from saga_fg.by_class import class_settings
 from saga_fg.edge_rules import EdgeRule
@@ -23,7 +24,6 @@ from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
 from saga_fg.tracking.clock import Clock, TimeVerdict
-from saga_fg.tracking.observation import observe
 from saga_fg.tracking.observer import Observer
 from saga_fg.tracking.provider_names import new_provider
 from saga_fg.tracking.roadside import Roadside
@@ -148,6 +148,11 @@ class Tracker:
         return self._tracks.graph
 
     @property
+    def world_T_ego(self) -> FloatArray | None:
+        """The vehicle's pose (4, 4) as factor providers and the objects have it; None where it is not estimated."""
+        return self._tracks.world_T_ego
+
+    @property
     def roadside(self) -> Roadside:
         """What is known of the road."""
         return self._tracks.roadside
@@ -162,15 +167,16 @@ class Tracker:
     def max_delay(self) -> float:
         """How late a frame may come and still be used, s."""
         settings = self.settings
+        if settings.ego is not None and settings.ego.estimated:
+            return 0.0  # nobody knows where the vehicle was
         whole = settings.estimator == "fixed-lag" and not self.providers
         return max(settings.max_delay, settings.lag) if whole else settings.max_delay
 
     def _step(self, frame: Frame) -> Tracks:
         sensor = self.sensor(frame.sensor)
-        observed = observe(frame, sensor, self.settings.classes)
         timestamp = frame.timestamp + sensor.time_offset
         if self._keep_time(timestamp, frame.sensor):
-            self.assignment = self._tracks.take_in(frame, sensor, observed, timestamp)
+            self.assignment = self._tracks.take_in(frame, sensor, timestamp)
         else:
             self.assignment = Assignment.empty()
         return self._tracks.report(self._clock.newest)

@@ -30,7 +30,9 @@ def local_origin(frame: Frame) -> FloatArray:
     """
     if frame.world_T_ego is not None:
         return np.round(frame.world_T_ego[:2, 3])
-    if len(frame):
+    if frame.ego is not None and frame.ego.gps is not None:
+        return np.round(frame.ego.gps.position[:2])
+    if len(frame) and frame.coordinates == "world":
         return np.round(frame.detections.boxes.position[0, :2])
     return np.zeros(2)
 

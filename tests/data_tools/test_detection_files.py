@@ -387,3 +387,39 @@ def test_a_column_without_a_meaning_is_named_in_a_warning(tmp_path: Path, caplog
     path.write_text("timestamp,x,y,camera_model\n0,1,2,fisheye\n")
     assert len(read_detections(path).scene("d").frames) == 1
     assert f"{path}: columns without a meaning here, not read: camera_model" in caplog.text
+
+
+EGO_CSV = """\
+timestamp,coordinates,x,y,odometry_x,odometry_y,odometry_yaw,odometry_dt,gps_x,gps_y,gps_z
+0.0,ego,10.2,3.1,,,,,500.1,20.0,
+0.1,ego,9.2,3.1,1.0,0.1,0.02,0.1,,,
+0.1,ego,4.2,3.1,,,,,,,
+0.2,ego,,,,,,,502.0,20.3,7.5
+"""
+
+
+def test_the_vehicles_own_measurements_come_with_its_frames(tmp_path: Path) -> None:
+    first, second, third = read_detections(write(tmp_path, ".csv", EGO_CSV)).scene("drive").frames
+    assert [frame.world_T_ego for frame in (first, second, third)] == [None] * 3
+    assert first.ego.odometry is None
+    assert first.ego.gps.position.tolist() == [500.1, 20.0]
+    assert second.ego.gps is None
+    assert second.ego.odometry.dt == 0.1
+    assert second.ego.odometry.before_T_now[:2, 2].tolist() == [1.0, 0.1]
+    assert second.ego.odometry.before_T_now[1, 0] == pytest.approx(np.sin(0.02))
+    assert third.ego.gps.position.tolist() == [502.0, 20.3, 7.5]
+
+
+@pytest.mark.parametrize(
+    ("columns", "row", "message"),
+    [
+        ("gps_x", "1.0", "gps_y: expected a number, since gps_x is given"),
+        ("odometry_x,odometry_dt", "1.0,0.1", "odometry_y: expected a number, since odometry_x is given"),
+        ("odometry_x,odometry_y,odometry_yaw,odometry_dt", "1,0,0,0", "odometry_dt: expected seconds > 0, got 0"),
+        ("gps_x,gps_y", "far,0", "gps_x: expected a number, got 'far'"),
+    ],
+)
+def test_own_measurements_that_make_no_sense(tmp_path: Path, columns: str, row: str, message: str) -> None:
+    path = write(tmp_path, ".csv", f"timestamp,x,y,{columns}\n0.0,1.0,2.0,{row}\n")
+    with pytest.raises(InputError, match=f"line 2: {message}"):
+        read_detections(path)

@@ -22,6 +22,7 @@ from factors import (
     point_factors,
     position_factor,
     range_factor,
+    relative_detection_factors,
 )
 from factors.solver import linearised
 
@@ -78,8 +79,12 @@ def bearing(planar):
     return make
 
 
-def satellite(rng, keys, covariance):
-    return position_factor(keys[0], rng.normal(0, 5, 3), covariance(rng, 3)), [some_pose(rng)]
+def satellite(dim):
+    def make(rng, keys, covariance):
+        antenna = rng.normal(0, 2, 3)
+        return position_factor(keys[0], rng.normal(0, 5, dim), covariance(rng, dim), antenna), [some_pose(rng, dim)]
+
+    return make
 
 
 def attitude(rng, keys, covariance):
@@ -111,11 +116,18 @@ def standing(rng, keys, covariance):
     return on_plane_factor(*keys, 0.8, 0.01, state_dim=6, position=(4, 0, 2)), [rng.normal(0, 5, 6), some_plane(rng)]
 
 
+def detection(rng, keys, covariance):
+    factor = relative_detection_factors([keys], rng.normal(0, 5, (1, 2)), covariance(rng, 2), 5, (3, 1))
+    return factor, [some_pose(rng, 2), rng.normal(0, 5, 5)]
+
+
 CASES = {
     "point in the plane": point(2), "point in space": point(3), "plane": plane, "range in the plane": distance(True),
     "range in space": distance(False), "bearing in the plane": bearing(True), "bearing in space": bearing(False),
-    "position": satellite, "attitude": attitude, "lane boundary": boundary, "lane keeping": keeping,
+    "position in the plane": satellite(2), "position in space": satellite(3),
+    "attitude": attitude, "lane boundary": boundary, "lane keeping": keeping,
     "lane keeping, seen at each foot": keeping_bend, "on a plane": standing, "straight edge": edge,
+    "object in the plane": detection,
 }  # fmt: skip
 
 
@@ -222,7 +234,7 @@ def test_the_offset_of_a_straight_lane_is_a_distance():
         (lambda: range_factor(1, 2, 1.0, 0.0, planar=True), "positive definite"),
         (lambda: bearing_range_factor(1, 2, [1, 1, 1], 1.0, np.eye(3)), "direction of length 1"),
         (lambda: bearing_range_factor(1, 2, 0.5, 1.0, np.eye(3)), "covariance"),
-        (lambda: position_factor(1, [1, 2], np.eye(3)), "position"),
+        (lambda: position_factor(1, [1, 2, 3, 4], np.eye(4)), "position: expected 2 or 3"),
         (lambda: attitude_factor(1, [0, 0, 0], 1.0), "seen: expected a direction"),
         (lambda: attitude_factor(1, [0, 0, 1], -1.0), "positive definite"),
         (lambda: point_factors([[1, 2]], [[1, 2]], np.eye(3)), "covariances"),

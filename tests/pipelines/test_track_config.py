@@ -11,7 +11,8 @@ from data_tools.simulator import SimulatorSettings
 from pipelines.config import Family, TrackConfig, load_config
 from pipelines.configuration import read_settings, settings_reference, write_settings
 from pipelines.configuration.schema import settings_of
-from saga_fg import InputError
+from saga_fg import InputError, Tracker
+from saga_fg.providers import Gps, Landmarks, Odometry, StartSettings
 
 
 @pytest.mark.parametrize("family", get_args(Family))
@@ -52,3 +53,39 @@ def test_every_setting_explains_itself(settings: type) -> None:
 
     assert unexplained(settings, settings.__name__) == []
     assert settings_reference(settings).count("|  |") == 0
+
+
+PROVIDERS = """
+tracker:
+  estimator: isam2
+  providers:
+    - {kind: "saga_fg.providers:Odometry", start: {place: [1, 2, 0.1], deviation: 0.3}}
+    - {kind: "saga_fg.providers:Gps", deviation: 0.5}
+    - saga_fg.providers:Landmarks
+"""
+
+
+def test_providers_have_settings_of_their_own() -> None:
+    config = read_settings(TrackConfig, PROVIDERS)
+    start = StartSettings(place=(1.0, 2.0, 0.1), deviation=0.3)
+    assert config.tracker.providers == (Odometry(start), Gps(deviation=0.5), "saga_fg.providers:Landmarks")
+    assert read_settings(TrackConfig, write_settings(config)) == config
+    assert Tracker(config.tracker).providers == (Odometry(start), Gps(deviation=0.5), Landmarks())
+
+
+@pytest.mark.parametrize(
+    ("provider", "message"),
+    [
+        ('{kind: "saga_fg.providers:Gps", deviation: -1}', r"providers\[0\]: deviation: expected a finite number > 0"),
+        ('{kind: "saga_fg.providers:Gps", deviaton: 1}', r"providers\[0\].deviaton: unknown key, did you mean"),
+        ('{kind: "saga_fg.providers:Gps", deviation: far}', r"providers\[0\].deviation: expected a number, got"),
+        ('{kind: "saga_fg.providers:Odometry", start: {place: [0, 0]}}', r"start.place: expected a list of 3"),
+        ("{deviation: 1}", r"providers\[0\].kind: expected MODULE:NAME, got nothing"),
+        ('{kind: "math:sqrt"}', r"providers\[0\].kind: math:sqrt: expected a dataclass of settings"),
+        ('{kind: "no_such_module:X"}', r"providers\[0\].kind: .*expected a module that can be imported"),
+        ("3", r"providers\[0\]: expected a section \(key: value\), got 3"),
+    ],
+)
+def test_settings_of_providers_that_make_no_sense(provider: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_settings(TrackConfig, f"tracker: {{estimator: isam2, providers: [{provider}]}}")

@@ -88,7 +88,8 @@ def test_linear_factors_of_providers_lead_to_one_estimate(seed, name):
             operation.run(estimator)
         if not isinstance(operation, Add | Marginalise):
             for estimator in (kalman, other):
-                estimator.ask(ORIGIN)
+                estimator.hear(None, ORIGIN)
+                estimator.ask()
         nodes = apart.nodes
         assert kalman.nodes.tolist() == other.nodes.tolist()
         P = kalman.joint_covariance(nodes)

@@ -112,7 +112,10 @@ CASES = {
         lambda v, k: Additions([NewVariable(EGO_POSE, 0, gtsam.Pose2(np.nan, 0, 0))]),
         "ego pose 0 at 3.40 s: expected a state of finite numbers",
     ),
-    "a matrix as state": (lambda v, k: Additions([NewVariable(OBJECT, 3, np.eye(2))]), "expected a vector, a pose or"),
+    "a matrix as state": (
+        lambda v, k: Additions([NewVariable(OBJECT, 3, np.eye(2))]),
+        "expected a vector, a pose, a plane or a bias",
+    ),
     "text as state": (lambda v, k: Additions([NewVariable(OBJECT, 3, "x")]), "object 3: expected a vector.*got str"),
     "negative id": (lambda v, k: Additions([NewVariable(OBJECT, -3, np.zeros(4))]), "expected id to be a whole number"),
     "unknown variable": (

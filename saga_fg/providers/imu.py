@@ -1,0 +1,128 @@
+"""The vehicle's pose, velocity and the biases of its inertial sensors from epoch to epoch, by preintegration.
+
+GTSAM's `CombinedImuFactor` between (pose, velocity, biases) of two epochs (Forster, Carlone, Dellaert, Scaramuzza,
+"On-manifold preintegration for real-time visual-inertial odometry", IEEE T-RO 33, 2017). The samples of a frame are
+taken for steady over its interval where they last longer or shorter than the epoch. Where there are none, the vehicle
+goes straight on, with noise on its acceleration and its rate of turn: the same factor of one coarse sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import prior_factor
+from saga_fg.arrays import FloatArray
+from saga_fg.ego_measurements import ImuSamples
+from saga_fg.errors import InputError
+from saga_fg.graph.keys import EGO_BIAS, EGO_POSE, EGO_VELOCITY
+from saga_fg.graph.parts import NewVariable
+from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.providers.start import StartSettings
+from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Adds the vehicle's pose in space, velocity and biases at every epoch, and inertial samples (`frame.ego.imu`)."""
+
+    start: StartSettings = settings_group(lambda: StartSettings(planar=False), "the first pose, in space")
+    start_velocity: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "first velocity, world, m/s")
+    start_velocity_deviation: float = setting(10.0, "its standard deviation, m/s")
+    accelerometer_noise: float = setting(0.02, "of the accelerometer, m/s^2/sqrt(Hz)")
+    gyroscope_noise: float = setting(0.002, "of the gyroscope, rad/s/sqrt(Hz)")
+    integration_noise: float = setting(1e-4, "of integrating the position, m/s/sqrt(Hz)")
+    accelerometer_bias: float = setting(0.1, "standard deviation of the accelerometer's first bias, m/s^2")
+    gyroscope_bias: float = setting(0.01, "standard deviation of the gyroscope's first bias, rad/s")
+    accelerometer_drift: float = setting(1e-3, "random walk of the accelerometer's bias, m/s^2 after one second")
+    gyroscope_drift: float = setting(1e-4, "random walk of the gyroscope's bias, rad/s after one second")
+    unknown_acceleration: float = setting(3.0, "of the acceleration where there are no samples, m/s^2/sqrt(Hz)")
+    unknown_turn: float = setting(0.3, "of the rate of turn where there are no samples, rad/s/sqrt(Hz)")
+    gravity: float = setting(9.81, "m/s^2")
+    name: str = setting("imu", "what it is called in messages")
+
+    def __post_init__(self) -> None:
+        names = ("start_velocity_deviation", "accelerometer_noise", "gyroscope_noise", "integration_noise")
+        biases = ("accelerometer_bias", "gyroscope_bias", "accelerometer_drift", "gyroscope_drift")
+        require_positive(self, *names, *biases, "unknown_acceleration", "unknown_turn")
+        require_between(self, 0, np.inf, "gravity")
+        if self.start.planar:
+            raise InputError("start.planar: expected false, inertial sensors move a pose in space")
+
+    def predict(self, view: GraphView) -> Additions:
+        before = view.before(EGO_VELOCITY)
+        if not before:
+            return self._start(view)
+        kinds = (EGO_POSE, EGO_VELOCITY, EGO_BIAS)
+        pose, velocity, bias = (view.before(kind)[0].key for kind in kinds)
+        if not isinstance(view.state(pose), gtsam.Pose3):
+            raise InputError("imu: expected the vehicle's pose in space (start.planar: false), got one in the plane")
+        now = [view.key(kind, 0) for kind in kinds]
+        measured = self._preintegrated(view, view.state(pose), view.state(bias))
+        moved = measured.predict(gtsam.NavState(view.state(pose), view.state(velocity)), view.state(bias))
+        new = [
+            NewVariable(EGO_VELOCITY, 0, np.array(moved.velocity()), label="vehicle's velocity"),
+            NewVariable(EGO_BIAS, 0, view.state(bias), label="imu bias"),
+        ]
+        if not view.now(EGO_POSE):
+            new.append(NewVariable(EGO_POSE, 0, moved.pose(), label="vehicle"))
+        return Additions(new, [gtsam.CombinedImuFactor(pose, velocity, now[0], now[1], bias, now[2], measured)])
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions()
+
+    def _start(self, view: GraphView) -> Additions:
+        first = self.start.additions(view)
+        velocity, bias = view.key(EGO_VELOCITY, 0), view.key(EGO_BIAS, 0)
+        deviations = np.repeat([self.accelerometer_bias, self.gyroscope_bias], 3)
+        start = np.array(self.start_velocity)
+        return Additions(
+            [
+                *first.variables,
+                NewVariable(EGO_VELOCITY, 0, start, label="vehicle's velocity"),
+                NewVariable(EGO_BIAS, 0, gtsam.imuBias.ConstantBias(), label="imu bias"),
+            ],
+            [
+                *list(first.factors),  # type: ignore[arg-type]
+                prior_factor(velocity, start, self.start_velocity_deviation**2 * np.eye(3)),
+                gtsam.PriorFactorConstantBias(
+                    bias, gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(deviations)
+                ),
+            ],
+        )
+
+    def _preintegrated(
+        self, view: GraphView, pose: gtsam.Pose3, bias: gtsam.imuBias.ConstantBias
+    ) -> gtsam.PreintegratedCombinedMeasurements:
+        ego = None if view.frame is None else view.frame.ego
+        samples = None if ego is None else ego.imu
+        known = samples is not None
+        if samples is None:
+            up = pose.rotation().matrix().T @ [[0.0], [0.0], [self.gravity]]
+            corrected = bias.vector()[None]  # what sensors with these biases would say of straight on
+            samples = ImuSamples(np.array([view.dt]), up.T + corrected[:, :3], corrected[:, 3:])
+        parameters = self._parameters(known)
+        measured = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
+        share = view.dt / float(samples.dt.sum())
+        for dt, acceleration, rate in zip(samples.dt, samples.acceleration, samples.angular_rate, strict=True):
+            measured.integrateMeasurement(acceleration, rate, share * float(dt))
+        return measured
+
+    def _parameters(self, known: bool) -> gtsam.PreintegrationCombinedParams:
+        parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(self.gravity)
+        noises = (self.accelerometer_noise, self.gyroscope_noise)
+        for name, deviation in (
+            ("Accelerometer", noises[0] if known else self.unknown_acceleration),
+            ("Gyroscope", noises[1] if known else self.unknown_turn),
+            ("Integration", self.integration_noise),
+            ("BiasAcc", self.accelerometer_drift),
+            ("BiasOmega", self.gyroscope_drift),
+        ):
+            getattr(parameters, f"set{name}Covariance")(_isotropic(deviation))
+        return parameters
+
+
+def _isotropic(deviation: float) -> FloatArray:
+    return np.asarray(deviation**2 * np.eye(3))

@@ -1,0 +1,88 @@
+"""The vehicle's pose from epoch to epoch, by odometry.
+
+    r = log( measured^-1 before^-1 now ),    measured = before_T_now of the interval
+
+An increment over other times than the epoch's is taken for a steady motion, of which the epoch has its share: the
+motion's logarithm times the share, its covariance as well. Without an increment the vehicle may be anywhere nearby.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import Pose, between_factor, pose
+from saga_fg.arrays import FloatArray
+from saga_fg.ego_measurements import OdometryIncrement
+from saga_fg.errors import InputError
+from saga_fg.graph.keys import EGO_POSE
+from saga_fg.graph.parts import NewVariable
+from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.providers.start import StartSettings
+from saga_fg.settings import require_positive, setting, settings_group
+
+_SAME = 1e-4  # relative difference of two intervals that timestamps make
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Adds the vehicle's pose at every epoch, and what odometry (`frame.ego.odometry`) says of its motion."""
+
+    start: StartSettings = settings_group(StartSettings, "the first pose")
+    place_drift: float = setting(
+        0.1, "increments that come without a covariance: standard deviation of the place after one second, m"
+    )
+    heading_drift: float = setting(0.01, "the same of the heading, and of roll and pitch, rad")
+    unknown_speed: float = setting(10.0, "standard deviation of the velocity where there is no increment, m/s")
+    unknown_turn: float = setting(0.3, "standard deviation of the rate of turn where there is no increment, rad/s")
+    name: str = setting("odometry", "what it is called in messages")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "place_drift", "heading_drift", "unknown_speed", "unknown_turn")
+
+    def predict(self, view: GraphView) -> Additions:
+        before = view.before(EGO_POSE)
+        if not before:
+            return self.start.additions(view)
+        last, key = before[0].key, view.key(EGO_POSE, 0)
+        planar = isinstance(view.state(last), gtsam.Pose2)
+        motion, covariance = self._motion(view, planar)
+        new = (
+            [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, view.state(last).compose(motion), label="vehicle")]
+        )
+        return Additions(new, [between_factor(last, key, motion.matrix(), covariance)])
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions()
+
+    def _motion(self, view: GraphView, planar: bool) -> tuple[Pose, FloatArray]:
+        """Of this epoch, with the covariance of its tangent."""
+        ego = None if view.frame is None else view.frame.ego
+        if ego is None or ego.odometry is None:
+            standing: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
+            return standing, self._covariance(self.unknown_speed * view.dt, self.unknown_turn * view.dt, planar)
+        said = ego.odometry
+        motion = _motion_of(said, planar)
+        covariance = said.covariance
+        if covariance is None:
+            covariance = self._covariance(self.place_drift, self.heading_drift, planar) * said.dt
+        share = view.dt / said.dt
+        if abs(share - 1) <= _SAME:
+            return motion, covariance
+        still: Any = type(motion)()
+        return still.expmap(share * still.logmap(motion)), share * max(share, 1.0) * covariance
+
+    def _covariance(self, place: float, heading: float, planar: bool) -> FloatArray:
+        sigmas = [place, place, heading] if planar else 3 * [heading] + 3 * [place]
+        return np.diag(np.square(sigmas))
+
+
+def _motion_of(said: OdometryIncrement, planar: bool) -> Pose:
+    wanted = 3 if planar else 4
+    if len(said.before_T_now) != wanted:
+        n = len(said.before_T_now)
+        raise InputError(f"odometry: expected a {wanted} x {wanted} transform, as poses are, got {n} x {n}")
+    return pose("odometry", said.before_T_now)

@@ -1,0 +1,65 @@
+"""The first pose of the vehicle: where it is believed to be before anything moves, with a prior."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import Pose, pose, pose_prior_factor
+from saga_fg.arrays import FloatArray
+from saga_fg.errors import InputError
+from saga_fg.frame import Frame
+from saga_fg.geometry import yaw_of, yaw_transform
+from saga_fg.graph.keys import EGO_POSE
+from saga_fg.graph.parts import NewVariable
+from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.settings import require_positive, setting
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """The vehicle's first pose."""
+
+    place: tuple[float, float, float] | None = setting(
+        None, "x, y (m) and yaw (rad) in the world; null: the first frame's world_T_ego, else its GPS fix, yaw 0"
+    )
+    deviation: float = setting(1.0, "standard deviation of the place, m")
+    heading_deviation: float = setting(0.1, "of the heading, rad")
+    tilt_deviation: float = setting(0.02, "of roll and pitch, rad; for poses in space")
+    planar: bool = setting(True, "a pose (x, y, heading), gtsam.Pose2; false: in space, gtsam.Pose3")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "deviation", "heading_deviation", "tilt_deviation")
+        if self.place is not None and not all(map(math.isfinite, self.place)):
+            raise InputError(f"place: expected finite numbers, got {self.place!r}")
+
+    def additions(self, view: GraphView) -> Additions:
+        """The first pose with its prior; none where the vehicle has a pose already."""
+        if view.now(EGO_POSE) or view.before(EGO_POSE):
+            return Additions()
+        world_T_ego = self.transform(view.frame)
+        world_T_ego[:2, 3] -= view.origin
+        if self.planar:
+            start: Pose = gtsam.Pose2(float(yaw_of(world_T_ego[:3, :3])), world_T_ego[:2, 3])
+            sigmas = [self.deviation, self.deviation, self.heading_deviation]
+        else:
+            start = pose("start", world_T_ego)
+            sigmas = [self.tilt_deviation, self.tilt_deviation, self.heading_deviation] + 3 * [self.deviation]
+        prior = pose_prior_factor(view.key(EGO_POSE, 0), start.matrix(), np.diag(np.square(sigmas)))
+        return Additions([NewVariable(EGO_POSE, 0, start, label="vehicle")], [prior])
+
+    def transform(self, frame: Frame | None) -> FloatArray:
+        """world_T_ego (4, 4) as settings or a frame have it."""
+        if self.place is not None:
+            x, y, yaw = self.place
+            return yaw_transform(x, y, 0.0, yaw)
+        if frame is not None and frame.world_T_ego is not None:
+            return frame.world_T_ego.copy()
+        start = np.eye(4)
+        if frame is not None and frame.ego is not None and frame.ego.gps is not None:
+            place = frame.ego.gps.position
+            start[: len(place), 3] = place
+        return start

@@ -1,0 +1,54 @@
+"""Objects that stand: v ~ N(0, deviation^2 / dt), robust, so that one which drives off is let go.
+
+The variance shrinks with the length of the interval, so that a second says the same however often sensors speak.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factors import ResidualFactors, Robust
+from saga_fg.arrays import FloatArray
+from saga_fg.graph.keys import OBJECT
+from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.settings import require_positive, setting
+
+
+@dataclass(frozen=True)
+class Stationary:
+    """Says of objects of some classes that they probably stand."""
+
+    classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of objects that stand")
+    deviation: float = setting(0.1, "standard deviation of a velocity that a second of standing leaves, m/s")
+    surely_moving: float = setting(4.0, "standard deviations from standing at which the loss gives an object up")
+    name: str = setting("stationary", "what it is called in messages")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "deviation", "surely_moving")
+
+    def factors(self, view: GraphView) -> Additions:
+        dims: dict[int, list[list[int]]] = {}
+        for one in view.now(OBJECT).values():
+            if one.label in self.classes and one.dim >= 4:  # (x, y, vx, vy, ...)
+                dims.setdefault(one.dim, []).append([one.key])
+        if view.dt == 0:
+            return Additions()
+        R, robust = self.deviation**2 / view.dt * np.eye(2), Robust("geman-mcclure", self.surely_moving)
+        return Additions(
+            factors=[
+                ResidualFactors(
+                    np.array(rows, dtype=np.uint64), (dim,), _velocity, R, _by_velocity, robust, name="standing object"
+                )
+                for dim, rows in dims.items()
+            ]
+        )
+
+
+def _velocity(x: FloatArray) -> FloatArray:
+    return x[:, 2:4]
+
+
+def _by_velocity(x: FloatArray) -> list[FloatArray]:
+    return [np.tile(np.eye(2, x.shape[1], 2), (len(x), 1, 1))]

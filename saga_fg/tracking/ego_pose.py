@@ -1,0 +1,70 @@
+"""The vehicle's pose as a variable of the tracks' running graph, and objects seen from it.
+
+Factor providers move it (`saga_fg.providers`). What a detection in the vehicle's frame measures is r = R^T (p - t) - z
+of the pose (R, t) and the object's place p. Both err together, as both hang on what was seen before, so that a
+detection is compared with the covariance of r, and not with that of p.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from factors import relative_detection_factors
+from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.estimators import GraphFilter
+from saga_fg.geometry import inverse_transform, transform_points, yaw_transform
+from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
+from saga_fg.interactions import POSITION
+from saga_fg.node import NodeType
+
+
+class Sightings(NamedTuple):
+    """m places (m, 3) in the vehicle's frame, m, with covariances (m, 2, 2) in its axes, m^2."""
+
+    z: FloatArray
+    R: FloatArray
+
+    def select(self, rows: IntArray) -> Sightings:
+        """Some of them."""
+        return Sightings(self.z[rows], self.R[rows])
+
+    @classmethod
+    def of(cls, world_T_ego: FloatArray, position: FloatArray, R: FloatArray) -> Sightings:
+        """Of places (m, 3) and covariances (m, 2, 2) in the world, where a pose has put them."""
+        turn = world_T_ego[:2, :2]
+        return cls(transform_points(inverse_transform(world_T_ego), position), turn.T @ R @ turn)
+
+
+def local_pose(graph: SceneFactorGraph) -> FloatArray | None:
+    """The vehicle's present pose (4, 4), counted from the graph's origin; None where no provider has added one."""
+    key = key_of(EGO_POSE, 0, graph.epoch) if graph.epoch >= 0 else -1
+    if key not in graph.variables:
+        return None
+    pose = graph.state(key)
+    return pose.matrix() if isinstance(pose, gtsam.Pose3) else yaw_transform(pose.x(), pose.y(), 0.0, pose.theta())
+
+
+def relative_covariances(estimator: GraphFilter, ids: IntArray, types: tuple[NodeType, ...]) -> FloatArray:
+    """Covariances (n, 2, 2) of where objects are, seen from the vehicle, in the axes of the world."""
+    key = key_of(EGO_POSE, 0, estimator.graph().epoch)
+    pose = estimator.graph().state(key)
+    planar = isinstance(pose, gtsam.Pose2)
+    matrix = pose.matrix()[None]
+    turn = matrix[0, :2, :2]
+    joint = estimator.covariance_with([key], ids)
+    d, start, result = pose.dim(), pose.dim(), np.zeros((len(ids), 2, 2))
+    for row, (node, node_type) in enumerate(zip(ids.tolist(), types, strict=True)):
+        x, y = node_type.index(POSITION).tolist()
+        state = estimator.mean([node])
+        z = pose.transformTo(state[0, [x, y]] if planar else np.append(state[0, [x, y]], pose.z()))
+        seen = relative_detection_factors([[0, 1]], [z], np.eye(2), node_type.dim, (x, y))
+        assert seen.jacobians is not None
+        J_pose, J_state = (np.asarray(J)[0] for J in seen.jacobians(matrix, state))
+        mine = np.r_[0:d, start : start + node_type.dim]
+        G = turn @ np.concatenate([J_pose, J_state], axis=1)
+        result[row] = G @ joint[np.ix_(mine, mine)] @ G.T
+        start += node_type.dim
+    return result
