@@ -15,13 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import gtsam
 
 from factors import Linearisable, PlanarPose, SpatialPose, Variable
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances
-from saga_fg.frame import Frame
+
+if TYPE_CHECKING:  # it brings observations itself
+    from saga_fg.frame import Frame
 
 LandmarkFactors = Sequence[Linearisable] | gtsam.NonlinearFactorGraph
 

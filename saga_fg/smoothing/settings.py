@@ -97,8 +97,8 @@ class SmoothingSettings:
     loss_scale: float = setting(2.0, "residual from which the loss differs from a square, standard deviations")
     providers: tuple[str | FactorProvider, ...] = setting(
         (),
-        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked once a moment for the final "
-        "states, made anew every time",
+        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked once a moment for the "
+        "final states, made anew every time",
     )
     reweightings: int = setting(1, "times the weights of the loss, and the edges, are found again at the final states")
     extension: float = setting(1.5, "how far before its birth and after its end an object is looked for, s")
