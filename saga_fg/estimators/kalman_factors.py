@@ -79,15 +79,14 @@ class Beside:
             graph.advance(time)
         else:  # asked again: the nodes have changed since
             graph.marginalise([key for key in graph.variables if key not in ids])
+        _move(graph, x, ids)
         nodes = []
         for node, state in zip(joint, np.split(x.mean, x.layout.offsets[1:-1]), strict=bool(joint)):
             if node not in ids:
                 kind, number = node_kind(node)
                 nodes.append((node, NewVariable(kind, number, state, label=self.labels.get(node, ""))))
         keys = graph.add_variables("tracks", [new for _, new in nodes])
-        ids |= {key: node for key, (node, _) in zip(keys, nodes, strict=True)}
-        _move(graph, x, ids)
-        return graph, ids
+        return graph, ids | {key: node for key, (node, _) in zip(keys, nodes, strict=True)}
 
 
 def asked(
