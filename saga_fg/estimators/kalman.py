@@ -26,6 +26,7 @@ from saga_fg.estimators.kalman_factors import Beside, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.graph.providers import FactorProvider
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
@@ -126,9 +127,9 @@ class JointKalmanFilter:
         """All that the filter knows."""
         return self._state
 
-    def graph(self) -> FactorGraph:
-        """One joint prior a component: the filter keeps nothing of the past but this."""
-        return prior_graph(self._state)
+    def graph(self) -> FactorGraph | SceneFactorGraph:
+        """One joint prior a component: the filter keeps nothing of the past but this. With providers by name."""
+        return self._beside.priors(self._state, self._time) if self.providers else prior_graph(self._state)
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""
