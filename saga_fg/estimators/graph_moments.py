@@ -111,7 +111,7 @@ def condense(graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, in
     for number in range(x.partition.count):
         rows = np.flatnonzero(x.partition.label == number)
         keys = [now[ids[row]] for row in rows.tolist()]
-        old = {label[earlier[ids[row]]] for row in rows.tolist()}
+        old = {label.get(earlier[ids[row]]) for row in rows.tolist()}
         gone = [key for key, part in label.items() if part in old and key not in keys]
         mean = np.split(x.mean[x.layout.places(rows)], np.cumsum(x.layout.dims[rows])[:-1])
         base = graph.base

@@ -146,8 +146,8 @@ class JointKalmanFilter:
         return self._state
 
     def graph(self) -> SceneFactorGraph:
-        """One joint prior a component: the filter keeps nothing of the past but this."""
-        return prior_graph(self._state, self._time)
+        """One joint prior a component: the filter keeps nothing of the past but this. With providers by name."""
+        return self._beside.priors(self._state, self._time) if self.providers else prior_graph(self._state, self._time)
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""
