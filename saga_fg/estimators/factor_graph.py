@@ -207,7 +207,7 @@ def motion_factors(
         heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
         if not _is_regular(Q):
-            raise FactorError(f"node {node}: expected noise in all directions of its state, or no motion at all")
+            raise FactorError(f"node {node}: expected noise in all directions of its state")
         native.append(interaction_factor(int(then[row]), [key for key, _ in heard], [F for _, F in heard], b, Q))
     return native, nonlinear
 

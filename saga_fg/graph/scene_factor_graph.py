@@ -270,15 +270,26 @@ class SceneFactorGraph:
                 graph.add(factor)
         return graph
 
-    def copy(self) -> SceneFactorGraph:
-        """A graph of its own with the same variables and factors, which are shared."""
+    def copy(self, share_values: bool = False) -> SceneFactorGraph:
+        """A graph of its own with the same variables and factors, which are shared.
+
+        share_values: what is added to the copy comes into these values, too, which costs less than copying them; only
+        one of the two can go on, this one with `drop_strangers`
+        """
         other = SceneFactorGraph()
         other.__dict__ |= self.__dict__
         other._variables, other._groups = dict(self._variables), dict(self._groups)
         other._touching, other._fresh = dict(self._touching), dict(self._fresh)
         other._factor_counts = dict(self._factor_counts)
-        other._base, other._values = self.base, self.values
+        if not share_values:
+            other._base, other._values = self.base, self.values
         return other
+
+    def drop_strangers(self) -> None:
+        """Erase values of variables that are not in the graph."""
+        for values in (self._base, self._values):
+            for key in set(values.keys()) - self._variables.keys():
+                values.erase(key)
 
     def undetermined(self, error: Exception) -> GraphError:
         """What a solver said, in the words of this graph."""

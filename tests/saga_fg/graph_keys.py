@@ -1,6 +1,7 @@
 """Keys of an estimator's graph by node."""
 
 from saga_fg.graph import OBJECT
+from saga_fg.graph.keys import node_kind
 
 
 def keys_of(graph, epoch):
@@ -10,4 +11,4 @@ def keys_of(graph, epoch):
 
 def newest_key(graph, node):
     """The key of a node's last variable, which a pole has had since it appeared."""
-    return max(key for key, variable in graph.variables.items() if variable.id == node and variable.kind == OBJECT)
+    return max(key for key, variable in graph.variables.items() if (variable.kind, variable.id) == node_kind(node))

@@ -31,7 +31,7 @@ from road_scenes import road_program
 from factors import SolverSettings
 from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators import BatchSolver, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.keys import node_key
 from saga_fg.transition import Blocks
@@ -266,6 +266,19 @@ def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
         for values in (solved, equivalent.values):
             assert np.abs((values.atVector(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 1e-7
         assert np.linalg.norm(marginals.marginalCovariance(key) - P) < 1e-6 * np.linalg.norm(P)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_batch_solver_solves_the_estimators_graph_to_the_same_answer(make, seed):
+    """Its graph is a running graph: nodes of a map by their kind, moments by their time, poles with one variable."""
+    estimator, _ = run(random_program(np.random.default_rng(seed), moments=6), make())
+    estimator.add([-4], np.array([[3.0, 1.0]]), 0.1 * np.eye(2)[None])
+    solver = BatchSolver(graph=estimator.graph())
+    for node in estimator.nodes.tolist():
+        key, P = newest_key(estimator.graph(), node), estimator.covariance([node])[0]
+        assert np.abs((solver.state(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 5e-9
+        assert np.linalg.norm(solver.covariance(key) - P) < 5e-9 * np.linalg.norm(P)
+    assert str(solver.graph().variable(key)) == f"map node 4 at {estimator.time:.2f} s"
 
 
 def test_any_subset_in_any_order_can_be_read(make):
