@@ -144,7 +144,7 @@ def lidar_slam(
         if s.landmarks:
             seen.append(landmarks_seen(points, s.sightings, detectors))
             mapper.observe([each.observation for each in seen[-1]])
-        online.append(mapper.pose)
+        online.append(mapper.estimate.pose.matrix())
         if progress is not None:
             progress("landmarks", k + 1, len(drive.points))
     landmark_map = mapper.map()

@@ -85,6 +85,13 @@ class Engine:
             conditional = self.isam.marginalFactor(key, gtsam.EliminateQR)
         return np.array(conditional.R())  # R() is a view into the conditional
 
+    def joint(self, keys: Sequence[int]) -> FloatArray | None:
+        """Joint covariance of variables on increments from the base, to half the digits; None where these are lost."""
+        try:
+            return np.asarray(np.linalg.inv(self.isam.jointMarginalInformation(list(keys)).fullMatrix()))
+        except (RuntimeError, np.linalg.LinAlgError):
+            return None
+
     def linear(self) -> gtsam.GaussianFactorGraph:
         """All linear factors that it holds, the sharpest first."""
         held, linear = self.isam.getFactorsUnsafe(), gtsam.GaussianFactorGraph()
@@ -131,9 +138,8 @@ class Engine:
         newest = [key for key in keys if graph.variable(key).epoch in (graph.epoch, None)]
         if not newest:
             return
-        try:
-            P = np.linalg.inv(self.isam.jointMarginalInformation(newest).fullMatrix())
-        except (RuntimeError, np.linalg.LinAlgError):
+        P = self.joint(newest)
+        if P is None:
             P = marginal_moments(self.linear(), newest, "qr")[1]
         start = 0
         for key in newest:

@@ -32,11 +32,11 @@ class GraphSolution:
     def covariance(self, keys: Iterable[int]) -> FloatArray:
         """Joint covariance (D, D) of variables in the order given; of poses in their own frames, as GTSAM's."""
         wanted = list(keys)
-        return self._transported(wanted, marginal_moments(self._linear, wanted, self._eliminated[1])[1])
+        return self._point.transported(wanted, marginal_moments(self._linear, wanted, self._eliminated[1])[1])
 
     def marginal(self, key: int) -> FloatArray:
         """Covariance (d, d) of one variable, by elimination of everything once for all variables that are asked for."""
-        return self._transported([key], self._marginals[key])
+        return self._point.transported([key], self._marginals[key])
 
     @property
     def step(self) -> gtsam.VectorValues:
@@ -45,16 +45,6 @@ class GraphSolution:
         if not np.isfinite(step.norm()):
             raise singular_system(self._linear)
         return step
-
-    def _transported(self, keys: list[int], P: FloatArray) -> FloatArray:
-        P, start = P.copy(), 0
-        for key in keys:
-            span, D = slice(start, start + self._point.variables[key].dim), self._point.transport(key)
-            if D is not None:
-                P[span] = D @ P[span]
-                P[:, span] = P[:, span] @ D.T
-            start = span.stop
-        return P
 
     @cached_property
     def _marginals(self) -> dict[int, FloatArray]:

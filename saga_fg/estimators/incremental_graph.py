@@ -111,6 +111,14 @@ class IncrementalSmoother:
         self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
         self._times = self._times[first:]
 
+    def steps(self, epochs: Iterable[tuple[float, Sequence[FactorProvider]]]) -> None:
+        """Begin several epochs, each at its time with its providers, and solve once; nothing is marginalised."""
+        graph = self._graph.copy()
+        for time, providers in epochs:
+            graph.advance(time)
+            self._ask(graph, providers)
+        self._move_to(graph)
+
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch, and solve again."""
         self._asked(self._graph.copy(), providers)
@@ -133,11 +141,12 @@ class IncrementalSmoother:
         root = root if D is None else D @ root
         return root @ root.T
 
-    def joint_covariance(self, keys: Sequence[int]) -> FloatArray:
-        """Joint covariance of variables in the order given."""
+    def joint_covariance(self, keys: Sequence[int], rough: bool = False) -> FloatArray:
+        """Joint covariance of variables in the order given; rough: to half the digits, from their part of the tree."""
         for key in keys:
             self._graph.variable(key)
-        return self.solution().covariance(keys)
+        P = self._ready().joint(keys) if rough else None
+        return self.solution().covariance(keys) if P is None else self._graph.point().transported(keys, P)
 
     def solution(self) -> GraphSolution:
         """The present solution as a value."""
@@ -173,11 +182,22 @@ class IncrementalSmoother:
         providers: Sequence[FactorProvider],
         change: Callable[[SceneFactorGraph], None] | None = None,
     ) -> None:
+        self._ask(graph, providers, change)
+        self._move_to(graph)
+
+    def _ask(
+        self,
+        graph: SceneFactorGraph,
+        providers: Sequence[FactorProvider],
+        change: Callable[[SceneFactorGraph], None] | None = None,
+    ) -> None:
         view = GraphView(graph, self.covariance, self.origin, self.frame)
         for k, provider in enumerate(providers):
             ask(provider, graph, view)
             if k == 0 and change is not None:
                 change(graph)
+
+    def _move_to(self, graph: SceneFactorGraph) -> None:
         self._engine = self._solved(graph)
         self._graph = graph
 

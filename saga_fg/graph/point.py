@@ -42,6 +42,17 @@ class Point:
             self._transports[key] = None if base is None else transport(kind, base, self.increment(key))
         return self._transports[key]
 
+    def transported(self, keys: Sequence[int], P: FloatArray) -> FloatArray:
+        """A joint covariance of variables, counted from the base, in the coordinates of where they are."""
+        P, start = P.copy(), 0
+        for key in keys:
+            span, D = slice(start, start + self.variables[key].dim), self.transport(key)
+            if D is not None:
+                P[span] = D @ P[span]
+                P[:, span] = P[:, span] @ D.T
+            start = span.stop
+        return P
+
     def dims(self, keys: Sequence[int]) -> list[int]:
         """Dimensions of variables."""
         return [self.variables[key].dim for key in keys]

@@ -1,7 +1,13 @@
-"""The newest pose and landmarks as one Gaussian: innovations of observations, and how far landmarks are apart.
+"""The pose and all landmarks as one Gaussian, kept by an error-state Kalman filter between two smoothings.
 
-State x = (pose, l_1, ..., l_n) with covariance P of its tangents, as a running graph says. With factors linearised and
-whitened at the state, r + A dx + w, w ~ N(0, 1), the innovation covariance is S = A P A^T + 1.
+State x = (pose, l_1, ..., l_n) with covariance P of its tangents. With factors linearised and whitened at the state,
+r + A_p dp + A_l dl + w, w ~ N(0, 1):
+
+    move      P_pp <- Ad P_pp Ad^T + Q,  P_pl <- Ad P_pl              Ad of the inverse increment
+    update    S = A P A^T + 1,  K = P A^T S^-1,  x <- x + (-K r),  P <- P - K A P
+    append    dl = -A_l^-1 (A_p dp + w)                                 a landmark where its first observation puts it
+
+Source: R. Smith, M. Self, P. Cheeseman, "Estimating uncertain spatial relationships in robotics", 1990.
 """
 
 from __future__ import annotations
@@ -13,7 +19,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import Vector, linearised, pose
+from factors import ResidualFactors, Variable, Vector, linearised, pose
 from factors.differences import central_differences
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.landmarks.protocol import LandmarkType, Observation
@@ -33,22 +39,23 @@ class Innovation:
 
 
 class JointEstimate:
-    """A pose, and the kind and state of each landmark by number, with the covariance of all of them in this order."""
+    """Pose and landmarks; a landmark's key is the number it was appended with."""
 
     def __init__(
-        self, world_T_pose: FloatArray, covariance: FloatArray, landmarks: Mapping[int, tuple[LandmarkType, Any]]
+        self,
+        world_T_pose: FloatArray,
+        covariance: FloatArray,
+        landmarks: Mapping[int, tuple[LandmarkType, Any]] | None = None,
     ) -> None:
+        """covariance: of the pose and of landmarks, type and state by number, in this order."""
         self.values = gtsam.Values()
         self.values.insert(POSE, pose("world_T_pose", world_T_pose))
         self.planar = world_T_pose.shape == (3, 3)
-        self.kinds = {number: kind for number, (kind, _) in landmarks.items()}
+        self.kinds: dict[int, LandmarkType] = {}
         self.P = np.array(covariance, dtype=np.float64)
-        self._columns: dict[int, slice] = {POSE: slice(0, 3 if self.planar else 6)}
-        end = self._columns[POSE].stop
-        for number, (kind, state) in landmarks.items():
-            self.values.insert(number, state)
-            self._columns[number] = slice(end, end + kind.variable.dim)
-            end = self._columns[number].stop
+        self._columns = {POSE: slice(0, 3 if self.planar else 6)}
+        for number, (kind, state) in (landmarks or {}).items():
+            self._insert(number, kind, state)
 
     @property
     def pose(self) -> Any:
@@ -64,6 +71,16 @@ class JointEstimate:
         columns = self._columns_of(keys)
         return np.asarray(self.P[np.ix_(columns, columns)])
 
+    def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
+        """Move the pose by a measured increment; covariance (k, k) of its tangent."""
+        increment = pose("a_T_b", a_T_b)
+        k = increment.dim()
+        self.values.update(POSE, self.pose.compose(increment))
+        Ad = increment.inverse().AdjointMap()
+        self.P[:k] = Ad @ self.P[:k]
+        self.P[:, :k] = self.P[:, :k] @ Ad.T
+        self.P[:k, :k] += covariance
+
     def innovations(self, observation: Observation, landmarks: Iterable[int]) -> list[Innovation]:
         """The observation against each of these landmarks, which are of its kind."""
         keys = list(landmarks)
@@ -74,6 +91,10 @@ class JointEstimate:
         observed = np.broadcast_to(observation.value, (n, len(observation.value)))
         covariances = np.broadcast_to(observation.covariance, (n, *observation.covariance.shape))
         factors = observation.kind.factors(rows, observed, covariances)
+        if not isinstance(factors, gtsam.NonlinearFactorGraph) and isinstance(factors[0], ResidualFactors):
+            W, (by_pose, by_landmark), r = factors[0].linearisation(self.values)
+            whitened = zip(keys, (W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark, strict=True)
+            return [Innovation(*one) for one in whitened]
         if isinstance(factors, gtsam.NonlinearFactorGraph):
             linear = factors.linearize(self.values)
         else:
@@ -104,6 +125,17 @@ class JointEstimate:
         S += A_l @ P_ll @ A_l.swapaxes(1, 2) + np.eye(r.shape[1])
         squared = (r * np.linalg.solve(S, r[:, :, None])[:, :, 0]).sum(axis=1)
         return squared, np.linalg.slogdet(S)[1]
+
+    def update(self, innovations: Sequence[Innovation]) -> None:
+        """Take in observations of different landmarks made from the present pose."""
+        A, columns = self._stacked(innovations)
+        r = np.concatenate([i.r for i in innovations])
+        PA = self.P[:, columns] @ A.T
+        S = A @ PA[columns] + np.eye(len(A))
+        K = np.linalg.solve(S, PA.T).T
+        self.P -= K @ PA.T
+        self.P = (self.P + self.P.T) / 2
+        self._retract(-K @ r)
 
     def differences(self, pairs: Sequence[tuple[int, int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """How far K pairs of a kind are apart: l_j seen from l_i in its tangent, (K, d), to first order delta + J dl.
@@ -142,6 +174,28 @@ class JointEstimate:
         C = C.reshape(K * d, K * d) + _SAME * np.eye(K * d)
         return np.asarray(C.reshape(K, d, K, d))
 
+    def append(self, landmark: int, observation: Observation) -> None:
+        """Add a landmark where an observation from the present pose puts it."""
+        kind = observation.kind
+        self._insert(landmark, kind, kind.initialise(self.pose.matrix(), observation.value))
+        n, d, k = len(self.P), kind.variable.dim, self._columns[POSE].stop
+        (first,) = self.innovations(observation, [landmark])
+        G = -np.linalg.solve(first.by_landmark, first.by_pose)
+        noise = np.linalg.inv(first.by_landmark)
+        P = np.zeros((n + d, n + d))
+        P[:n, :n] = self.P
+        P[n:, :n] = G @ self.P[:k]
+        P[:n, n:] = P[n:, :n].T
+        P[n:, n:] = G @ self.P[:k, :k] @ G.T + noise @ noise.T
+        self.P = P
+
+    def _insert(self, landmark: int, kind: LandmarkType, state: Any) -> None:
+        """Its columns of P are the next ones."""
+        end = max(columns.stop for columns in self._columns.values())
+        self.kinds[landmark] = kind
+        self.values.insert(landmark, state)
+        self._columns[landmark] = slice(end, end + kind.variable.dim)
+
     def _columns_of(self, keys: Sequence[int]) -> IntArray:
         """The columns of P that belong to these, one after the other."""
         return np.concatenate([np.arange(len(self.P))[self._columns[key]] for key in keys])
@@ -159,3 +213,27 @@ class JointEstimate:
             columns.append(np.arange(len(self.P))[self._columns[i.landmark]])
             row, column = row + m, column + d
         return A, np.concatenate(columns)
+
+    def _retract(self, delta: FloatArray) -> None:
+        self.values.update(POSE, self.pose.retract(delta[self._columns[POSE]]))
+        for key, kind in self.kinds.items():
+            columns = self._columns[key]
+            state = self.state(key)
+            moved = kind.variable.retract(state, delta[columns])
+            self.values.update(key, moved)
+            if not isinstance(kind.variable, Vector):
+                self._transport(columns, _turned(kind.variable, state, delta[columns], moved))
+
+    def _transport(self, columns: slice, turned: FloatArray) -> None:
+        """Express the covariance of a state in the tangent of where it moved to, whose axes may be others."""
+        self.P[columns] = turned @ self.P[columns]
+        self.P[:, columns] = self.P[:, columns] @ turned.T
+
+
+def _turned(variable: Variable, state: Any, delta: FloatArray, moved: Any) -> FloatArray:
+    """d local(moved, retract(state, delta + e)) / de (d, d)."""
+
+    def seen(step: FloatArray) -> FloatArray:
+        return variable.local(moved, variable.retract(state, delta + step))
+
+    return central_differences(seen, [np.zeros(variable.dim)], [Vector(variable.dim)])[0]

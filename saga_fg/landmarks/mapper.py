@@ -1,14 +1,10 @@
-"""SLAM with landmarks whose identities nobody tells: online, in a running graph that iSAM2 keeps smoothed.
+"""SLAM with landmarks whose identities nobody tells: online, with everything smoothed again from time to time.
 
-Every pose, landmark and observation is in the graph (`saga_fg.graph`), and every estimate is that of all of it. Which
-observation is of which landmark is told by the joint marginal of the newest pose and those landmarks that come into
-question: as a covariance P of two parts is never larger than twice its diagonal blocks,
-
-    d^2 = r^T (A P A^T + 1)^-1 r   >=   r^T (2 A_p P_pp A_p^T + 2 A_l P_ll A_l^T + 1)^-1 r
-
-a landmark whose right side is outside the gate is outside it for sure. What is known of a landmark only grows, so P_ll
-may be an old one. Every `smooth_every` observations landmarks that turn out to be one are merged (see `merging`), with
-the same bound on the pairs.
+Between two smoothings the pose and the landmarks are one Gaussian (`JointEstimate`), which is what gates need: the
+innovation of an observation takes the correlation of pose and landmark into account. Every `smooth_every` observations
+all that came goes into a running graph (`saga_fg.graph`), which iSAM2 keeps smoothed, so that linearisation errors do
+not add up; the joint marginal of the newest pose and all landmarks then replaces the Gaussian. At the same time
+landmarks that turn out to be one are merged (see `merging`).
 
 How far odometry and sensor are to be believed is itself a hypothesis, and the probability of all that was measured says
 which is the better one, without any truth (Laplace's approximation at the solution x* with information matrix H):
@@ -19,29 +15,29 @@ which is the better one, without any truth (Laplace's approximation at the solut
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from factors import ResidualFactor, Solution, Variable
+from factors import ResidualFactor, Solution, SolverSettings, Variable
 from saga_fg.arrays import FloatArray
-from saga_fg.association import gate
+from saga_fg.estimators.batch_graph import BatchSolver
 from saga_fg.estimators.graph_engine import RelinearisationSettings
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.graph import Additions, GraphView
 from saga_fg.landmarks.association import associate
 from saga_fg.landmarks.joint_estimate import JointEstimate
-from saga_fg.landmarks.merging import duplicates, possible_duplicates
+from saga_fg.landmarks.merging import duplicates
 from saga_fg.landmarks.protocol import LandmarkType, Observation
 from saga_fg.landmarks.providers import MeasuredMotion, Sightings, landmark_key, pose_key, sighting_factors
 from saga_fg.settings import require_between, setting
 
-_THRESHOLD = 0.05  # standard deviations that a variable moves before its factors are linearised anew
+_THRESHOLD = 1.0  # standard deviations that a variable moves before its factors are linearised anew
+_SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 
 @dataclass(frozen=True)
@@ -124,141 +120,135 @@ class LandmarkMapper:
     ) -> None:
         """world_T_pose: the first pose, (3, 3) in the plane or (4, 4); covariance: of its tangent."""
         self.settings = settings or MapperSettings()
+        self.estimate = JointEstimate(world_T_pose, covariance)
         self._smoother = IncrementalSmoother(lag=None, settings=RelinearisationSettings(_THRESHOLD))
-        self._sightings: list[Sighting] = []
-        self._kinds: dict[int, LandmarkType] = {}
-        self._bounds: dict[int, FloatArray] = {}  # covariances (d, d) of landmarks as known once
-        self._numbers = self._since = 0
-        self._normaliser = 0.0
-        self.move(world_T_pose, covariance)
-
-    @property
-    def pose(self) -> FloatArray:
-        """The newest pose (d + 1, d + 1)."""
-        return np.asarray(self._pose(self._smoother.graph().epoch).matrix())
+        self._poses = 1
+        self._waiting = [MeasuredMotion(world_T_pose, covariance)]
+        self._seen: dict[int, list[tuple[int, Observation]]] = {}  # since the last smoothing, by pose
+        self._smoothed: dict[int, dict[int, list[tuple[int, Observation]]]] = {}  # by the last pose of a smoothing
+        self._numbers = 0
+        self._since = 0
+        self._normaliser = _log_det(covariance)
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on to the next pose by odometry: a_T_b (d + 1, d + 1), covariance of its tangent."""
-        self._smoother.step(float(self._smoother.graph().epoch + 1), [MeasuredMotion(a_T_b, covariance)])
+        self.estimate.move(a_T_b, covariance)
+        self._waiting.append(MeasuredMotion(a_T_b, covariance, self.estimate.pose.matrix()))
         self._normaliser += _log_det(covariance)
+        self._poses += 1
 
     def observe(self, observations: Sequence[Observation]) -> list[int]:
         """Take in what is seen from the present pose.
 
         Returns the number of the landmark of each; what is not surely a known one begins a new one.
         """
-        if not observations:
-            return []
-        pairs = associate(self.estimate(self._in_question(observations)), observations, self.settings.gate)
+        pairs = associate(self.estimate, observations, self.settings.gate)
+        if pairs:
+            self.estimate.update(list(pairs.values()))
         taken: list[int] = []
-        start: dict[int, Any] = {}
         for row, observation in enumerate(observations):
-            if row not in pairs:
-                self._numbers += 1
-                self._kinds[self._numbers] = observation.kind
-                start[self._numbers] = observation.kind.initialise(self.pose, observation.value)
-            taken.append(pairs[row].landmark if row in pairs else self._numbers)
-        epoch = self._smoother.graph().epoch
-        self._smoother.extend([Sightings({epoch: list(zip(taken, observations, strict=True))}, start)])
-        for number in taken:
-            self._bounds[number] = self._smoother.covariance(landmark_key(number))
-        self._sightings += [Sighting(epoch, z, number) for z, number in zip(observations, taken, strict=True)]
+            if row in pairs:
+                taken.append(pairs[row].landmark)
+                continue
+            self._numbers += 1
+            self.estimate.append(self._numbers, observation)
+            taken.append(self._numbers)
+        self._seen.setdefault(self._poses - 1, []).extend(zip(taken, observations, strict=True))
         self._normaliser += sum(_log_det(observation.covariance) for observation in observations)
         self._since += len(observations)
         if self._since >= self.settings.smooth_every:
-            self.merge()
+            self.smooth()
         return taken
 
-    def estimate(self, numbers: Iterable[int] | None = None) -> JointEstimate:
-        """The newest pose and landmarks, by default all, with their joint covariance."""
-        chosen = sorted(self._kinds if numbers is None else numbers)
-        newest = pose_key(self._smoother.graph().epoch)
-        return self._gaussian(self._smoother.joint_covariance([newest, *map(landmark_key, chosen)]), chosen)
-
-    def merge(self) -> None:
-        """Merge landmarks that turn out to be one."""
+    def smooth(self) -> None:
+        """Smooth all poses and landmarks, and merge what turns out to be one."""
         self._since = 0
-        while merged := self._duplicates():
-            seen: dict[int, list[tuple[int, Observation]]] = {}
-            changed = {s.pose for s in self._sightings if s.landmark in merged}
-            self._sightings = [replace(s, landmark=merged.get(s.landmark, s.landmark)) for s in self._sightings]
-            for s in self._sightings:
-                if s.pose in changed:
-                    seen.setdefault(s.pose, []).append((s.landmark, s.observation))
-            self._smoother.extend([_Merged(seen, [(n, self._kinds[n].variable) for n in merged])])
+        if self._waiting or self._seen:
+            last = self._poses - 1
+            chunk = {row: list(now) for row, now in self._smoothed.get(last, {}).items()}
+            for row, now in [*self._seen.items(), (last, [])]:
+                chunk.setdefault(row, []).extend(now)
+            sightings = Sightings(chunk, {n: self.estimate.state(n) for now in chunk.values() for n, _ in now})
+            first = self._poses - len(self._waiting)
+            if self._waiting:
+                self._smoother.steps([(float(first + k), [one, sightings]) for k, one in enumerate(self._waiting)])
+            else:
+                self._smoother.extend([sightings])
+            self._smoothed[last] = chunk
+            self._waiting, self._seen = [], {}
+            self._read()
+        while merged := duplicates(self.estimate, self.settings.merge, self._apart()):
+            changed = {
+                last: {row: [(merged.get(n, n), z) for n, z in now] for row, now in chunk.items()}
+                for last, chunk in self._smoothed.items()
+                if any(n in merged for now in chunk.values() for n, _ in now)
+            }
+            self._smoothed |= changed
+            self._smoother.extend([_Merged(changed, {n: self.estimate.kinds[n].variable for n in merged})])
             self._smoother.marginalise(map(landmark_key, merged))
             for number in merged:
-                del self._kinds[number], self._bounds[number]
+                del self.estimate.kinds[number]
+            self._read()
 
     def log_evidence(self) -> float:
-        """log p(z) of everything measured so far."""
-        self.merge()
-        solution = self._smoother.snapshot().solve()
+        """log p(z) of everything measured so far, smoothed."""
+        self.smooth()
+        solution = self._smoother.snapshot().solve(_SOLVER)
         half_log_det = float(solution.linear.eliminateMultifrontal().logDeterminant())
         free = sum(solution.values.dims().values())
-        expected = sum(float(np.log(kind.density)) for kind in self._kinds.values())
+        expected = sum(float(np.log(kind.density)) for kind in self.estimate.kinds.values())
         volume = 0.5 * free * float(np.log(2 * np.pi))
         return -solution.error - half_log_det + volume - 0.5 * self._normaliser + expected
 
     def map(self) -> LandmarkMap:
-        """Everything."""
-        self.merge()
-        seen = ((s.landmark, s.observation) for s in self._sightings)
-        landmarks = landmarks_of(seen, self._smoother.solution(), self.settings.confirm)
-        poses = np.stack([self._pose(epoch).matrix() for epoch in range(self._smoother.graph().epoch + 1)])
-        return LandmarkMap(poses, landmarks, list(self._sightings))
+        """Everything, smoothed."""
+        self.smooth()
+        solver = BatchSolver(graph=self._smoother.snapshot(), settings=_SOLVER)
+        sightings = list(self._sightings())
+        seen = ((s.landmark, s.observation) for s in sightings)
+        poses = np.stack([_pose(solver, row) for row in range(self._poses)])
+        return LandmarkMap(poses, landmarks_of(seen, solver.solve(), self.settings.confirm), sightings)
 
-    def _pose(self, epoch: int) -> Any:
-        return self._smoother.state(pose_key(epoch))
+    def _read(self) -> None:
+        """Make the Gaussian that of the graph."""
+        numbers = sorted(self.estimate.kinds)
+        keys = [pose_key(self._poses - 1), *map(landmark_key, numbers)]
+        landmarks = {n: (self.estimate.kinds[n], self._smoother.state(landmark_key(n))) for n in numbers}
+        P = self._smoother.joint_covariance(keys, rough=True)
+        self.estimate = JointEstimate(_pose(self._smoother, self._poses - 1), P, landmarks)
 
-    def _gaussian(self, covariance: FloatArray, numbers: Iterable[int]) -> JointEstimate:
-        landmarks = {n: (self._kinds[n], self._smoother.state(landmark_key(n))) for n in numbers}
-        return JointEstimate(self.pose, covariance, landmarks)
+    def _sightings(self) -> Iterator[Sighting]:
+        for chunk in self._smoothed.values():
+            for row, now in chunk.items():
+                for number, observation in now:
+                    yield Sighting(row, observation, number)
 
-    def _bound(self) -> JointEstimate:
-        """The newest pose and all landmarks with a covariance that is larger than theirs, in blocks."""
-        P = self._smoother.covariance(pose_key(self._smoother.graph().epoch))
-        numbers = sorted(self._kinds)
-        return self._gaussian(2 * block_diag(P, *(self._bounds[n] for n in numbers)), numbers)
-
-    def _in_question(self, observations: Sequence[Observation]) -> set[int]:
-        """The landmarks that any of the observations may be of."""
-        bound, found = self._bound(), set[int]()
-        for observation in observations:
-            kind = observation.kind
-            innovations = bound.innovations(observation, (n for n, other in self._kinds.items() if other == kind))
-            if innovations:
-                inside = bound.squared_distances(innovations)[0] < gate(self.settings.gate, kind.variable.dim)
-                found |= {innovations[k].landmark for k in np.flatnonzero(inside).tolist()}
-        return found
-
-    def _duplicates(self) -> dict[int, int]:
-        """Which landmark is to become which."""
-        seen: dict[int, set[int]] = {}
-        for sighting in self._sightings:
-            seen.setdefault(sighting.pose, set()).add(sighting.landmark)
-        apart = {(i, j) for together in seen.values() for i in together for j in together if i < j}
-        pairs = possible_duplicates(self._bound(), self.settings.merge, apart)
-        return (
-            duplicates(self.estimate({n for pair in pairs for n in pair}), self.settings.merge, apart) if pairs else {}
-        )
+    def _apart(self) -> set[tuple[int, int]]:
+        """Pairs of landmarks that were seen from one pose."""
+        together = ({n for n, _ in now} for chunk in self._smoothed.values() for now in chunk.values())
+        return {(i, j) for numbers in together for i in numbers for j in numbers if i < j}
 
 
 @dataclass(frozen=True, eq=False)
 class _Merged:
-    """What was seen, of landmarks under other numbers; the old ones are held where they are until they leave."""
+    """Sightings as `LandmarkMapper` keeps them, under new numbers; the old landmarks are held until they leave."""
 
-    seen: Mapping[int, Sequence[tuple[int, Observation]]]
-    old: Sequence[tuple[int, Variable]]
+    changed: Mapping[int, Mapping[int, Sequence[tuple[int, Observation]]]]
+    old: Mapping[int, Variable]
     name: str = Sightings.name
 
     def factors(self, view: GraphView) -> Additions:
         held = []
-        for number, variable in self.old:
+        for number, variable in self.old.items():
             key = landmark_key(number)
             off = partial(variable.local, view.state(key))
             held.append(ResidualFactor((key,), (variable,), off, np.eye(variable.dim), name="held"))
-        return Additions(factors=held, named={k: sighting_factors({k: now}) for k, now in self.seen.items()})
+        return Additions(factors=held, named={last: sighting_factors(chunk) for last, chunk in self.changed.items()})
+
+
+def _pose(solver: IncrementalSmoother | BatchSolver, row: int) -> FloatArray:
+    pose: Any = solver.state(pose_key(row))
+    return np.asarray(pose.matrix())
 
 
 def _log_det(covariance: FloatArray) -> float:

@@ -36,9 +36,11 @@ def duplicates(estimate: JointEstimate, probability: float, apart: Set[tuple[int
     probability: of the gate; apart: pairs (lower, higher) that were seen side by side.
     """
     merged: dict[int, int] = {}
-    possible = possible_duplicates(estimate, probability, apart)
-    for kind in dict.fromkeys(estimate.kinds[first] for first, _ in possible):
-        pairs = [pair for pair in possible if estimate.kinds[pair[0]] == kind]
+    for kind in dict.fromkeys(estimate.kinds.values()):
+        numbers = sorted(number for number, other in estimate.kinds.items() if other == kind)
+        pairs = _possible(estimate, list(combinations(numbers, 2)), probability, apart)
+        if not pairs:
+            continue
         delta, J_i, J_j = estimate.differences(pairs)
         covariance = estimate.joint_difference_covariance(pairs, J_i, J_j)
         chosen = _likeliest_set(pairs, delta, covariance, kind.density, probability)
@@ -46,20 +48,17 @@ def duplicates(estimate: JointEstimate, probability: float, apart: Set[tuple[int
     return merged
 
 
-def possible_duplicates(
-    estimate: JointEstimate, probability: float, apart: Set[tuple[int, int]]
+def _possible(
+    estimate: JointEstimate, every: list[tuple[int, int]], probability: float, apart: Set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Pairs of a kind that are inside the gate, each for itself."""
-    found = []
-    for kind in dict.fromkeys(estimate.kinds.values()):
-        numbers = sorted(number for number, other in estimate.kinds.items() if other == kind)
-        pairs = [pair for pair in combinations(numbers, 2) if pair not in apart]
-        if pairs:
-            delta, J_i, J_j = estimate.differences(pairs)
-            S = estimate.difference_covariances(pairs, J_i, J_j)
-            squared = (delta * np.linalg.solve(S, delta[:, :, None])[:, :, 0]).sum(axis=1)
-            found += [pairs[k] for k in np.flatnonzero(squared < gate(probability, delta.shape[1])).tolist()]
-    return found
+    """Pairs inside the gate, each for itself."""
+    pairs = [pair for pair in every if pair not in apart]
+    if not pairs:
+        return []
+    delta, J_i, J_j = estimate.differences(pairs)
+    S = estimate.difference_covariances(pairs, J_i, J_j)
+    squared = (delta * np.linalg.solve(S, delta[:, :, None])[:, :, 0]).sum(axis=1)
+    return [pairs[k] for k in np.flatnonzero(squared < gate(probability, delta.shape[1])).tolist()]
 
 
 def _likeliest_set(

@@ -79,7 +79,7 @@ class Observation:
 
 
 class LandmarkDetector(Protocol):
-    """What finds landmarks in the data of a moment: a frame, or the points (N, 3), m, of a scan."""
+    """Finds landmarks in the data of a moment: a frame, or the points (N, 3), m, of a scan in the scanner's frame."""
 
     def observations(self, seen: Frame | FloatArray) -> Sequence[Observation]:
-        """Return what is observed, in the coordinates that the data are in, from the pose of vehicle or sensor."""
+        """Return what is observed: from a frame in the vehicle's coordinates, from points in theirs."""
