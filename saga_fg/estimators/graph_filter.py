@@ -46,7 +46,7 @@ class GraphFilter:
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
-    lag        s; how long epochs stay in the graph, at least until providers have been asked at the next one
+    lag        s; how long epochs stay in the graph, at least until all providers have been asked at the next one
 
     What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
     stands still; where noise is so small that factors would lose digits, it is predicted in moments.
@@ -140,6 +140,8 @@ class GraphFilter:
         smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in standing], change)
         self._keys = keys
         self._beside += self._beside_now()
+        if not self.providers:  # nobody is to be asked for factors on the epoch before
+            smoother.forget(keys.values())
 
     def update(self, measurements: Measurements) -> float:
         require_kind("measurements", measurements, Measurements)
