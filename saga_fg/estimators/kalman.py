@@ -35,12 +35,15 @@ _DECOUPLE_EVERY = 10  # predictions between looks for components that have falle
 
 @dataclass(frozen=True, eq=False)
 class KalmanState:
-    """The filter as a value: its Gaussian, how many predictions it has made, the time, s, and what `asked` keeps."""
+    """The filter as a value: its Gaussian, how many predictions it has made, the time, s, and what `asked` keeps.
+
+    Without providers it keeps nothing, and the value is made of numbers alone.
+    """
 
     x: BlockGaussian
     predictions: int
     time: float
-    beside: Beside
+    beside: Beside | None
 
 
 class JointKalmanFilter:
@@ -151,10 +154,10 @@ class JointKalmanFilter:
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""
-        return KalmanState(self._state, self._predictions, self._time, self._beside)
+        return KalmanState(self._state, self._predictions, self._time, self._beside if self.providers else None)
 
     def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
         require_kind("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
-        self._beside = state.beside
+        self._beside = state.beside or Beside()
