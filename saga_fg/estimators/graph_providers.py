@@ -46,7 +46,7 @@ class Births:
 
 @dataclass(frozen=True, eq=False)
 class Interactions:
-    """Objects of the epoch before move by a transition over those that stay; nonlinear motion goes beside it."""
+    """Objects of the epoch before move by a transition over those that stay."""
 
     transition: Transition
     name: str = "interactions"
@@ -59,12 +59,15 @@ class Interactions:
         before = view.before(OBJECT)
         layout = Layout(nodes, transition.graph.dims)
         mean = np.concatenate([view.state(before[node].key) for node in nodes])
-        moved = transition.F_matrix @ mean + transition.b
+        motion = Motion(transition)
+        dynamics = motion.dynamics(layout, mean)
+        moved = dynamics.moved(mean) + dynamics.b
         states = np.split(moved, transition.offsets[1:-1])
         new = [NewVariable(OBJECT, n, x, label=before[n].label) for n, x in zip(nodes, states, strict=True)]
         now = {node: view.key(OBJECT, node) for node in nodes}
         earlier = {node: before[node].key for node in nodes}
-        return Additions(new, motion_factors(Motion(transition), layout, mean, earlier, now)[0])
+        native, nonlinear = motion_factors(motion, layout, mean, earlier, now)
+        return Additions(new, [*native, *nonlinear])
 
 
 @dataclass(frozen=True, eq=False)

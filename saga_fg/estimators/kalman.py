@@ -18,9 +18,10 @@ from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
 from saga_fg.estimators.layout import checked_prior
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.transition import Transition
 
@@ -57,7 +58,7 @@ class JointKalmanFilter:
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
 
     def predict(self, transition: Transition) -> None:
-        dynamics = Dynamics.of(transition, self._state.layout)
+        dynamics = Motion(transition).dynamics(self._state.layout, self._state.mean)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
         self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         self._predictions += 1

@@ -70,10 +70,10 @@ class JointTrackState:
         return tuple([types[k] for k in index.tolist()])
 
     def add(self, ids: IntArray, label: StrArray, now: Kinematics, delay: float = 0.0) -> None:
-        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1."""
+        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0."""
         for node_type, rows in self._by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
-            P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
+            P = np.tile(np.diag(node_type.initial_deviation**2), (len(rows), 1, 1))
             at_p = node_type.index(POSITION)
             mean[:, at_p], P[:, at_p[:, None], at_p] = now.position[rows], now.P[rows]
             if node_type.has(VELOCITY):

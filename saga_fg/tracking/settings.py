@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.errors import InputError
 from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
 from saga_fg.rigid_coupling import Attached
@@ -19,6 +19,7 @@ from saga_fg.road.lane_keeping import InLane
 from saga_fg.road.stopping import RedLight
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 from saga_fg.stability import require_stable
+from saga_fg.turning import Bicycle, CoordinatedTurn
 
 EstimatorName = Literal["kalman", "isam2", "fixed-lag"]
 AssociationName = Literal["hungarian", "greedy", "graph"]
@@ -28,7 +29,7 @@ AssociationName = Literal["hungarian", "greedy", "graph"]
 class ClassSettings:
     """How objects of one class move, are born, matched and given up."""
 
-    motion: ConstantVelocity | ConstantAcceleration | RandomWalk = settings_group(
+    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle = settings_group(
         lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
     )
     birth_speed: float = setting(5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s")
@@ -165,8 +166,8 @@ class TrackerSettings:
         default_factory=lambda: {DEFAULT: ClassSettings()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    edges: tuple[Following | Neighbours | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = settings_group(
-        lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
+    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = (
+        settings_group(lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects")
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (),
