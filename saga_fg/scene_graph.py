@@ -12,8 +12,9 @@ Only nodes are estimated (Sani et al., SAGA-KF, ICPR 2024), edges are inputs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -65,6 +66,26 @@ class Edges:
         return len(self.target)
 
 
+class MatchedMotion(NamedTuple):
+    """Own motions x' = F x + b + q, q ~ N(0, Q), of n nodes over an interval: F, Q (n, d, d), b (n, d)."""
+
+    F: FloatArray
+    b: FloatArray
+    Q: FloatArray
+
+
+class ModeRecord(Protocol):
+    """Mixtures of motion of some nodes at the start of an interval; see `saga_fg.modes.ModeTable`."""
+
+    @property
+    def ids(self) -> IntArray: ...
+
+    def select(self, rows: IntArray) -> ModeRecord: ...
+
+    def predicted(self, dt: float, scale: FloatArray) -> tuple[ModeRecord, MatchedMotion]:
+        """dt seconds later, and the motions that have the same moments; scale (n,) of the process noise."""
+
+
 @dataclass(frozen=True, eq=False)
 class NonlinearEdges:
     """E edges that accelerate their targets: dv_i/dt += rate tau a(x_i, x_j).
@@ -106,6 +127,7 @@ class SceneGraph:
     nonlinear  one or more groups of nonlinear edges, likewise
     diffusion_scale  (n,) > 0, factors on the diffusion of the nodes' own motion, 1 if not given: what an interaction
                      explains of a node's motion is noise no more
+    modes  of nodes whose own motion is a mixture, in place of that of their types
 
     Raises `InputError` for edges that name a row the graph has not, or triples whose sizes don't fit the nodes.
     """
@@ -115,6 +137,7 @@ class SceneGraph:
     edges: tuple[Edges, ...] = ()
     diffusion_scale: FloatArray = None  # type: ignore[assignment]  # an array from construction on
     nonlinear: tuple[NonlinearEdges, ...] = ()
+    modes: tuple[ModeRecord, ...] = ()
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
@@ -164,6 +187,19 @@ class SceneGraph:
         """The same nodes, moving on their own: the classical filter's graph."""
         return SceneGraph(self.nodes, self.types)
 
+    def after(self, dt: float) -> SceneGraph:
+        """The graph for the rest of an interval of which dt seconds have passed: the same edges, later modes."""
+        if not self.modes:
+            return self
+        scale = (self.diffusion_scale[self.rows(record.ids)] for record in self.modes)
+        later = (record.predicted(dt, s)[0] for record, s in zip(self.modes, scale, strict=True))
+        return replace(self, modes=tuple(later))
+
+    def rows(self, nodes: IntArray) -> IntArray:
+        """Rows of nodes that are in the graph."""
+        order = np.argsort(self.nodes)
+        return np.asarray(order[np.searchsorted(self.nodes, nodes, sorter=order)])
+
     def only(self, nodes: IntArray) -> SceneGraph:
         """The graph of those of its nodes that are among `nodes` (any ids), with the edges between them."""
         kept = np.flatnonzero(np.isin(self.nodes, nodes))
@@ -180,7 +216,8 @@ class SceneGraph:
             triple = (group.A_self[inside], group.A_other[inside], group.b[inside])
             groups.append(Edges(group.interaction, target, source, group.rate[inside], *triple))
         types = tuple(self.types[k] for k in kept.tolist())
-        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear))
+        modes = tuple(m.select(np.flatnonzero(np.isin(m.ids, nodes))) for m in self.modes)
+        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear), modes)
 
     @staticmethod
     def of(nodes: Sequence[int] | IntArray, node_type: NodeType, edges: Sequence[Edges] = ()) -> SceneGraph:

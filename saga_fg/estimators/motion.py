@@ -81,7 +81,7 @@ class Motion:
     def parts(self, dt: float) -> tuple[Motion, Motion]:
         """The first `dt` seconds of the interval and the rest, with the same edges."""
         graph = self.transition.graph
-        first, rest = discretise(graph, dt), discretise(graph, self.transition.dt - dt)
+        first, rest = discretise(graph, dt), discretise(graph.after(dt), self.transition.dt - dt)
         return Motion(first, self.nonlinear), Motion(rest, self.nonlinear)
 
     def dynamics(self, layout: Layout, mean: FloatArray) -> Dynamics:

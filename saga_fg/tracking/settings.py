@@ -11,6 +11,7 @@ from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
 from saga_fg.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.errors import InputError
+from saga_fg.modes import Mixture
 from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
 from saga_fg.rigid_coupling import Attached
 from saga_fg.road import RoadMap, SignalSettings
@@ -29,7 +30,7 @@ AssociationName = Literal["hungarian", "greedy", "graph"]
 class ClassSettings:
     """How objects of one class move, are born, matched and given up."""
 
-    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle = settings_group(
+    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
         lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
     )
     birth_speed: float = setting(5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s")
