@@ -3,7 +3,7 @@
 The sensor stands at s = (s_x, s_y) with heading phi and moves with velocity u; all are given in the frame of the state
 (world_T_sensor). With d = p - s, rho = |d| and the position p and velocity v of the state:
 
-    range and bearing    z = (rho, atan2(d_y, d_x) - phi)
+    range and bearing    z = (rho, atan2(d_y, d_x) - phi)       or one of them alone
     range rate           z = d . (v - u) / rho                     positive when the object recedes
     radar                z = (rho, bearing, range rate)
 
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors.errors import FactorError
-from factors.measurement import checked_components
+from factors.measurement import Part, checked_components
 from factors.validation import FloatArray, checked
 
 
@@ -64,6 +64,20 @@ class RangeBearing:
         J = np.zeros((*x.shape[:-1], 2, self.state_dim))
         _range_bearing_jacobian(J, _sight(x, self.position, self.sensor_pose), self.position)
         return J
+
+
+def range_only(
+    state_dim: int, position: tuple[int, int] = (0, 1), sensor_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Part:
+    """Return the model of a measured range (m); fields as in `RangeBearing`."""
+    return Part(RangeBearing(state_dim, position, sensor_pose), (0,), "range")
+
+
+def bearing_only(
+    state_dim: int, position: tuple[int, int] = (0, 1), sensor_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Part:
+    """Return the model of a measured bearing (rad); fields as in `RangeBearing`."""
+    return Part(RangeBearing(state_dim, position, sensor_pose), (1,), "bearing")
 
 
 @dataclass(frozen=True)

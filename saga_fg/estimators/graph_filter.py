@@ -19,6 +19,7 @@ from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.sighting import Observations
 from saga_fg.graph.keys import OBJECT, key_of
 from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -71,8 +72,8 @@ class GraphFilter:
         require_kind("transition", transition, Transition)
         self._changed().step(self.time + transition.dt, [Interactions(transition)])
 
-    def update(self, measurements: Measurements) -> None:
-        require_kind("measurements", measurements, Measurements)
+    def update(self, measurements: Measurements | Observations) -> None:
+        require_kind("measurements", measurements, Measurements, Observations)
         if len(measurements):
             self._layout.rows(measurements.nodes)
             self._changed().extend([LinearDetections(measurements)])

@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factors import gaussian_factors, prior_factors
+from factors import detection_factors, gaussian_factors, prior_factors
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.sighting import Observations
 from saga_fg.graph.keys import OBJECT
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
@@ -72,12 +73,14 @@ class Interactions:
 
 @dataclass(frozen=True, eq=False)
 class LinearDetections:
-    """Linear measurements of objects at this epoch."""
+    """Measurements of objects at this epoch."""
 
-    measurements: Measurements
+    measurements: Measurements | Observations
     name: str = "detections"
 
     def factors(self, view: GraphView) -> Additions:
         m = self.measurements
         keys = np.array([[view.key(OBJECT, node)] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
+        if isinstance(m, Observations):
+            return Additions(factors=[detection_factors(keys[:, 0], m.model, m.z, m.R)])
         return Additions(factors=gaussian_factors(keys, [m.H], m.z, m.R))
