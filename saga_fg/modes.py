@@ -236,13 +236,14 @@ class ModeTable:
         apart, dF = self.mean - mean[:, None], modes.F - near[:, None]
         step = np.einsum("nrij,nsj->nsri", dF, self.mean) + modes.c[:, None]  # of x' - near x, given s and r
         shift = np.einsum("nsr,nsri->ni", w, step)
-        cross = np.einsum("nsr,nrij,nsjk->nik", w, dF, self.P) + np.einsum("nsr,nsri,nsk->nik", w, step, apart)
+        P_of = np.einsum("nsr,nsij->nrij", w, self.P)
+        cross = (dF @ P_of).sum(axis=1) + np.einsum("nsri,nsk->nik", w[..., None] * step, apart)
         F = near + np.swapaxes(np.linalg.solve(P, np.swapaxes(cross, 1, 2)), 1, 2)
         b = shift - ((F - near) @ mean[..., None])[..., 0]
         dF = modes.F - F[:, None]
         e = np.einsum("nrij,nsj->nsri", dF, self.mean) + (modes.c - b[:, None])[:, None]
         Q = np.einsum("nr,nrij->nij", weight, modes.Q)
-        Q = Q + np.einsum("nsr,nrij,nsjk,nrlk->nil", w, dF, self.P, dF) + np.einsum("nsr,nsri,nsrj->nij", w, e, e)
+        Q = Q + (dF @ P_of @ np.swapaxes(dF, 2, 3)).sum(axis=1) + np.einsum("nsri,nsrj->nij", w[..., None] * e, e)
         return MatchedMotion(F, b, (Q + np.swapaxes(Q, 1, 2)) / 2)
 
 

@@ -263,11 +263,13 @@ class JointTrackState:
         return self._estimator
 
     def _by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
-        """Rows whose states mean the same, with a type of theirs; if `moving`, rows that also move the same."""
+        """Rows whose states mean the same, with a type of theirs; if `moving`, or not linear, that also move the same."""
         classes, index = distinct(label)
         types = [self.type_of(c) for c in classes]
         number: dict[object, int] = {}
-        kind = [number.setdefault(id(t) if moving else t.components, len(number)) for t in types]
+        apart = [moving or t.flow is not None or isinstance(t.motion, Mixture) for t in types]
+        names = [id(t) if own else t.components for own, t in zip(apart, types, strict=True)]
+        kind = [number.setdefault(name, len(number)) for name in names]
         if len(number) == 1:
             return [(types[0], np.arange(len(label)))]
         of_row = np.array(kind, dtype=np.int64)[index]

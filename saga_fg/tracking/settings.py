@@ -224,10 +224,12 @@ class TrackerSettings:
         if len(set(grouped)) < len(grouped) or not all(len(group) > 1 for group in self.class_groups):
             raise InputError(f"class_groups: expected groups of two classes and more, none in two, got {grouped}")
         for group in self.class_groups:
-            kinds = {type(class_settings(self.classes, ClassSettings, label).motion).__name__ for label in group}
-            if len(kinds) > 1:
+            motions = {class_settings(self.classes, ClassSettings, label).motion for label in group}
+            kinds = {type(motion).__name__ for motion in motions}
+            if len(kinds) > 1 or (len(motions) > 1 and kinds == {Mixture.__name__}):
                 raise InputError(
-                    f"class_groups: expected one kind of motion in {', '.join(group)}, got {sorted(kinds)}"
+                    f"class_groups: expected one kind of motion in {', '.join(group)}, or one mixture, "
+                    f"got {sorted(kinds)}"
                 )
 
 
