@@ -107,10 +107,13 @@ class ResidualFactors:
         ]
 
     def _single_residual(self, k: int, *states: FloatArray) -> FloatArray:
-        return np.asarray(self._residuals(self._filled([x[None] for x in states], np.array([k])))[k])
+        return np.asarray(self._residuals(self._filled(self._stacks(states), np.array([k])))[k])
 
     def _single_jacobians(self, k: int, *states: FloatArray) -> list[FloatArray]:
-        return [J[k] for J in self._jacobians(self._filled([x[None] for x in states], np.array([k])))]
+        return [J[k] for J in self._jacobians(self._filled(self._stacks(states), np.array([k])))]
+
+    def _stacks(self, states: Sequence[Any]) -> list[FloatArray]:
+        return [variable.array(x)[None] for variable, x in zip(self._variables, states, strict=True)]
 
     def states(self, values: gtsam.Values, chosen: IntArray | None = None) -> list[FloatArray]:
         """Return the states of each column, (N, d_k) or (N, 3, 3) or (N, 4, 4); of the rows `chosen` (n,) if given."""
