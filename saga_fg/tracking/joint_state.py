@@ -263,7 +263,10 @@ class JointTrackState:
         return self._estimator
 
     def _by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
-        """Rows whose states mean the same, with a type of theirs; if `moving`, or not linear, that also move the same."""
+        """Rows whose states mean the same, with a type of theirs; if `moving`, rows that also move the same.
+
+        What moves nonlinearly, or by a mixture, always stays apart.
+        """
         classes, index = distinct(label)
         types = [self.type_of(c) for c in classes]
         number: dict[object, int] = {}
