@@ -17,14 +17,14 @@ one linear motion with the same means, covariances and cross-covariance of x and
 They are recorded with the interval (`saga_fg.scene_graph`). Before and after it the node's Gaussians follow the joint
 state, which has heard of its neighbours too, by the one affine map that gives their mixture its marginal's moments.
 
-A measurement says more than z: which mode it was. So the joint state is told the measurement, of the whole state of the
-node, that takes the moments (m, P) of its mixture before to those after, (m', P'): with P = L L^T, and s, u the
-eigenvalues and vectors of L^-1 P' L^-T,
+A measurement is evidence of the mode as well. So the joint state is updated by an equivalent measurement, of the whole
+state of the node, which takes the moments (m, P) of its mixture before to those after, (m', P'): with P = L L^T, and
+s, u the eigenvalues and vectors of L^-1 P' L^-T,
 
     u^T L^-1 (x - m) = y / (1 - s) + v,     v ~ N(0, s / (1 - s)),     y = u^T L^-1 (m' - m)
 
-Where two modes have become equally likely a variance has grown, s > 1, which no measurement says: the shift L u y of
-the mean and the spread (s - 1) L u u^T L^T then go into b and Q of the next interval. A node without edges is thus
+Where two modes have become equally likely a variance has grown, s > 1, which no measurement does: the shift L u y of the
+mean and the spread (s - 1) L u u^T L^T then go into b and Q of the next interval. A node without edges is thus
 predicted as by the filter of Blom and Bar-Shalom, exactly; and given what is recorded everything is Gaussian, and all
 estimators agree.
 """
@@ -203,8 +203,8 @@ class ModeTable:
     ) -> tuple[ModeTable, FloatArray, FloatArray]:
         """With a measurement each of distinct nodes: z (k, m), H (k, m, d), R (k, m, m).
 
-        Returns z (k, d) and H (k, d, d) of what a joint state is told in its place, with R = 1; a row of zeros says
-        nothing.
+        Returns z (k, d) and H (k, d, d) of the equivalent measurements for a joint state, whose R is the identity; rows
+        of zeros carry no information.
         """
         rows = np.array([self._row[i] for i in ids.tolist()], dtype=np.int64)
         H, P, m = H[:, None], self.P[rows], self.mean[rows]
@@ -218,12 +218,12 @@ class ModeTable:
         m = m + (np.swapaxes(gain_T, -1, -2) @ innovation[..., None])[..., 0]
         P = P - np.swapaxes(gain_T, -1, -2) @ S @ gain_T
         before, after = (self.moments[0][rows], self.moments[1][rows]), _moments(weight, m, P)
-        said, directions, shift, spread = _equivalent(*before, *after)
+        equivalent, directions, shift, spread = _equivalent(*before, *after)
         columns = [column.copy() for column in self._columns]
         changed = weight, m, P, self.shift[rows] + shift, self.spread[rows] + spread
         for column, values in zip(columns[1:], changed, strict=True):
             column[rows] = values
-        return ModeTable(self.mixture, *columns), said, directions
+        return ModeTable(self.mixture, *columns), equivalent, directions
 
     @cached_property
     def _row(self) -> dict[int, int]:
@@ -280,13 +280,13 @@ def _equivalent(
     share, U = np.linalg.eigh(W @ later_P @ np.swapaxes(W, 1, 2))
     directions, axes = np.swapaxes(U, 1, 2) @ W, L @ U
     y = (directions @ (later - mean)[..., None])[..., 0]
-    told = share < 1 - _LEAST
-    rest = np.where(told, 1 - share, 1.0)
-    scale = np.where(told, np.sqrt(rest / np.where(told, share, 1.0)), 0.0)
+    informative = share < 1 - _LEAST
+    rest = np.where(informative, 1 - share, 1.0)
+    scale = np.where(informative, np.sqrt(rest / np.where(informative, share, 1.0)), 0.0)
     z = scale * (y / rest + (directions @ mean[..., None])[..., 0])
-    untold = np.where(told, 0.0, y), np.where(told, 0.0, np.maximum(share - 1, 0.0))
-    spread = (axes * untold[1][:, None]) @ np.swapaxes(axes, 1, 2)
-    return z, scale[..., None] * directions, (axes @ untold[0][..., None])[..., 0], spread
+    left = np.where(informative, 0.0, y), np.where(informative, 0.0, np.maximum(share - 1, 0.0))
+    spread = (axes * left[1][:, None]) @ np.swapaxes(axes, 1, 2)
+    return z, scale[..., None] * directions, (axes @ left[0][..., None])[..., 0], spread
 
 
 def _moments(weight: FloatArray, mean: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
