@@ -23,8 +23,8 @@ s, u the eigenvalues and vectors of L^-1 P' L^-T,
 
     u^T L^-1 (x - m) = y / (1 - s) + v,     v ~ N(0, s / (1 - s)),     y = u^T L^-1 (m' - m)
 
-Where two modes have become equally likely a variance has grown, s > 1, which no measurement does: the shift L u y of the
-mean and the spread (s - 1) L u u^T L^T then go into b and Q of the next interval. A node without edges is thus
+Where two modes have become equally likely a variance has grown, s > 1, which no measurement does: the shift L u y of
+the mean and the spread (s - 1) L u u^T L^T then go into b and Q of the next interval. A node without edges is thus
 predicted as by the filter of Blom and Bar-Shalom, exactly; and given what is recorded everything is Gaussian, and all
 estimators agree.
 """
