@@ -30,7 +30,7 @@ from factors.odometry import ERROR_DIM, odometry_factors
 from factors.on_plane import on_plane_factor
 from factors.plane import OrientedPlane, plane, plane_factor
 from factors.point import point_factors
-from factors.polar import Radar, RangeBearing, RangeRate, bearing_only, range_only
+from factors.polar import Bearing, Radar, Range, RangeBearing, RangeRate
 from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
 from factors.relative_detection import relative_detection_factors
@@ -42,6 +42,7 @@ from factors.variables import PlanarPose, SpatialPose, Variable, Vector
 
 __all__ = [
     "ERROR_DIM",
+    "Bearing",
     "Camera",
     "Components",
     "FactorError",
@@ -54,6 +55,7 @@ __all__ = [
     "PlanarPose",
     "Pose",
     "Radar",
+    "Range",
     "RangeBearing",
     "RangeRate",
     "ResidualFactor",
@@ -66,7 +68,6 @@ __all__ = [
     "Variable",
     "Vector",
     "attitude_factor",
-    "bearing_only",
     "bearing_range_factor",
     "between_factor",
     "box",
@@ -104,7 +105,6 @@ __all__ = [
     "prior_factor",
     "prior_factors",
     "range_factor",
-    "range_only",
     "relative_detection_factors",
     "relative_range_bearing_factors",
     "solve",

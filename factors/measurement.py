@@ -78,40 +78,6 @@ class Components:
         return np.broadcast_to(H, (*x.shape[:-1], *H.shape))
 
 
-@dataclass(frozen=True)
-class Part:
-    """Some of the numbers of another model, in the order given."""
-
-    model: MeasurementModel
-    rows: tuple[int, ...]
-    name: str = "part"
-
-    def __post_init__(self) -> None:
-        checked_components(self.name, self.rows, self.model.dim)
-
-    @property
-    def state_dim(self) -> int:
-        return self.model.state_dim
-
-    @property
-    def dim(self) -> int:
-        return len(self.rows)
-
-    @property
-    def angles(self) -> tuple[int, ...]:
-        return tuple(k for k, row in enumerate(self.rows) if row in self.model.angles)
-
-    @property
-    def linear(self) -> bool:
-        return self.model.linear
-
-    def predict(self, x: FloatArray) -> FloatArray:
-        return self.model.predict(x)[..., list(self.rows)]
-
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        return self.model.jacobian(x)[..., list(self.rows), :]
-
-
 def position(state_dim: int, position: tuple[int, ...] = (0, 1)) -> Components:
     """Return the model of a measured position (m); `position`: where it sits in the state."""
     return Components(state_dim, tuple(position), name="position")

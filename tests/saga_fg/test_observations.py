@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_nonlinear_motion import BACK_ENDS
 
-from factors import Camera, PixelBearing, Radar, RangeBearing, RangeRate, bearing_only, range_only
+from factors import Bearing, Camera, PixelBearing, Radar, Range, RangeBearing, RangeRate
 from saga_fg import ConstantVelocity, NodeType, SagaError, SceneGraph
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import BatchSmoother, GraphFilter, JointKalmanFilter, Measurements, Observations
@@ -12,8 +12,8 @@ from saga_fg.estimators import BatchSmoother, GraphFilter, JointKalmanFilter, Me
 POSE = (2.0, -3.0, 3.0)
 LOOKS = np.array([[0, 0, -1, 30.0], [1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # against x
 MODELS = {
-    "range": range_only(4, sensor_pose=POSE),
-    "bearing": bearing_only(4, sensor_pose=POSE),
+    "range": Range(4, sensor_pose=POSE),
+    "bearing": Bearing(4, sensor_pose=POSE),
     "range and bearing": RangeBearing(4, sensor_pose=POSE),
     "range rate": RangeRate(4, sensor_pose=POSE),
     "radar": Radar(4, sensor_pose=POSE),
