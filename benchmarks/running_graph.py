@@ -17,7 +17,7 @@ import numpy as np
 from factors import gaussian_factors, prior_factors
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import OBJECT, Additions, GraphView, NewVariable
-from saga_fg.nonlinear_interactions import Following
+from saga_fg.nonlinear_interactions import SmoothDriver, interaction
 
 DT, FRAMES, SKIPPED = 0.1, 30, 5
 F = np.eye(4) + DT * np.eye(4, k=2)
@@ -48,7 +48,7 @@ class Vehicles:
             return Additions(self._new(self.start), [*prior_factors(now, self.start, 0.5 * np.eye(4)), *seen])
         before = view.before(OBJECT)
         last = np.array([before[i].key for i in self.ids.tolist()], dtype=np.uint64)
-        x, law = np.stack([view.state(key) for key in last.tolist()]), Following()
+        x, law = np.stack([view.state(key) for key in last.tolist()]), interaction(SmoothDriver())
         first, behind = np.flatnonzero(self.ids % self.row == 0), np.flatnonzero(self.ids % self.row)
         eye, zero = np.eye(4), np.zeros(4)
         alone = [np.tile(M, (len(first), 1, 1)) for M in (eye, -F)]
@@ -60,7 +60,7 @@ class Vehicles:
             moved += gaussian_factors(keys, led, np.tile(zero, (len(behind), 1)), Q)
             return Additions(self._new(start), [*moved, *seen])
         start[behind] = law.predict(x[behind], [x[behind - 1]], DT)
-        following = law.interaction.factors(keys[:, 0], keys[:, 1], keys[:, 2:], 4, DT, Q)
+        following = law.factors(keys[:, 0], keys[:, 1], keys[:, 2:], 4, DT, Q)
         return Additions(self._new(start), [*moved, following, *seen])
 
     def _new(self, states: np.ndarray) -> list[NewVariable]:

@@ -8,6 +8,7 @@ Linear families give native `gtsam.JacobianFactor`s, which no solver needs Pytho
 from factors.absolute import attitude_factor, position_factor
 from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
 from factors.calibrated_range import calibrated_range_factors
+from factors.camera import Camera, PixelBearing
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.edge import HesseLine, edge_factors
 from factors.errors import FactorError, SingularSystemError
@@ -29,7 +30,7 @@ from factors.odometry import ERROR_DIM, odometry_factors
 from factors.on_plane import on_plane_factor
 from factors.plane import OrientedPlane, plane, plane_factor
 from factors.point import point_factors
-from factors.polar import Radar, RangeBearing, RangeRate
+from factors.polar import Bearing, Radar, Range, RangeBearing, RangeRate
 from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
 from factors.relative_detection import relative_detection_factors
@@ -41,6 +42,8 @@ from factors.variables import ImuBias, PlanarPose, SpatialPose, Variable, Vector
 
 __all__ = [
     "ERROR_DIM",
+    "Bearing",
+    "Camera",
     "Components",
     "FactorError",
     "HesseLine",
@@ -49,9 +52,11 @@ __all__ = [
     "MeasurementModel",
     "NonlinearInteraction",
     "OrientedPlane",
+    "PixelBearing",
     "PlanarPose",
     "Pose",
     "Radar",
+    "Range",
     "RangeBearing",
     "RangeRate",
     "ResidualFactor",

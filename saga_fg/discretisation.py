@@ -88,7 +88,39 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         for edges in graph.edges:
             if edges.A_other.shape[1] == d and edges.rate.any():
                 F.append(_coupling_blocks(edges, dt, M, phi, position, kinds, kind))
+    if graph.modes:
+        _move_by_modes(graph, dt, F, b, Q, offsets)
     return Transition(graph, dt, _merged(F, len(graph)), b, tuple(Q))
+
+
+def _move_by_modes(
+    graph: SceneGraph, dt: float, F: list[Blocks], b: FloatArray, Q: list[Blocks], offsets: IntArray
+) -> None:
+    """Put the recorded motions of mixtures in place of those of their types: G_i = F_ii exp(-A_i dt) acts on them."""
+    for record in graph.modes:
+        rows = graph.rows(record.ids)
+        if len(rows) == 0:
+            continue
+        own = record.predicted(dt, graph.diffusion_scale[rows])[1]
+        back = scipy.linalg.expm(-graph.types[rows[0]].generator * dt)
+        place = np.full(len(graph), -1)
+        place[rows] = np.arange(len(rows))
+        G = np.empty_like(own.F)
+        for number, blocks in enumerate(F):
+            mine = np.flatnonzero((place[blocks.target] >= 0) & (blocks.target == blocks.source))
+            if len(mine):
+                at, values = place[blocks.target[mine]], blocks.values.copy()
+                G[at] = values[mine] @ back
+                values[mine] = G[at] @ own.F[at]
+                F[number] = Blocks(blocks.target, blocks.source, values)
+        b[offsets[rows][:, None] + np.arange(own.b.shape[1])] += (G @ own.b[:, :, None])[:, :, 0]
+        for number, blocks in enumerate(Q):
+            mine = np.flatnonzero(place[blocks.target] >= 0)
+            if len(mine):
+                at, values = place[blocks.target[mine]], blocks.values.copy()
+                noise = G[at] @ own.Q[at] @ np.swapaxes(G[at], 1, 2)
+                values[mine] = (noise + np.swapaxes(noise, 1, 2)) / 2
+                Q[number] = Blocks(blocks.target, blocks.source, values)
 
 
 def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -22,8 +22,9 @@ from saga_fg.errors import InputError
 from saga_fg.intelligent_driver import IntelligentDriver
 from saga_fg.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.node import distinct_types
+from saga_fg.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.road.cone_geometry import ConeGeometry, anticipated
-from saga_fg.scene_graph import Edges, SceneGraph
+from saga_fg.scene_graph import Edges, NonlinearEdges, SceneGraph
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
@@ -43,7 +44,7 @@ class EdgeRule(Protocol):
     """Chooses edges from the estimates at the start of an interval."""
 
     @property
-    def interaction(self) -> Interaction: ...
+    def interaction(self) -> Interaction | AccelerationLaw: ...
 
     def pairs(self, nodes: NodeTable) -> Pairs: ...
 
@@ -101,7 +102,7 @@ class Neighbours:
 class Following:
     """A vehicle is led by the nearest vehicle ahead in its lane, as far as headings tell the lane."""
 
-    interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver = settings_group(
+    interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
     rate: float = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
@@ -158,6 +159,32 @@ class Following:
         return Pairs(target[nearest], source[nearest], rate[nearest])
 
 
+@dataclass(frozen=True)
+class Repulsion:
+    """Pedestrians keep away from each other; with `sources: [wall]`, from the walls of the road map."""
+
+    interaction: SocialForce = settings_group(SocialForce, "how strongly")
+    rate: float = setting(1.0, "1/s; 1: with all of the force")
+    max_distance: float = setting(4.0, "nobody further away counts, m")
+    max_degree: int = setting(4, "sources kept per object, the nearest first")
+    classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
+    sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_distance", "max_degree")
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        pushed, pushing = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.classes, self.sources))
+        target, source = np.repeat(pushed, len(pushing)), np.tile(pushing, len(pushed))
+        target, source = target[target != source], source[target != source]
+        given = self.interaction.given(nodes, target, source)
+        apart, _ = nearest_offset(nodes.position[target] - nodes.position[source], given)
+        distance = np.hypot(*apart.T)
+        near = np.flatnonzero(distance <= self.max_distance)
+        closest = strongest(Pairs(target[near], source[near], -distance[near]), len(nodes), self.max_degree)
+        return closest._replace(rate=np.full(len(closest.rate), self.rate))
+
+
 def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
     """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
     return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))
@@ -178,6 +205,7 @@ def build_graph(
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
     """
     groups: list[Edges] = []
+    nonlinear: list[NonlinearEdges] = []
     total_rate = np.zeros(len(nodes))
     if len(nodes) > 1:
         kinds, kind = distinct_types(nodes.types)
@@ -191,14 +219,18 @@ def build_graph(
             for k in np.flatnonzero(np.bincount(pair_kind)):
                 mine = pair_kind == k
                 t, s = target[mine], source[mine]
-                if rule.interaction.applies(nodes.types[t[0]], nodes.types[s[0]]):
-                    name = type(rule.interaction).__name__
-                    groups.append(Edges(name, t, s, rate[mine], *rule.interaction.triples(nodes, t, s)))
-                    np.add.at(total_rate, t, rate[mine])
+                law = rule.interaction
+                if not law.applies(nodes.types[t[0]], nodes.types[s[0]]):
+                    continue
+                if isinstance(law, AccelerationLaw):
+                    nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))
+                else:
+                    groups.append(Edges(type(law).__name__, t, s, rate[mine], *law.triples(nodes, t, s)))
+                np.add.at(total_rate, t, rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale
-    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale)
+    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale, tuple(nonlinear))
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:

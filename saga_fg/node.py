@@ -2,6 +2,9 @@
 
     dx/dt = A x + w,    E[w(t) w(s)^T] = Qc delta(t - s)
 
+A nonlinear motion has a `flow` besides, its state dt seconds later without noise and interactions (see
+`saga_fg.turning`); A is then what of it is linear everywhere, along which noise and interactions are discretised.
+
 A type names its state components ("x", "vx", ...), so that sensors and interactions find what they need by name and
 nodes of different types, with states of different size, live in one graph.
 """
@@ -12,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +36,19 @@ class Motion(Protocol):
 
     @property
     def diffusion(self) -> FloatArray: ...
+
+
+@runtime_checkable
+class NonlinearMotion(Motion, Protocol):
+    """Own motion x(t + dt) = flow(x(t), dt) + q; both functions take stacks of states (..., d)."""
+
+    @property
+    def initial_deviation(self) -> FloatArray:
+        """(d,) standard deviations of components that nothing is known of."""
+
+    def flow(self, x: FloatArray, dt: float) -> FloatArray: ...
+
+    def flow_jacobian(self, x: FloatArray, dt: float) -> FloatArray: ...
 
 
 def _planar(one_axis: ArrayLike) -> FloatArray:
@@ -151,6 +167,17 @@ class NodeType:
     def diffusion(self) -> FloatArray:
         """Qc (d, d), per s."""
         return checked("diffusion", self.motion.diffusion, (self.dim, self.dim))
+
+    @cached_property
+    def flow(self) -> NonlinearMotion | None:
+        """The motion where it is nonlinear."""
+        return self.motion if isinstance(self.motion, NonlinearMotion) else None
+
+    @cached_property
+    def initial_deviation(self) -> FloatArray:
+        """(d,) of components that nothing is known of: 1 unless the motion says otherwise."""
+        given = getattr(self.motion, "initial_deviation", np.ones(self.dim))
+        return checked("initial_deviation", given, (self.dim,))
 
     @cached_property
     def nilpotency(self) -> int | None:

@@ -3,7 +3,8 @@
     dx_i/dt = A_i x_i + sum_j rate_ij ( A_self x_i + A_other x_j + b ) + noise
 
 An edge carries its rate (1/s, never per step) and the triple (A_self, A_other, b) of its interaction function, already
-evaluated at the estimate at the start of an interval. A graph is therefore a complete, frozen record of the
+evaluated at the estimate at the start of an interval; that of a nonlinear edge is a law of acceleration, evaluated
+where an estimator asks. A graph is therefore a complete, frozen record of the
 dynamics of an interval: it can be discretised over any dt, and again over parts of it when a measurement comes late.
 Only nodes are estimated (Sani et al., SAGA-KF, ICPR 2024), edges are inputs.
 """
@@ -11,14 +12,16 @@ Only nodes are estimated (Sani et al., SAGA-KF, ICPR 2024), edges are inputs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_ids, checked_rows
 from saga_fg.errors import InputError
 from saga_fg.node import NodeType
+from saga_fg.nonlinear_interactions import AccelerationLaw
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,57 @@ class Edges:
         return len(self.target)
 
 
+class MatchedMotion(NamedTuple):
+    """Own motions x' = F x + b + q, q ~ N(0, Q), of n nodes over an interval: F, Q (n, d, d), b (n, d)."""
+
+    F: FloatArray
+    b: FloatArray
+    Q: FloatArray
+
+
+class ModeRecord(Protocol):
+    """Mixtures of motion of some nodes at the start of an interval; see `saga_fg.modes.ModeTable`."""
+
+    @property
+    def ids(self) -> IntArray: ...
+
+    def select(self, rows: IntArray) -> ModeRecord: ...
+
+    def predicted(self, dt: float, scale: FloatArray) -> tuple[ModeRecord, MatchedMotion]:
+        """dt seconds later, and the motions that have the same moments; scale (n,) of the process noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearEdges:
+    """E edges that accelerate their targets: dv_i/dt += rate tau a(x_i, x_j).
+
+    law     the acceleration, and tau
+    target  (E,) rows of the influenced nodes in the graph
+    source  (E,) rows of the influencing nodes
+    rate    (E,) >= 0, 1/s
+    given   (E, ...) what the law takes besides the states
+    """
+
+    law: AccelerationLaw
+    target: IntArray
+    source: IntArray
+    rate: FloatArray
+    given: FloatArray
+
+    def __post_init__(self) -> None:
+        rate = checked(f"edges of {self.interaction}: rate", self.rate, (len(self.target),))
+        if (rate < 0).any() or (self.target == self.source).any() or len(self.given) != len(self.target):
+            raise InputError(f"edges of {self.interaction}: expected rates >= 0 and no edge of a node to itself")
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    @property
+    def interaction(self) -> str:
+        """Name of the law."""
+        return type(self.law).__name__
+
+
 @dataclass(frozen=True, eq=False)
 class SceneGraph:
     """Nodes and edges at the start of an interval.
@@ -70,8 +124,10 @@ class SceneGraph:
     nodes  (n,) ids, unique
     types  n node types
     edges  one or more groups of edges, by rows of `nodes`
+    nonlinear  one or more groups of nonlinear edges, likewise
     diffusion_scale  (n,) > 0, factors on the diffusion of the nodes' own motion, 1 if not given: what an interaction
                      explains of a node's motion is noise no more
+    modes  of nodes whose own motion is a mixture, in place of that of their types
 
     Raises `InputError` for edges that name a row the graph has not, or triples whose sizes don't fit the nodes.
     """
@@ -80,6 +136,8 @@ class SceneGraph:
     types: tuple[NodeType, ...]
     edges: tuple[Edges, ...] = ()
     diffusion_scale: FloatArray = None  # type: ignore[assignment]  # an array from construction on
+    nonlinear: tuple[NonlinearEdges, ...] = ()
+    modes: tuple[ModeRecord, ...] = ()
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
@@ -94,17 +152,15 @@ class SceneGraph:
                 f"diffusion_scale[{int(np.argmax(scale <= 0))}]: expected a factor > 0, got {scale.min():g}"
             )
         object.__setattr__(self, "diffusion_scale", scale)
-        for group in self.edges:
-            for name, rows, dim in (
-                ("target", group.target, group.A_other.shape[1]),
-                ("source", group.source, group.A_other.shape[2]),
-            ):
+        for group in self._groups:
+            d_i, d_j = group.A_other.shape[1:] if isinstance(group, Edges) else (None, None)
+            for name, rows, dim in (("target", group.target, d_i), ("source", group.source, d_j)):
                 if len(rows) == 0:
                     continue
                 if rows.min() < 0 or rows.max() >= len(nodes):
                     bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
                     raise InputError(f"edges of {group.interaction}: {name}: row {bad} is outside {len(nodes)} nodes")
-                if (self.dims[rows] != dim).any():
+                if dim is not None and (self.dims[rows] != dim).any():
                     bad = int(rows[np.argmax(self.dims[rows] != dim)])
                     raise InputError(
                         f"edges of {group.interaction}: {name}: node {int(nodes[bad])} has {self.dims[bad]} "
@@ -120,26 +176,48 @@ class SceneGraph:
         return np.array([t.dim for t in self.types], dtype=np.int64)
 
     @property
+    def _groups(self) -> tuple[Edges | NonlinearEdges, ...]:
+        return *self.edges, *self.nonlinear
+
+    @property
     def edge_count(self) -> int:
-        return sum(len(group) for group in self.edges)
+        return sum(len(group) for group in self._groups)
 
     def without_edges(self) -> SceneGraph:
         """The same nodes, moving on their own: the classical filter's graph."""
         return SceneGraph(self.nodes, self.types)
+
+    def after(self, dt: float) -> SceneGraph:
+        """The graph for the rest of an interval of which dt seconds have passed: the same edges, later modes."""
+        if not self.modes:
+            return self
+        scale = (self.diffusion_scale[self.rows(record.ids)] for record in self.modes)
+        later = (record.predicted(dt, s)[0] for record, s in zip(self.modes, scale, strict=True))
+        return replace(self, modes=tuple(later))
+
+    def rows(self, nodes: IntArray) -> IntArray:
+        """Rows of nodes that are in the graph."""
+        order = np.argsort(self.nodes)
+        return np.asarray(order[np.searchsorted(self.nodes, nodes, sorter=order)])
 
     def only(self, nodes: IntArray) -> SceneGraph:
         """The graph of those of its nodes that are among `nodes` (any ids), with the edges between them."""
         kept = np.flatnonzero(np.isin(self.nodes, nodes))
         row = np.full(len(self), -1, dtype=np.int64)
         row[kept] = np.arange(len(kept))
-        groups = []
-        for group in self.edges:
+        groups: list[Edges] = []
+        nonlinear: list[NonlinearEdges] = []
+        for group in self._groups:
             inside = np.flatnonzero((row[group.target] >= 0) & (row[group.source] >= 0))
             target, source = row[group.target[inside]], row[group.source[inside]]
+            if isinstance(group, NonlinearEdges):
+                nonlinear.append(NonlinearEdges(group.law, target, source, group.rate[inside], group.given[inside]))
+                continue
             triple = (group.A_self[inside], group.A_other[inside], group.b[inside])
             groups.append(Edges(group.interaction, target, source, group.rate[inside], *triple))
         types = tuple(self.types[k] for k in kept.tolist())
-        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept])
+        modes = tuple(m.select(np.flatnonzero(np.isin(m.ids, nodes))) for m in self.modes)
+        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear), modes)
 
     @staticmethod
     def of(nodes: Sequence[int] | IntArray, node_type: NodeType, edges: Sequence[Edges] = ()) -> SceneGraph:

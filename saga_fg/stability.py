@@ -10,7 +10,8 @@ Each rule is tried alone, on pairs in several directions to each other, and toge
 object, on a pair that heads the same way. (Where headings differ, one rule that speaks of speeds along headings and one
 of velocities may feed each other while headings are held; but the next interval sees these follow the velocities.)
 
-Rules by which lanes, lines or cones act on vehicles are not tried: what stands cannot be driven to run away.
+Rules by which lanes, lines or cones act on vehicles are not tried: what stands cannot be driven to run away. Nor are
+laws of acceleration, which are bounded in themselves.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from saga_fg.edge_rules import EdgeRule, Following, Neighbours
 from saga_fg.errors import InputError
 from saga_fg.interactions import NodeTable, unit
 from saga_fg.node import ConstantVelocity, NodeType
+from saga_fg.nonlinear_interactions import AccelerationLaw
 from saga_fg.rigid_coupling import Attached
 from saga_fg.scene_graph import Edges, SceneGraph
 
@@ -118,8 +120,8 @@ def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[Sce
         target, source = (first, second) if led else (np.concatenate([first, second]), np.concatenate([second, first]))
         scale = math.inf if isinstance(rule, EdgeNetwork) else rule.heading_scale
         rate = highest_rate(rule) * np.exp(-((turns[target // 2] / scale) ** 2) / 2)
-        if rule.interaction.applies(node_type, node_type):
+        law = rule.interaction
+        if not isinstance(law, AccelerationLaw) and law.applies(node_type, node_type):
             total += float(rate.max())
-            triples = rule.interaction.triples(nodes, target, source)
-            groups.append(Edges(type(rule.interaction).__name__, target, source, rate, *triples))
+            groups.append(Edges(type(law).__name__, target, source, rate, *law.triples(nodes, target, source)))
     return SceneGraph.of(nodes.id, node_type, groups), total

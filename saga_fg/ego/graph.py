@@ -33,6 +33,7 @@ from factors import (
 from saga_fg.arrays import FloatArray
 from saga_fg.ego.record import EgoMoment, motion_covariances
 from saga_fg.ego.settings import JointSettings
+from saga_fg.errors import InputError
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
@@ -114,7 +115,10 @@ def _motions(k: int, moment: EgoMoment) -> list[gtsam.JacobianFactor]:
     layout = Layout(nodes, moment.transition.graph.dims)
     before = {name: object_key(k - 1, name) for name in nodes}
     now = {name: object_key(k, name) for name in nodes}
-    return motion_factors(Motion(moment.transition), layout, np.zeros(layout.size), before, now)[0]
+    motion = Motion(moment.transition)
+    if not motion.linear:
+        raise InputError("motion: expected linear motion and interactions of objects beside a vehicle's path")
+    return motion_factors(motion, layout, np.zeros(layout.size), before, now)[0]
 
 
 def detections(record: Keyed, settings: JointSettings) -> list[Linearisable]:

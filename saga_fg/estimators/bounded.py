@@ -31,10 +31,10 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.cover import Bounds, Cover
-from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.graph_parts import adjacency
 from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.overlapping import gathered, propagated
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
@@ -95,7 +95,8 @@ class BoundedKalmanFilter:
         self._cover, self._state = cover, state
 
     def predict(self, transition: Transition) -> None:
-        dynamics = Dynamics.of(transition, self._cover.layout)
+        layout = self._cover.layout
+        dynamics = Motion(transition).dynamics(layout, self.joint_mean(layout.nodes))
         F = dynamics.matrix.copy()
         F.eliminate_zeros()
         acting = [blocks.values.any(axis=(1, 2)) for blocks in dynamics.F]

@@ -77,6 +77,8 @@ def _heard(motion: Motion) -> list[tuple[IntArray, IntArray]]:
     for one in motion.nonlinear:
         others = np.array(one.neighbours, dtype=np.int64)
         pairs.append((np.full(len(others), one.node), others))
+    for flow in motion.flows:
+        pairs += [(nodes[flow.rows[:, 0]], nodes[others]) for others in flow.rows.T[1:]]
     return pairs
 
 

@@ -170,7 +170,7 @@ def _resting(dynamics: Dynamics) -> BoolArray:
 
 def motion_factors(
     motion: Motion | Standstill, layout: Layout, mean: FloatArray, keys: dict[int, int], next_keys: dict[int, int]
-) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactor]]:
+) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactor | ResidualFactors]]:
     """Factors of an interval, native ones and those of nodes that move nonlinearly."""
     dynamics = motion.dynamics(layout, mean)
     special = {m.node: m for m in motion.nonlinear} if isinstance(motion, Motion) else {}
@@ -186,7 +186,12 @@ def motion_factors(
     kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
     for blocks in dynamics.F:
         kinds[np.unique(blocks.target)] += 1
-    together = regular & (kinds == 1) & ~same
+    nonlinear: list[ResidualFactor | ResidualFactors] = []
+    flowing = same.copy()
+    for flow, rows in motion.flows_of(layout) if isinstance(motion, Motion) else ():
+        flowing[rows[:, 0]] = True
+        nonlinear.append(flow.factors(then[rows[:, 0]], now[rows]))
+    together = regular & (kinds == 1) & ~flowing
     native: list[gtsam.JacobianFactor] = []
     for blocks in dynamics.F:
         mine = np.flatnonzero(together[blocks.target])
@@ -197,8 +202,7 @@ def motion_factors(
             Q = np.stack([noise[row] for row in rows.tolist()])
             names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
             native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
-    nonlinear = []
-    for row in np.flatnonzero(~together & ~same).tolist():
+    for row in np.flatnonzero(~together & ~flowing).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
         if node in special:

@@ -22,7 +22,7 @@ from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements, require_kind
-from saga_fg.estimators.sighting import Sighting
+from saga_fg.estimators.sighting import Observations, Sighting
 from saga_fg.estimators.smoothed import Newest
 from saga_fg.frame import Frame
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
@@ -143,8 +143,8 @@ class GraphFilter:
         if not self.providers:  # nobody is to be asked for factors on the epoch before
             smoother.forget(keys.values())
 
-    def update(self, measurements: Measurements) -> float:
-        require_kind("measurements", measurements, Measurements)
+    def update(self, measurements: Measurements | Observations) -> float:
+        require_kind("measurements", measurements, Measurements, Observations)
         sighting = Sighting(measurements)
         sighting.check(self._layout)
         if len(measurements) == 0:

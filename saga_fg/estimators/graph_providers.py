@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factors import gaussian_factors, prior_factors
+from factors import detection_factors, gaussian_factors, prior_factors
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.sighting import Observations
 from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
@@ -83,9 +84,9 @@ class Interactions:
 
 @dataclass(frozen=True, eq=False)
 class LinearDetections:
-    """Linear measurements of objects; keys: of their variables by id, by default those of this epoch."""
+    """Measurements of objects; keys: of their variables by id, by default those of this epoch."""
 
-    measurements: Measurements
+    measurements: Measurements | Observations
     keys: Mapping[int, int] | None = None
     name: str = "detections"
 
@@ -93,4 +94,6 @@ class LinearDetections:
         m = self.measurements
         now = self.keys or {node: node_key(node, view.epoch) for node in m.nodes.tolist()}
         keys = np.array([[now[node]] for node in m.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
+        if isinstance(m, Observations):
+            return Additions(factors=[detection_factors(keys[:, 0], m.model, m.z, m.R)])
         return Additions(factors=gaussian_factors(keys, [m.H], m.z, m.R))

@@ -33,7 +33,7 @@ from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.protocol import Measurements, require_kind
-from saga_fg.estimators.sighting import Sighting, whitened
+from saga_fg.estimators.sighting import Observations, Sighting, whitened
 from saga_fg.estimators.smoothed import Newest
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
@@ -115,8 +115,7 @@ class IncrementalFilter:
         motion.check(self._held.live)
         self._held = _moved(self._held, motion)
 
-    def update(self, measurements: Measurements) -> float:
-        require_kind("measurements", measurements, Measurements)
+    def update(self, measurements: Measurements | Observations) -> float:
         sighting = Sighting(measurements)
         sighting.check(self._held.live)
         if len(measurements) == 0:

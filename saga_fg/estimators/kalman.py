@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
@@ -25,6 +24,7 @@ from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.kalman_factors import Beside, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.sighting import Observations, Sighting
 from saga_fg.frame import Frame
 from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -106,16 +106,13 @@ class JointKalmanFilter:
         self._predictions += 1
         self._time += transition.dt
 
-    def update(self, measurements: Measurements) -> float:
-        require_kind("measurements", measurements, Measurements)
+    def update(self, measurements: Measurements | Observations) -> float:
+        sighting = Sighting(measurements)
+        sighting.check(self._state.layout)
         if len(measurements) == 0:
             return 0.0
-        rows = self._state.layout.rows(measurements.nodes)
-        size, d = self._state.layout.spans(rows).shape[1], measurements.H.shape[2]
-        if size != d:
-            raise InputError(f"H: expected {size} columns, the size of the nodes' states, got {d}")
-        m = measurements
-        self._state, _, log_likelihood = correct(self._state, rows, m.z, m.H, m.R)
+        seen = sighting.linearised(self._state.layout, self._state.mean)
+        self._state, _, log_likelihood = correct(self._state, *seen)
         return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:

@@ -2,21 +2,25 @@ r"""The dynamics of one interval as an estimator records them: a transition, and
 
     x_i(t+dt) = f( x_i(t), [x_j(t)], dt ) + q_i,   q_i ~ N(0, Q_i(dt))         for the nodes with an interaction f
 
-in place of the transition's own row; Q_i is the transition's. The frozen graph of the transition can be discretised
-again over parts of the interval, and so can f, which is what a late measurement needs.
+in place of the transition's own row; Q_i is the transition's. These are nodes whose types move nonlinearly or that
+nonlinear edges of the transition's graph act on (`saga_fg.estimators.flow`), and those of functions given by hand
+(`NodeMotion`). The frozen graph of the transition can be discretised again over parts of the interval, and so can f,
+which is what a late measurement needs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from factors import FactorError, NonlinearInteraction
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.discretisation import discretise
 from saga_fg.errors import InputError
 from saga_fg.estimators.dynamics import Dynamics, identity
+from saga_fg.estimators.flow import Flow, flows
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.transition import Blocks, Transition
@@ -46,13 +50,25 @@ class Motion:
     @property
     def linear(self) -> bool:
         """Whether linearising it again elsewhere gives the same."""
-        return not self.nonlinear
+        return not (self.nonlinear or self.flows)
+
+    @cached_property
+    def flows(self) -> tuple[Flow, ...]:
+        """The nonlinear dynamics of the transition's graph."""
+        return flows(self.transition)
+
+    def flows_of(self, layout: Layout) -> list[tuple[Flow, IntArray]]:
+        """The same with their rows (n, 1 + k) of `layout`."""
+        place = layout.rows(self.transition.nodes)
+        return [(flow, place[flow.rows]) for flow in self.flows]
 
     def check(self, layout: Layout) -> None:
         """Raise `InputError` or `UnknownNodeError` unless it is about exactly the nodes of `layout`, each once."""
         Dynamics.of(self.transition, layout)
         for motion in self.nonlinear:
             require_kind("nonlinear", motion, NodeMotion)
+        if self.nonlinear and self.flows:
+            raise InputError("nonlinear: expected linear motion and edges of all nodes in the graph beside it")
         moving = [motion.node for motion in self.nonlinear]
         layout.rows(moving)
         if len(set(moving)) < len(moving):
@@ -65,21 +81,32 @@ class Motion:
     def parts(self, dt: float) -> tuple[Motion, Motion]:
         """The first `dt` seconds of the interval and the rest, with the same edges."""
         graph = self.transition.graph
-        first, rest = discretise(graph, dt), discretise(graph, self.transition.dt - dt)
+        first, rest = discretise(graph, dt), discretise(graph.after(dt), self.transition.dt - dt)
         return Motion(first, self.nonlinear), Motion(rest, self.nonlinear)
 
     def dynamics(self, layout: Layout, mean: FloatArray) -> Dynamics:
         """The linear dynamics over the nodes of `layout`, nonlinear ones linearised at the joint state `mean`."""
         linear = Dynamics.of(self.transition, layout)
-        if not self.nonlinear:
+        if self.linear:
             return linear
         own = np.zeros(len(layout), dtype=bool)
         own[layout.rows([motion.node for motion in self.nonlinear])] = True
+        flows_of = self.flows_of(layout)
+        for _, rows in flows_of:
+            own[rows[:, 0]] = True
         F = []
         for blocks in linear.F:
             kept = ~own[blocks.target]
             F.append(Blocks(blocks.target[kept], blocks.source[kept], blocks.values[kept]))
         b = linear.b.copy()
+        for flow, rows in flows_of:
+            states = [mean[layout.spans(column)] for column in rows.T]
+            J = flow.jacobians(states)
+            moved = flow.predict(states)
+            for block, x in zip(J, states, strict=True):
+                moved = moved - (block @ x[:, :, None])[:, :, 0]
+            b[layout.spans(rows[:, 0])] = moved
+            F += [Blocks(rows[:, 0], column, block) for column, block in zip(rows.T, J, strict=True)]
         for motion in self.nonlinear:
             rows = layout.rows([motion.node, *motion.neighbours])
             x, *others = (mean[layout.places(rows[k : k + 1])] for k in range(len(rows)))

@@ -25,6 +25,7 @@ from saga_fg.interactions import CarFollowing, SharedCourse
 from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample
 from saga_fg.learning.rule_parameters import Rule, RuleParameters
+from saga_fg.nonlinear_interactions import AccelerationLaw
 
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s
@@ -93,6 +94,8 @@ def couple_rules(
                     Coupling(rule.interaction, rule.candidate_rates(rule.weights(), features, mask & (seen > 0)))
                 )
                 continue
+            if isinstance(rule.interaction, AccelerationLaw):
+                raise InputError("edges: expected linear interactions to be learned, got nonlinear ones")
             rate = np.where(mask & (seen > 0), rule.strength(features), 0.0)
             if isinstance(rule, Following):
                 remoteness = np.where(rate > 0, rule.remoteness(features), np.inf)

@@ -1,7 +1,7 @@
 """The road as part of the scene graph: lights, stop lines and lanes of a map, cones, and how traffic heeds them."""
 
 from saga_fg.road.cone_geometry import ConeGeometry
-from saga_fg.road.road_map import Lane, RoadMap, StopLine, TrafficLight
+from saga_fg.road.road_map import Lane, RoadMap, StopLine, TrafficLight, Wall
 from saga_fg.road.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
 
 __all__ = [
@@ -13,5 +13,6 @@ __all__ = [
     "SignalSettings",
     "StopLine",
     "TrafficLight",
+    "Wall",
     "colour_updated",
 ]

@@ -1,4 +1,4 @@
-"""What is known of the road: traffic lights, the stop lines they govern, and lanes, in world coordinates.
+"""What is known of the road: traffic lights, the stop lines they govern, lanes and walls, in world coordinates.
 
 A `Frame` may bring a map along (`frame.road_map`), as a vehicle does that drives from tile to tile, or the
 configuration holds one (`tracker.road_map`). Every element becomes a node of the scene graph: its place is a state with
@@ -17,8 +17,8 @@ from saga_fg.errors import InputError
 from saga_fg.settings import require_positive, required_setting, setting
 
 Point = tuple[float, float]
-LIGHT, STOP_LINE, LANE = "traffic_light", "stop_line", "lane"
-ROADSIDE = (LIGHT, STOP_LINE, LANE)  # classes of the nodes that a map brings
+LIGHT, STOP_LINE, LANE, WALL = "traffic_light", "stop_line", "lane", "wall"
+ROADSIDE = (LIGHT, STOP_LINE, LANE, WALL)  # classes of the nodes that a map brings
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,20 @@ class Lane:
 
 
 @dataclass(frozen=True)
+class Wall:
+    """What nobody walks through: a house front, a fence."""
+
+    name: str = required_setting("the wall's own")
+    points: tuple[Point, ...] = required_setting("points (x, y) of its foot, m")
+
+    def __post_init__(self) -> None:
+        _require_name(self.name)
+        _require_points(f"wall {self.name}: points", self.points)
+        if len(self.points) < 2:
+            raise InputError(f"wall {self.name}: points: expected at least two, got {len(self.points)}")
+
+
+@dataclass(frozen=True)
 class RoadMap:
     """Elements of the road with names of their own, and how well their places are known."""
 
@@ -84,11 +98,11 @@ class RoadMap:
     stop_lines: tuple[StopLine, ...] = setting((), "stop lines, each with the name of its light")
     lanes: tuple[Lane, ...] = setting((), "lanes")
     deviation: float = setting(0.2, "standard deviation of the places, every direction, m")
+    walls: tuple[Wall, ...] = setting((), "walls, which pedestrians keep away from (edge rule repulsion)")
 
     def __post_init__(self) -> None:
         require_positive(self, "deviation")
-        elements: tuple[TrafficLight | StopLine | Lane, ...] = (*self.lights, *self.stop_lines, *self.lanes)
-        names = [element.name for element in elements]
+        names = [e.name for group in (self.lights, self.stop_lines, self.lanes, self.walls) for e in group]
         twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
         if twice is not None:
             raise InputError(f"road map: expected names of their own, {twice!r} occurs twice")
@@ -98,7 +112,7 @@ class RoadMap:
                 raise InputError(f"stop line {line.name}: light: there is no traffic light {line.light!r} in the map")
 
     def __len__(self) -> int:
-        return len(self.lights) + len(self.stop_lines) + len(self.lanes)
+        return len(self.lights) + len(self.stop_lines) + len(self.lanes) + len(self.walls)
 
 
 def _require_name(name: str) -> None:

@@ -32,6 +32,7 @@ from saga_fg.geometry import wrap_angle
 from saga_fg.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised, accelerated, speed_along
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable, Triples, unit
 from saga_fg.node import NodeType
+from saga_fg.nonlinear_interactions import Accelerations, smooth_acceleration
 from saga_fg.road.polyline import feet, on_it
 from saga_fg.road.road_map import LANE, STOP_LINE
 from saga_fg.settings import require_between, require_positive, setting, settings_group
@@ -122,10 +123,49 @@ class DriverStopping:
 
 
 @dataclass(frozen=True)
+class SmoothStopping:
+    """Coming to a line as to the end of a queue, without corners in the law; the source is the line."""
+
+    driver: IntelligentDriver = settings_group(IntelligentDriver, "how he drives; `room` plays no part")
+
+    @property
+    def time_constant(self) -> float:
+        return self.driver.time_constant
+
+    @property
+    def alone(self) -> FloatArray:
+        return np.array([1.0, 0.0, 0.0])
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(POSITION + VELOCITY) and source.has(POSITION)
+
+    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
+        """Gap (E,), m, for ways (E,) from the centres to the line."""
+        return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
+
+    def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+        """(E, 3) direction of the lane, and the gap less the distance to the line along it."""
+        ways = approach(nodes, target, source)
+        straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], ways.direction)
+        return np.column_stack([ways.direction, self.gap(nodes, target, ways.way) - straight])
+
+    def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
+        u = given[..., :2]
+        v, s = (u * own[..., 2:]).sum(axis=-1), (u * (other - own)[..., :2]).sum(axis=-1) + given[..., 2]
+        f = smooth_acceleration(self.driver, v, s, np.zeros_like(v))
+        along = u[..., :, None] * u[..., None, :]
+        by_gap = f.by_gap[..., None, None] * along
+        by_own = np.concatenate([-by_gap, f.by_speed[..., None, None] * along], axis=-1)
+        return Accelerations(f.value[..., None] * u, by_own, np.concatenate([by_gap, 0 * by_gap], axis=-1))
+
+
+@dataclass(frozen=True)
 class RedLight:
     """The first vehicle that comes to a closed stop line, and can stop, does."""
 
-    interaction: Stopping | DriverStopping = settings_group(Stopping, "interaction function of the edges")
+    interaction: Stopping | DriverStopping | SmoothStopping = settings_group(
+        Stopping, "interaction function of the edges"
+    )
     rate: float = setting(1.0, "strength of an edge of a vehicle that brakes for a line surely closed, 1/s")
     max_distance: float = setting(100.0, "nobody brakes for a line further away, m")
     noticed: float = setting(0.3, "needed deceleration from which drivers begin to react, m/s^2")

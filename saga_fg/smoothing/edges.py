@@ -81,4 +81,5 @@ class SmoothedEdges:
             (*graph.types, *(types[row] for row in missing.tolist())),
             graph.edges,
             np.concatenate([graph.diffusion_scale, np.ones(len(missing))]),
+            graph.nonlinear,
         )

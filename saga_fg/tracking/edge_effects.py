@@ -16,6 +16,7 @@ import numpy as np
 from saga_fg.arrays import FloatArray
 from saga_fg.discretisation import discretise
 from saga_fg.interactions import POSITION, VELOCITY, NodeTable
+from saga_fg.nonlinear_interactions import held
 from saga_fg.scene_graph import Edges, SceneGraph
 
 
@@ -45,6 +46,14 @@ def edge_effects(graph: SceneGraph, dt: float, nodes: NodeTable) -> list[EdgeEff
             change = together - _predicted(graph, i, edges[:e] + edges[e + 1 :], dt, nodes, row_of)
             ids = int(graph.nodes[i]), int(graph.nodes[edge.source[0]])
             effects.append(EdgeEffect(*ids, edge.interaction, float(edge.rate[0]), change[:2], change[2:]))
+    for law_edges in graph.nonlinear:
+        i, j = (graph.nodes[rows].tolist() for rows in (law_edges.target, law_edges.source))
+        states = np.concatenate([nodes.position, nodes.velocity], axis=1)
+        own, other = (states[[row_of[node] for node in ends]] for ends in (i, j))
+        a = law_edges.law.accelerations(own, other, law_edges.given).value
+        moved = held((law_edges.law.time_constant * law_edges.rate[:, None] * a)[:, :, None], dt)[:, :, 0]
+        each = zip(i, j, law_edges.rate.tolist(), moved, strict=True)
+        effects += [EdgeEffect(t, s, law_edges.interaction, rate, x[:2], x[2:]) for t, s, rate, x in each]
     return effects
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter,
 from saga_fg.frame import Frame
 from saga_fg.graph import FactorProvider
 from saga_fg.interactions import POSITION, VELOCITY
+from saga_fg.modes import Mixture, ModeTable
 from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.providers import RelativeDetections
@@ -58,6 +60,7 @@ class JointTrackState:
         self._motion = motion
         self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
         self._born: dict[int, float] = {}  # on the estimator's clock
+        self._modes: dict[Mixture, ModeTable] = {}  # of tracks that move by a mixture
         self._kinematics: Kinematics | None = None  # until the state changes
 
     def type_of(self, label: str) -> NodeType:
@@ -81,7 +84,7 @@ class JointTrackState:
         delay: float = 0.0,
         seen: Sightings | None = None,
     ) -> None:
-        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1.
+        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0.
 
         With sightings from the vehicle, of which they are to be told next, nothing is known of where they are.
         """
@@ -89,7 +92,7 @@ class JointTrackState:
             now = now._replace(P=np.tile(_ANYWHERE**2 * np.eye(2), (len(ids), 1, 1)))
         for node_type, rows in self._by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
-            P = np.tile(np.eye(node_type.dim), (len(rows), 1, 1))
+            P = np.tile(np.diag(node_type.initial_deviation**2), (len(rows), 1, 1))
             at_p = node_type.index(POSITION)
             mean[:, at_p], P[:, at_p[:, None], at_p] = now.position[rows], now.P[rows]
             if node_type.has(VELOCITY):
@@ -98,6 +101,9 @@ class JointTrackState:
             if delay > 0:
                 F, Q = _own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
+            if isinstance(node_type.motion, Mixture):
+                new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
+                self._modes[node_type.motion] = new if old is None else old.extended(new)
             estimator = self._changed()
             if isinstance(estimator, GraphFilter | JointKalmanFilter):
                 estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
@@ -108,12 +114,22 @@ class JointTrackState:
     def remove(self, ids: IntArray) -> None:
         """Marginalise tracks: what they told of their neighbours stays."""
         self._changed().marginalise(ids)
+        self._modes = {k: t.select(np.flatnonzero(~np.isin(t.ids, ids))) for k, t in self._modes.items()}
         for track in ids.tolist():
             del self._born[track]
 
     def predict(self, graph: SceneGraph, dt: float) -> None:
         """Move all tracks by `dt` s under the graph's dynamics."""
-        self._changed().predict(discretise(graph, dt))
+        estimator = self._changed()
+        if self._modes:
+            self._anchor_modes()
+            graph = replace(graph, modes=tuple(self._modes.values()))
+        estimator.predict(discretise(graph, dt))
+        if self._modes:
+            scale = [graph.diffusion_scale[graph.rows(table.ids)] for table in self._modes.values()]
+            later = [t.predicted(dt, s)[0] for t, s in zip(self._modes.values(), scale, strict=True)]
+            self._modes = dict(zip(self._modes, later, strict=True))
+            self._anchor_modes()
 
     def update(
         self,
@@ -267,17 +283,18 @@ class JointTrackState:
 
     def snapshot(self) -> Any:
         """The state as a value."""
-        return self._estimator.snapshot(), dict(self._born)
+        return self._estimator.snapshot(), dict(self._born), dict(self._modes)
 
     def restore(self, snapshot: Any) -> None:
         """Continue from a snapshot."""
-        state, self._born = snapshot
+        state, self._born, self._modes = snapshot
         self._changed().restore(state)
 
     def copied(self) -> JointTrackState:
         """A state that goes its own way from here."""
         twin = copy.copy(self)
         twin._estimator, twin._born = copy.copy(self._estimator), dict(self._born)
+        twin._modes = dict(self._modes)
         return twin
 
     def _measure(
@@ -285,6 +302,9 @@ class JointTrackState:
     ) -> None:
         """z (k, m), H (k, m, d), R (k, m, m) of some tracks, `delay` s old."""
         estimator = self._changed()
+        if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
+            self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
+            R = np.broadcast_to(np.eye(node_type.dim), H.shape)
         if delay > 0 and isinstance(estimator, FixedLagSmoother):
             then = estimator.time - delay
             there = np.array([self._born[track] <= then for track in ids.tolist()]) & (then >= estimator.start)
@@ -295,16 +315,27 @@ class JointTrackState:
             H, R = _moved_to_present(node_type, H, R, delay)
         estimator.update(Measurements(ids, z, H, R))
 
+    def _anchor_modes(self) -> None:
+        estimator = self._estimator
+        for mixture, table in self._modes.items():
+            marginals = estimator.mean(table.ids), estimator.covariance(table.ids)
+            self._modes[mixture] = table.anchored(*marginals) if len(table) else table
+
     def _changed(self) -> TrackEstimator:
         self._kinematics = None
         return self._estimator
 
     def _by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
-        """Rows whose states mean the same, with a type of theirs; if `moving`, rows that also move the same."""
+        """Rows whose states mean the same, with a type of theirs; if `moving`, rows that also move the same.
+
+        What moves nonlinearly, or by a mixture, always stays apart.
+        """
         classes, index = distinct(label)
         types = [self.type_of(c) for c in classes]
         number: dict[object, int] = {}
-        kind = [number.setdefault(id(t) if moving else t.components, len(number)) for t in types]
+        apart = [moving or t.flow is not None or isinstance(t.motion, Mixture) for t in types]
+        names = [id(t) if own else t.components for own, t in zip(apart, types, strict=True)]
+        kind = [number.setdefault(name, len(number)) for name in names]
         if len(number) == 1:
             return [(types[0], np.arange(len(label)))]
         of_row = np.array(kind, dtype=np.int64)[index]

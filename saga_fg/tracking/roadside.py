@@ -19,7 +19,7 @@ from saga_fg.by_class import class_settings
 from saga_fg.frame import Frame
 from saga_fg.interactions import NodeTable
 from saga_fg.node import Motion, RandomWalk
-from saga_fg.road.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, RoadMap
+from saga_fg.road.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, WALL, RoadMap
 from saga_fg.road.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
 from saga_fg.sensor import Sensor
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics
@@ -168,4 +168,7 @@ def _elements(road_map: RoadMap) -> list[tuple[str, str, Place, str]]:
         centre = np.array(lane.centre)
         middle = centre[len(centre) // 2]
         elements.append((lane.name, LANE, Place(middle, centre - middle, 0.0, lane.width), ""))
+    for wall in road_map.walls:
+        middle = np.mean(wall.points, axis=0)
+        elements.append((wall.name, WALL, Place(middle, np.array(wall.points) - middle, 0.0, 0.0), ""))
     return elements

@@ -9,9 +9,10 @@ from typing import get_args
 
 from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
+from saga_fg.modes import Mixture
 from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
 from saga_fg.rigid_coupling import Attached
 from saga_fg.road import RoadMap, SignalSettings
@@ -21,13 +22,14 @@ from saga_fg.road.stopping import RedLight
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
 from saga_fg.stability import require_stable
 from saga_fg.tracking.names import AssociationName, EstimatorName
+from saga_fg.turning import Bicycle, CoordinatedTurn
 
 
 @dataclass(frozen=True)
 class ClassSettings:
     """How objects of one class move, are born, matched and given up."""
 
-    motion: ConstantVelocity | ConstantAcceleration | RandomWalk = settings_group(
+    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
         lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
     )
     birth_speed: float = setting(5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s")
@@ -181,8 +183,8 @@ class TrackerSettings:
         default_factory=lambda: {DEFAULT: ClassSettings()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    edges: tuple[Following | Neighbours | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = settings_group(
-        lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects"
+    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = (
+        settings_group(lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects")
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (),
@@ -249,10 +251,12 @@ class TrackerSettings:
         if len(set(grouped)) < len(grouped) or not all(len(group) > 1 for group in self.class_groups):
             raise InputError(f"class_groups: expected groups of two classes and more, none in two, got {grouped}")
         for group in self.class_groups:
-            kinds = {type(class_settings(self.classes, ClassSettings, label).motion).__name__ for label in group}
-            if len(kinds) > 1:
+            motions = {class_settings(self.classes, ClassSettings, label).motion for label in group}
+            kinds = {type(motion).__name__ for motion in motions}
+            if len(kinds) > 1 or (len(motions) > 1 and kinds == {Mixture.__name__}):
                 raise InputError(
-                    f"class_groups: expected one kind of motion in {', '.join(group)}, got {sorted(kinds)}"
+                    f"class_groups: expected one kind of motion in {', '.join(group)}, or one mixture, "
+                    f"got {sorted(kinds)}"
                 )
 
 

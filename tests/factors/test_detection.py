@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 from factors import (
+    Bearing,
     Components,
     FactorError,
     Radar,
+    Range,
     RangeBearing,
     RangeRate,
     Robust,
@@ -29,6 +31,8 @@ POSE = (1.0, -2.0, 0.7)
 LINEAR = [position(4), position(7, (2, 6, 0)), position_velocity(6, (0, 3), (1, 4)), box(8, (0, 1, 2), (5, 6, 7), 3)]
 POLAR = [
     RangeBearing(4, (2, 0), POSE),
+    Range(4, (2, 0), POSE),
+    Bearing(5, (1, 4), POSE),
     RangeRate(5, (0, 3), (4, 1), POSE, (0.5, -1.0)),
     Radar(4, (0, 1), (2, 3), POSE, (0.5, -1.0)),
 ]

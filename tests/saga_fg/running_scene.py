@@ -11,7 +11,7 @@ import numpy as np
 
 from factors import between_factor, pose_prior_factor, prior_factors, relative_range_bearing_factors
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, NewVariable
-from saga_fg.nonlinear_interactions import Following, SocialForce
+from saga_fg.nonlinear_interactions import SmoothDriver, SocialForce, interaction
 
 START = np.diag([0.05, 0.05, 0.01]) ** 2
 ODOMETRY = np.diag([0.05, 0.03, 0.01]) ** 2
@@ -54,8 +54,8 @@ class Traffic:
     def law(self, node, near):
         """The interaction function of a node with these neighbours; alone, everybody keeps going."""
         if self.kinds[node] == "car" and near:
-            return Following()
-        return SocialForce()
+            return interaction(SmoothDriver())
+        return interaction(SocialForce())
 
 
 def traffic(rng, frames=12, cars=4, pedestrians=3, intervals=(0.05, 0.1, 0.2, 0.5)):
@@ -144,7 +144,7 @@ class Objects:
             earlier = np.array([[before[i].key for i in row] for row in rows], dtype=np.uint64)
             now = [view.key(OBJECT, row[0]) for row in rows]
             Q = process_noise(moment.dt)
-            factors.append(law.interaction.factors(now, earlier[:, 0], earlier[:, 1:], 4, moment.dt, Q))
+            factors.append(law.factors(now, earlier[:, 0], earlier[:, 1:], 4, moment.dt, Q))
         return Additions(new, factors)
 
 
