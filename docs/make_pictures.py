@@ -10,6 +10,7 @@ from pathlib import Path
 
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
+from running_graph_picture import write_running_graph_pictures
 
 from data_tools.simulator import simulate_scene
 from data_tools.simulator.scan_drive import SimulatedScans
@@ -36,10 +37,11 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the concepts, of the benchmark of scaling, of the demonstration, and of a simulated drive."""
+    """The pictures of the concepts, the running graph, the benchmark of scaling, of the demonstration, and of a simulated drive."""
     write_concept_pictures(HERE)
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     write_heterogeneous_picture(HERE)
+    write_running_graph_pictures(HERE)
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")

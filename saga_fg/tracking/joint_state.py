@@ -15,7 +15,7 @@ from factors import RangeRate
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
-from saga_fg.graph import FactorProvider
+from saga_fg.graph import FactorProvider, SceneFactorGraph
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
@@ -160,6 +160,11 @@ class JointTrackState:
         if isinstance(self._estimator, GraphFilter):
             self._estimator.ask(origin)
             self._changed()
+
+    def running_graph(self) -> SceneFactorGraph | None:
+        """The graph that runs, where the estimator has one."""
+        graph = self._estimator.graph()
+        return graph if isinstance(graph, SceneFactorGraph) else None
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
