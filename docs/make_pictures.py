@@ -37,7 +37,7 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the concepts, the running graph, the benchmark of scaling, of the demonstration, and of a simulated drive."""
+    """All pictures but for those that need recordings."""
     write_concept_pictures(HERE)
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     write_heterogeneous_picture(HERE)

@@ -2,8 +2,8 @@
 
 nodes    name ("car 12 at 3.40 s"), kind, time (s; null: for all time), position [x, y], m, in the world; where known
          covariance (2, 2), m^2, and outline [[x, y], ...] of a box or of a line of the map
-factors  kind; nodes: their numbers in the list above; at: the place [x, y] that was detected; edges: the interaction
-         function and the rate, 1/s, by which each node from the third on acts on the first
+factors  kind; nodes: their numbers in the list above; edges: the interaction function and the rate, 1/s, by which each
+         node from the third on acts on the first
 
 Variables without a place, such as biases, are left out, and so are factors on these alone.
 """
@@ -53,23 +53,25 @@ class GraphRecord:
     ) -> None:
         """Add a running graph, whose positions are from `origin`.
 
-        known: numbers of nodes that are here already, by key, with the toolkit's own factors on them; covariance: of a
-        variable by key, as the estimator's method
+        known: numbers of nodes that are here already, by key; then only factors on the present are added, without
+        interactions; covariance: of a variable by key, as the estimator's method
         """
-        number = dict(known or {})
-        for key, variable in graph.variables.items():
-            place = None if key in number else _place(variable, graph.state(key))
-            if place is not None:
-                more: dict[str, FloatArray] = {}
-                if covariance is not None and isinstance(graph.state(key), np.ndarray):
-                    more["covariance"] = covariance(key)[:2, :2]
-                name = f"{variable.label} {variable.id}"
-                number[key] = self.node(variable.kind.name, name, variable.time, place + np.asarray(origin), **more)
+        numbers, origin = dict(known or {}), np.asarray(origin, dtype=float)
+
+        def number(variable: GraphVariable) -> int:
+            key = variable.key
+            if key not in numbers:
+                vector = covariance is not None and isinstance(graph.state(key), np.ndarray)
+                more = {"covariance": covariance(key)[:2, :2]} if covariance is not None and vector else {}
+                name, place = f"{variable.label} {variable.id}", _place(variable, graph) + origin
+                numbers[key] = self.node(variable.kind.name, name, variable.time, place, **more)
+            return numbers[key]
+
         for factor in graph.factors():
-            keys = [variable.key for variable in factor.variables if variable.key in number]
-            if keys and not (known and factor.provider in OWN and known.keys() >= set(keys)):
-                kind = OWN.get(factor.provider, f"{factor.provider}: {factor.kind}")
-                self.factor(kind, [number[key] for key in keys])
+            on = [variable for variable in factor.variables if len(_place(variable, graph))]
+            present = any(variable.epoch in (graph.epoch, None) for variable in on)
+            if on and (known is None or (present and factor.provider not in ("interactions", "marginals"))):
+                self.factor(OWN.get(factor.provider, f"{factor.provider}: {factor.kind}"), [number(one) for one in on])
 
 
 def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -> dict[str, Any]:
@@ -77,29 +79,25 @@ def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -
 
     Times are counted from `start`. The states at the beginning of the interval have a joint prior, which is not listed.
     """
-    record, time = GraphRecord(), now.timestamp - start
-    names = [f"{label} {id_}" for id_, label in zip(now.columns.id.tolist(), now.columns.label.tolist(), strict=True)]
-    boxes, corners = now.boxes, now.boxes.corners()
-    numbers = {
-        id_: record.node(
-            OBJECT.name, names[row], time, boxes.position[row, :2], covariance=now.P[row], outline=corners[row]
-        )
-        for row, id_ in enumerate(now.columns.id.tolist())
-    }
+    record, time, n = GraphRecord(), now.timestamp - start, len(now.columns.id)
+    table, corners, numbers = now.nodes, now.boxes.corners(), dict[int, int]()
+    for row, id_ in enumerate(table.id.tolist()):
+        if id_ >= 0:
+            more = {"covariance": now.P[row], "outline": corners[row]} if row < n else {}
+            place = table.position[row] + now.origin
+            numbers[id_] = record.node(OBJECT.name, f"{table.label[row]} {id_}", time, place, **more)
     if before is not None and now.graph is not None and now.timestamp > before.timestamp:
         _interactions(record, before, now, numbers, start)
-    if now.matching is not None and now.observed is not None:
-        places = now.observed.boxes.position[:, :2]
-        for row, detection in zip(now.matching.track.tolist(), now.matching.detection.tolist(), strict=True):
-            record.factor("detection", [row], at=_rounded(places[detection]))
-        for row, detection in enumerate(now.born.tolist(), start=len(names) - len(now.born)):
-            record.factor("birth", [row], at=_rounded(places[detection]))
-        viewpoint = now.observed.viewpoint
-        if now.running is not None:
-            ours = {one.key: numbers[id_] for id_, one in now.running.of(OBJECT, now.running.epoch).items()}
-            record.add(now.running, now.origin, ours)
-        elif viewpoint is not None:
-            record.node(KNOWN_POSE, "vehicle", time, viewpoint[:2])
+    if now.running is not None:
+        ours = {one.key: numbers[id_] for id_, one in now.running.of(OBJECT, now.running.epoch).items()}
+        record.add(now.running, now.origin, ours)
+    elif now.matching is not None and now.observed is not None:
+        for row in now.matching.track.tolist():
+            record.factor("detection", [row])
+        for row in range(n - len(now.born), n):
+            record.factor("birth", [row])
+        if now.observed.viewpoint is not None:
+            record.node(KNOWN_POSE, "vehicle", time, now.observed.viewpoint[:2])
     return {"nodes": record.nodes, "factors": record.factors}
 
 
@@ -135,11 +133,13 @@ def _interactions(
             record.factor("interaction", nodes, edges=[[name, round(rate, 3)] for _, name, rate in on])
 
 
-def _place(variable: GraphVariable, state: Any) -> FloatArray | None:
+def _place(variable: GraphVariable, graph: SceneFactorGraph) -> FloatArray:
+    """Where a variable is, (2,), m; (0,) for what has no place."""
+    state = graph.state(variable.key)
     if isinstance(state, gtsam.Pose2 | gtsam.Pose3):
         return np.asarray(state.translation())[:2]
     vector = isinstance(state, np.ndarray) and len(state) >= 2 and variable.kind != EGO_ERROR
-    return state[:2] if vector else None
+    return np.asarray(state[:2] if vector else np.empty(0))
 
 
 def _rounded(values: ArrayLike) -> Any:

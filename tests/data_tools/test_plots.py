@@ -114,7 +114,7 @@ def test_a_running_graph_is_drawn_where_it_is() -> None:
     ]
     factors = [
         {"kind": "interaction", "nodes": [0, 1, 2], "edges": [["CarFollowing", 0.5]]},
-        {"kind": "detection", "nodes": [0], "at": [20.1, 0.0]},
+        {"kind": "detection", "nodes": [0]},
     ]
     figure = running_graph_picture({"nodes": nodes, "factors": factors}, "a graph")
     (ax,) = figure.axes
