@@ -2,8 +2,8 @@
 
 Decoupled: the odometry's path, and the tracker along it. Joint: `saga_fg.ego.OnlineEstimator`, which knows the same
 frames and odometry. Both are asked at every frame for what they know then. Errors of objects are those of position and
-velocity in the world, of the pairs (object, moment) that both report: detected, within 2 m of the truth along the true
-path, and with a velocity known to `TrackerSettings.report_speed_known`.
+velocity in the world, of the pairs (object, moment) that the tracker reports and that both have detected, within 2 m of
+the truth along the true path, in at least `SETTLED` frames before: earlier, velocities are the priors of new tracks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import TrackConfig
 from pipelines.slam.joint import degraded_drive
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray
+from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.association import Assignment, assign
 from saga_fg.boxes import Boxes
 from saga_fg.dataset import Annotations, Scene
@@ -28,7 +28,7 @@ from saga_fg.errors import InputError
 from saga_fg.frame import Detections, Frame
 from saga_fg.tracking import Tracker
 
-NEAR = 2.0  # m, of a detection from the object that it is of
+NEAR, SETTLED = 2.0, 3  # m, of a detection from the object that it is of; frames
 Pair = tuple[int, str]  # frame, object
 
 
@@ -90,10 +90,11 @@ def _run(scene: Scene, config: TrackConfig, settings: JointSettings, sensor: str
     frames, path, odometry = degraded_drive(scene, settings, sensor, seed)
     start = path.world_T_ego[0]
     alone, joined = (Tracker(replace(config.tracker, estimator="kalman"), config.sensors) for _ in range(2))
-    estimator, limit = OnlineEstimator(joined, lag, settings, start=start), config.tracker.report_speed_known
+    estimator = OnlineEstimator(joined, lag, settings, start=start)
     driven = odometry.path(start)
-    errors: tuple[dict[Pair, FloatArray], ...] = ({}, {})
-    newest, settled = [], []
+    errors = _ObjectErrors(), _ObjectErrors()
+    newest: list[FloatArray] = []
+    settled: list[FloatArray] = []
     for k, frame in enumerate(frames):
         detections = in_ego(frame, alone.sensor(sensor))
         moment = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
@@ -101,19 +102,18 @@ def _run(scene: Scene, config: TrackConfig, settings: JointSettings, sensor: str
         objects = _objects(detections, frame.world_T_ego, truth) if there else {}
         tracks = alone.step(Frame(frame.timestamp, frame.sensor, detections, driven[k], "ego"))
         states = np.concatenate([tracks.boxes.position[:, :2], tracks.boxes.velocity], axis=1)
-        errors[0].update(_errors(k, tracks.id.tolist(), states, alone.assignment, objects, truth))
+        errors[0].add(k, tracks.id, states, alone.assignment, objects, truth)
         step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
         newest.append(step.newest.world_T_ego[-1])
         settled += [] if step.settled is None else [*step.settled.world_T_ego]
-        now, P = step.newest.objects[-1], step.newest.object_covariances(-1)
-        known = np.flatnonzero(np.sqrt((P[:, 2, 2] + P[:, 3, 3]) / 2) <= limit)
-        states = np.concatenate([now.position, now.velocity], axis=1)[known]
-        errors[1].update(_errors(k, now.id[known].tolist(), states, joined.assignment, objects, truth))
+        now = step.newest.objects[-1]
+        states = np.concatenate([now.position, now.velocity], axis=1)
+        errors[1].add(k, now.id, states, joined.assignment, objects, truth)
     settled += [*estimator.window().world_T_ego]
-    paths = (Trajectory(path.timestamps, np.stack(one)) for one in (driven, newest, settled))
+    paths = (Trajectory(path.timestamps, np.stack(one)) for one in (list(driven), newest, settled))
     ate = [trajectory_errors(one, path).ate for one in paths]
-    both = sorted(errors[0].keys() & errors[1].keys())
-    off = [np.array([one[pair] for pair in both]).reshape(-1, 2, 2) for one in errors]
+    both = sorted(errors[0].found.keys() & errors[1].found.keys())
+    off = [np.array([one.found[pair] for pair in both]).reshape(-1, 2, 2) for one in errors]
     length = [np.linalg.norm(one, axis=2) for one in off]  # (pairs, 2): of position and velocity
     rmse = [np.sqrt((one**2).mean(axis=0)) if len(both) else np.full(2, np.nan) for one in length]
     median = [float(np.median(one[:, 1])) if len(both) else float("nan") for one in length]
@@ -139,24 +139,34 @@ def _objects(detections: Detections, world_T_ego: FloatArray | None, truth: Anno
     return dict(zip(*(rows.tolist() for rows in assign(distance, same & (distance < NEAR), NEAR)), strict=True))
 
 
-def _errors(
-    frame: int,
-    ids: Sequence[int],
-    states: FloatArray,
-    assignment: Assignment,
-    objects: dict[int, int],
-    truth: Annotations,
-) -> dict[Pair, FloatArray]:
-    """Errors (4,) of states (n, 4) of tracks, by object, where its detection was taken and its velocity is known."""
-    row = {id_: n for n, id_ in enumerate(ids)}
-    found = {}
-    for id_, detection in zip(assignment.id.tolist(), assignment.detection.tolist(), strict=True):
-        if id_ in row and detection in objects:
+class _ObjectErrors:
+    """Errors (4,) of the states of tracks, by frame and object; count: of detections of an object by a track."""
+
+    def __init__(self) -> None:
+        self.found: dict[Pair, FloatArray] = {}
+        self._count: dict[tuple[int, str], int] = {}
+
+    def add(
+        self,
+        frame: int,
+        ids: IntArray,
+        states: FloatArray,
+        assignment: Assignment,
+        objects: dict[int, int],
+        truth: Annotations,
+    ) -> None:
+        """Take in the states (n, 4) of the tracks `ids` (n,) at a frame."""
+        row = {id_: n for n, id_ in enumerate(ids.tolist())}
+        for id_, detection in zip(assignment.id.tolist(), assignment.detection.tolist(), strict=True):
+            if detection not in objects:
+                continue
             n = objects[detection]
+            name = str(truth.id[n])
+            before = self._count.get((id_, name), 0)
+            self._count[id_, name] = before + 1
             true = np.concatenate([truth.boxes.position[n, :2], truth.boxes.velocity[n]])
-            if np.isfinite(true).all():
-                found[frame, str(truth.id[n])] = states[row[id_]] - true
-    return found
+            if id_ in row and before >= SETTLED and np.isfinite(true).all():
+                self.found[frame, name] = states[row[id_]] - true
 
 
 def _judged(rows: Sequence[OnlineRow]) -> OnlineBench:
