@@ -7,10 +7,10 @@ and by the whole graph in turn.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from data_tools.metrics import nees_band
 from factors import gaussian_factors, prior_factors
@@ -21,7 +21,10 @@ from pipelines.bench.measuring import timed
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphView, NewVariable
+from saga_fg.graph.factor_checks import Factor
 from saga_fg.nonlinear_interactions import Following
+
+KeyArray = NDArray[np.uint64]
 
 DT, ROW, SPEED, GAP = 0.1, 5, 8.0, 14.0  # s, vehicles in a row, m/s, m
 LAG, WARM_UP = 2.0, 5  # s, frames
@@ -49,38 +52,42 @@ class Vehicles:
 
     def factors(self, view: GraphView) -> Additions:
         """Positions, births, and interactions of those that were there before."""
-        ids, old, Q, zero = self.ids(view.epoch), self.ids(view.epoch - 1), process_noise(DT), np.zeros(4)
+        ids, old, Q = self.ids(view.epoch), self.ids(view.epoch - 1), process_noise(DT)
         there = self.start + view.time * np.array([SPEED, 0.0, 0.0, 0.0])
         noise = 0.3 * np.random.default_rng(view.epoch).normal(size=(len(ids), 2))
         now = np.array([view.key(OBJECT, i) for i in ids.tolist()], dtype=np.uint64)
         H = np.tile(np.eye(2, 4), (len(ids), 1, 1))
-        factors = gaussian_factors(now[:, None], [H], there[:, :2] + noise, 0.09 * np.eye(2))
+        factors: list[Factor] = [
+            *gaussian_factors(now[:, None], [H], there[:, :2] + noise, 0.09 * np.eye(2)),
+        ]
         stay = (ids == old) & (view.epoch > 0)
         if not stay.all():
             factors += prior_factors(now[~stay], there[~stay], 0.5 * np.eye(4))
-        before = view.before(OBJECT)
         if stay.any():
+            before = view.before(OBJECT)
             last = np.array([before[i].key for i in old.tolist()], dtype=np.uint64)
             x = np.stack([view.state(key) for key in last.tolist()])
             there[stay] = x[stay] @ F.T
-            for rows, blocks in ((self._of(stay, first=True), [F]), (self._of(stay, first=False), [OWN, LEADER])):
-                if len(blocks) == 1 or self.linear:
-                    keys = np.stack([now[rows], last[rows], last[rows - 1]][: 1 + len(blocks)], axis=1)
-                    J = [np.tile(M, (len(rows), 1, 1)) for M in (np.eye(4), *(-block for block in blocks))]
-                    factors += gaussian_factors(keys, J, np.tile(zero, (len(rows), 1)), Q) if len(rows) else []
-                elif len(rows):
-                    law = Following()
-                    there[rows] = law.predict(x[rows], [x[rows - 1]], DT)
-                    led = law.interaction.factors(now[rows], last[rows], last[rows - 1, None], 4, DT, Q)
-                    return Additions(self._new(ids, there), [*factors, led])
+            head = stay & (self.slots % self.row == 0)
+            first, behind = np.flatnonzero(head), np.flatnonzero(stay & ~head)
+            factors += _linear(now, last, first, [F], Q)
+            if self.linear:
+                factors += _linear(now, last, behind, [OWN, LEADER], Q)
+            elif len(behind):
+                law = Following()
+                there[behind] = law.predict(x[behind], [x[behind - 1]], DT)
+                factors.append(law.interaction.factors(now[behind], last[behind], last[behind - 1, None], 4, DT, Q))
         return Additions(self._new(ids, there), factors)
-
-    def _of(self, stay: ArrayLike, first: bool) -> IntArray:
-        """Places of those that stay, at the head of a row or behind somebody."""
-        return np.flatnonzero(stay & ((self.slots % self.row == 0) == first))
 
     def _new(self, ids: IntArray, states: FloatArray) -> list[NewVariable]:
         return [NewVariable(OBJECT, i, x) for i, x in zip(ids.tolist(), states, strict=True)]
+
+
+def _linear(now: KeyArray, last: KeyArray, rows: IntArray, blocks: Sequence[FloatArray], Q: FloatArray) -> list[Factor]:
+    """x' = F x, plus a leader's share if there are two blocks, of the vehicles in some places."""
+    keys = np.stack([now[rows], last[rows], last[rows - 1]][: 1 + len(blocks)], axis=1)
+    J = [np.tile(M, (len(rows), 1, 1)) for M in (np.eye(4), *(-block for block in blocks))]
+    return [*gaussian_factors(keys, J, np.zeros((len(rows), 4)), Q)] if len(rows) else []
 
 
 def drivers(kind: Kind, n: int, frames: int) -> list[Row]:
