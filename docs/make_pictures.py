@@ -10,6 +10,7 @@ from pathlib import Path
 
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
+from running_graph_picture import write_running_graph_pictures
 
 from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
@@ -36,10 +37,11 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """The pictures of the concepts, of the benchmark of scaling, of the demonstration, and of a simulated drive."""
+    """All pictures but for those that need recordings."""
     write_concept_pictures(HERE)
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     write_heterogeneous_picture(HERE)
+    write_running_graph_pictures(HERE)
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")

@@ -5,6 +5,7 @@ from data_tools.plots.calibration import calibration_plot
 from data_tools.plots.error_histograms import error_histograms
 from data_tools.plots.from_above import paths_from_above
 from data_tools.plots.recall_sweep import recall_sweep
+from data_tools.plots.running_graph import running_graph_picture
 from data_tools.plots.scaling import scaling_plot
 from data_tools.plots.scan_map import scan_map_from_above
 
@@ -16,6 +17,7 @@ __all__ = [
     "paths_from_above",
     "png",
     "recall_sweep",
+    "running_graph_picture",
     "scaling_plot",
     "scan_map_from_above",
     "trails",

@@ -17,6 +17,7 @@ from pipelines.bench.contenders import Contender, Filter, GtsamWindow, Ours, Our
 from pipelines.bench.estimator_figures import Criterion, Row, Soak, criteria, exponents
 from pipelines.bench.flocks import Flock, Kind, flock
 from pipelines.bench.measuring import environment, size_of, timed
+from pipelines.bench.running_graph import drivers, endless_drivers, windows
 from pipelines.process import one_thread, resident_memory
 from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray
@@ -36,6 +37,7 @@ from saga_fg.settings import setting
 KINDS: tuple[Kind, ...] = ("connected", "components")
 LAG = 5  # frames
 WARM_UP = 3  # frames that are not counted
+WHOLE = 100  # more nodes take the running graph seconds a frame
 DENSE = INCREMENTAL = 300  # more nodes in one graph are hopeless for the textbook and for iSAM2
 _COVARIANCES = 50  # more nodes take GTSAM's smoother seconds to tell its covariances
 
@@ -51,7 +53,9 @@ class EstimatorBenchSettings:
     batch_nodes: int = setting(100, "nodes of that recording")
     soak_frames: int = setting(10_000, "frames of the endurance run; 0 for none")
     soak_nodes: int = setting(100, "nodes of the endurance run")
+    scenes: int = setting(20, "nonlinear scenes drawn from the model; 0 for none")
     seed: int = setting(0, "seed of the flocks")
+    scene_frames: int = setting(40, "frames of each of these scenes")
     everything: bool = setting(False, "measure the hopeless cases too")
 
     def __post_init__(self) -> None:
@@ -77,7 +81,8 @@ def bench_estimators(settings: EstimatorBenchSettings, progress: Progress | None
     """Measure everything, one case after the other."""
     rows: list[Row] = []
     soaks: list[Soak] = []
-    cases = [*_filter_cases(settings), *_lag_cases(settings), *_batch_cases(settings), *_soak_cases(settings)]
+    cases = [*_filter_cases(settings), *_lag_cases(settings), *_batch_cases(settings)]
+    cases += [*_running_cases(settings), *_soak_cases(settings)]
     with one_thread():
         for done, (name, case) in enumerate(cases):
             if progress is not None:
@@ -220,31 +225,57 @@ def _textbook_smoother(scene: Flock) -> tuple[list[Gaussian], float]:
     return smoothed, milliseconds
 
 
+def _running_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
+    for n in settings.sizes:
+        for kind in KINDS if n <= WHOLE else ():
+            yield f"running graph, {kind}, {n} nodes", partial(drivers, kind, n, settings.frames)
+    if settings.scenes:
+        yield "nonlinear scenes", partial(windows, settings.scenes, settings.scene_frames, settings.seed)
+
+
 def _soak_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
+    few = max(2, settings.soak_nodes // 5)
     for kind in KINDS if settings.soak_frames else ():
-        n = settings.soak_nodes if kind == "components" else max(2, settings.soak_nodes // 5)
-        yield f"endurance, {kind}, {n} nodes", partial(_soak, kind, n, settings)
+        n = settings.soak_nodes if kind == "components" else few
+        scene = flock(kind, n, 50, settings.seed)
+        yield f"endurance, {kind}, {n} nodes", partial(_soak, "isam2", kind, n, settings, partial(_endless, scene))
+    if settings.soak_frames:
+        make = partial(endless_drivers, few)
+        yield f"endurance, drivers, {few} nodes", partial(_soak, "drivers", "components", few, settings, make)
 
 
-def _soak(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Soak]:
-    """The same frames over and over. Over the last tenth, a young filter takes turns with the old one."""
-    scene = flock(kind, n, 50, settings.seed)
-    old, young = Ours(IncrementalFilter(), scene), Ours(IncrementalFilter(), scene)
+def _endless(scene: Flock) -> Callable[[int], None]:
+    """The linear filter on the same frames over and over."""
+    ours = Ours(IncrementalFilter(), scene)
+
+    def step(k: int) -> None:
+        ours.prepare(scene.frames[k % len(scene.frames)])
+        ours.step()
+
+    return step
+
+
+def _soak(
+    name: str, kind: Kind, n: int, settings: EstimatorBenchSettings, make: Callable[[], Callable[[int], None]]
+) -> list[Soak]:
+    """`make` gives a fresh filter, which takes frame k. Over the last tenth of the frames a young one, which is then
+    between one and two tenths old, takes turns with the one that went all the way.
+    """
     part = max(1, settings.soak_frames // 10)
+    second, late = settings.soak_frames - 2 * part, settings.soak_frames - part
+    old, young = make(), make()
     times: dict[str, list[float]] = {"young": [], "old": []}
-    memory = []
+    memory: tuple[list[float], list[float]] = ([], [])
     for k in range(settings.soak_frames):
-        frame = scene.frames[k % len(scene.frames)]
-        old.prepare(frame)
-        taken = timed(old.step)
-        if k >= settings.soak_frames - part:
-            young.prepare(frame)
-            times["young"].append(timed(young.step))
-            times["old"].append(taken)
-        if k in (part - 1, settings.soak_frames - 1):
-            memory.append(resident_memory())
+        taken = [timed(partial(old, k)), timed(partial(young, k - second)) if k >= second else 0.0]
+        if k >= late:
+            times["old"].append(taken[0])
+            times["young"].append(taken[1])
+        if k >= late or part <= k < 2 * part:
+            memory[k >= late].append(resident_memory())
     medians = float(np.median(times["young"])), float(np.median(times["old"]))
-    return [Soak("isam2", kind, n, settings.soak_frames, medians, (memory[0], memory[-1]))]
+    held = float(np.median(memory[0] or memory[1])), float(np.median(memory[1]))
+    return [Soak(name, kind, n, settings.soak_frames, medians, held)]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
 
 if TYPE_CHECKING:
+    from pipelines.bench.estimator_figures import Row
     from pipelines.bench.estimators import EstimatorBench
 
 
@@ -32,7 +33,10 @@ def estimators(
         int, typer.Option("--soak-frames", min=0, help="Frames of the endurance run; 0: none.")
     ] = 10_000,
     soak_nodes: Annotated[int, typer.Option("--soak-nodes", min=2, help="Nodes of the endurance run.")] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated flocks.")] = 0,
+    scenes: Annotated[
+        int, typer.Option("--scenes", min=0, help="Nonlinear scenes drawn from the model; 0: none.")
+    ] = 20,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of what is simulated.")] = 0,
     everything: Annotated[bool, typer.Option("--all", help="Measure the hopeless cases too: hours.")] = False,
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
@@ -42,7 +46,8 @@ def estimators(
     """What the estimators cost and how exact they are.
 
     Filters are compared with the textbook's on dense matrices, fixed-lag smoothers with GTSAM's, batch smoothers with
-    Rauch, Tung and Striebel's. All run in turn on one thread; times are medians of CPU time.
+    Rauch, Tung and Striebel's, a running graph of intelligent drivers with a linear one, and one with a lag with the
+    whole graph. All run in turn on one thread; times are medians of CPU time.
 
     \b
     Examples:
@@ -54,7 +59,16 @@ def estimators(
     from pipelines.figures import write_figures
 
     settings = EstimatorBenchSettings(
-        counts("--sizes", sizes), frames, seconds, batch_frames, batch_nodes, soak_frames, soak_nodes, seed, everything
+        counts("--sizes", sizes),
+        frames,
+        seconds,
+        batch_frames,
+        batch_nodes,
+        soak_frames,
+        soak_nodes,
+        scenes,
+        seed,
+        everything=everything,
     )
     if json_file is not None:
         check_writable(json_file)
@@ -72,7 +86,7 @@ def _print(result: EstimatorBench) -> None:
     table = Table(*columns, title="cost, and error in standard deviations", title_justify="left")
     for row in result.rows:
         cells = [f"{row.milliseconds:.3g}", _number(row.ratio), _number(row.largest_error, ".1e")]
-        cells += [_number(row.covariance_error, ".1e"), _number(row.anees, ".3f"), _number(row.memory)]
+        cells += [_number(row.covariance_error, ".1e"), _number(row.anees, ".3f") + _band(row), _number(row.memory)]
         table.add_row(row.case, row.graph, str(row.nodes), row.contender, *cells)
     console.print(table)
     for name, exponent in result.exponents.items():
@@ -90,6 +104,10 @@ def _print(result: EstimatorBench) -> None:
         table.add_row(criterion.name, _number(criterion.value), f"<= {criterion.limit}", words[criterion.reached])
     console.print(table)
     typer.echo(", ".join(f"{name} {value}" for name, value in result.environment.items()))
+
+
+def _band(row: Row) -> str:
+    return "" if math.isnan(row.band[0]) else f" ({row.band[0]:.2f} to {row.band[1]:.2f})"
 
 
 def _number(value: float, form: str = ".3g") -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,8 @@ from pipelines.cli.tables import JsonFile
 if TYPE_CHECKING:
     from data_tools.metrics import Interval
     from pipelines.bench.joint import JointBench
+    from pipelines.config import TrackConfig
+    from saga_fg.dataset import Scene
 
 
 def joint(
@@ -36,11 +39,15 @@ def joint(
     parked: Annotated[
         bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
     ] = True,
+    online: Annotated[
+        bool, typer.Option("--online", help="In a running graph, frame by frame; objects are scored too.")
+    ] = False,
+    lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
     json_file: JsonFile = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
-    """Joint against decoupled estimation with degraded odometry: the error of the path.
+    """Joint against decoupled estimation with degraded odometry: the error of the path, online also of the objects.
 
     The odometry has noise, a scale error and a bias of the yaw rate, all wandering, drawn anew for every seed.
 
@@ -49,6 +56,7 @@ def joint(
       saga-fg bench joint --scenes 10 --poles
       saga-fg bench joint --scenes 10 --lanes --no-parked
       saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
+      saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
     from data_tools.atomic_files import check_writable
     from data_tools.kitti import KittiTracking
@@ -63,15 +71,20 @@ def joint(
         raise InputError("expected both --dataroot and --detections, or neither")
     if dataroot is not None and (poles or lanes or not parked):
         raise InputError("--poles, --lanes and --no-parked: expected with simulated streets only")
+    if online and (poles or lanes):
+        raise InputError("--online: expected neither --poles nor --lanes")
     if json_file is not None:
         check_writable(json_file)
     if dataroot is None:
         many = [simulate_scene(street(parked, mapped=lanes), seed) for seed in range(first, first + scenes)]
         settings = load_config("simulated", config)
     else:
-        kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","))
+        kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","), online)
         many = [kitti.scene(name) for name in kitti.scenes]
         settings = load_config("kitti", config)
+    if online:
+        _online(many, settings, seeds, lag, json_file)
+        return
 
     def so_far(result: JointBench) -> None:
         row = result.rows[-1]
@@ -107,6 +120,38 @@ def joint(
         better = sum(row.lanes_in_map < row.joint_in_map for row in result.rows)
         change = _percent("error in the map, with lanes against without", result.lanes)
         typer.echo(f"{change}, lower in {better} runs")
+
+
+def _online(scenes: Sequence[Scene], config: TrackConfig, seeds: int, lag: float, json_file: Path | None) -> None:
+    """Run and print the online comparison."""
+    from pipelines.bench.joint_online import OnlineBench, bench_online
+    from pipelines.figures import write_figures
+
+    def so_far(result: OnlineBench) -> None:
+        row = result.rows[-1]
+        line = f"{len(result.rows)}/{len(scenes) * seeds} {row.scene}, seed {row.seed}: {_pair(row.ate)} m ATE"
+        error_console().print(line, markup=False, highlight=False, soft_wrap=True)
+        if json_file is not None:
+            write_figures(json_file, result)
+
+    with progress_bar(unit="runs") as progress:
+        result = bench_online(scenes, config, range(seeds), lag, progress=progress, so_far=so_far)
+    columns = ("recording", "seed", "ATE, m", "settled", "pairs", "position, m", "velocity, m/s", "median")
+    table = Table(*columns, title="decoupled -> joint, RMSE of objects in the world", title_justify="left")
+    for row in result.rows:
+        errors = [_pair(row.position), _pair(row.velocity), _pair(row.median_velocity)]
+        table.add_row(row.scene, str(row.seed), _pair(row.ate), f"{row.settled_ate:.3f}", str(row.pairs), *errors)
+    Console(width=max(Console().width, 120)).print(table)
+    for name in ("ate", "position", "velocity"):
+        better = sum(getattr(row, name)[1] < getattr(row, name)[0] for row in result.rows)
+        change: Interval = getattr(result, name)
+        typer.echo(
+            f"{_percent(f'{name}, joint against decoupled', change)}, lower in {better} of {len(result.rows)} runs"
+        )
+
+
+def _pair(errors: tuple[float, float]) -> str:
+    return f"{errors[0]:.3f} -> {errors[1]:.3f}"
 
 
 def _percent(what: str, change: Interval) -> str:

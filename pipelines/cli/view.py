@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,7 +43,7 @@ Spacing = Annotated[
 
 @view_app.callback()
 def view() -> None:
-    """See a result in space: boxes, tracks, ellipses, edges, truth, LiDAR points, landmarks (rerun or Foxglove)."""
+    """See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (rerun or Foxglove)."""
 
 
 @view_app.command()
@@ -144,6 +145,7 @@ def slam(
 
 def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView]], slam: Path | None = None) -> None:
     """Write or open the scenes that `make` gives, with the map of a run of SLAM."""
+    from pipelines.explaining import journal_of, read_graphs
     from pipelines.view import (
         check_view_file,
         draw_scene,
@@ -161,7 +163,9 @@ def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView
     else:
         check_view_file(save)
     with working("making the view"):
-        scenes, driven = make(), read_slam_view(slam) if slam is not None else None
+        graphs = read_graphs(journal_of(result)) if journal_of(result).exists() else {}
+        scenes = [replace(each, graphs=graphs.get(each.report.scene.name, ())) for each in make()]
+        driven = read_slam_view(slam) if slam is not None else None
         roots = [each.report.scene.name for each in scenes]
         if driven is not None and len(scenes) > 1:
             raise InputError(f"--slam {slam}: expected one sequence, got {', '.join(roots)}; choose it by --sequences")

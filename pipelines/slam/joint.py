@@ -61,18 +61,9 @@ def run_joint(
     """Estimate jointly from the frames of one sensor and odometry degraded as `settings.odometry` says.
 
     landmarks: what is observed of them at n frames; lag: s, to estimate online as well; new_providers: gives fresh
-    providers of other factors.
-    Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
+    providers of other factors. Raises `InputError` as `degraded_drive`.
     """
-    frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], settings.keyframe_period)
-    if not frames:
-        raise InputError(f"scene {scene.name}: expected frames of {sensor}, there are those of {scene.sensors}")
-    poses = [frame.world_T_ego for frame in frames if frame.world_T_ego is not None]
-    if len(poses) < len(frames):
-        raise InputError(f"scene {scene.name}: expected a pose with every frame of {sensor}")
-    truth = Trajectory(np.array([frame.timestamp for frame in frames]), np.stack(poses))
-    exact = Odometry.of(truth.timestamps, truth.world_T_ego)
-    odometry = degraded_odometry(exact, settings.odometry, np.random.default_rng(seed))
+    frames, truth, odometry = degraded_drive(scene, settings, sensor, seed)
     start = truth.world_T_ego[0]
 
     def new_tracker() -> Tracker:
@@ -85,6 +76,24 @@ def run_joint(
         tracker, own = new_tracker(), new_providers()
         online = estimate_online(frames, odometry, tracker, lag, settings, start, observed, providers=own)
     return JointRun(truth, Trajectory(truth.timestamps, odometry.path(start)), estimate, online)
+
+
+def degraded_drive(
+    scene: Scene, settings: JointSettings, sensor: str, seed: int
+) -> tuple[list[Frame], Trajectory, Odometry]:
+    """The keyframes of one sensor, their true path, and odometry degraded as `settings.odometry` says.
+
+    Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
+    """
+    frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], settings.keyframe_period)
+    if not frames:
+        raise InputError(f"scene {scene.name}: expected frames of {sensor}, there are those of {scene.sensors}")
+    poses = [frame.world_T_ego for frame in frames if frame.world_T_ego is not None]
+    if len(poses) < len(frames):
+        raise InputError(f"scene {scene.name}: expected a pose with every frame of {sensor}")
+    truth = Trajectory(np.array([frame.timestamp for frame in frames]), np.stack(poses))
+    exact = Odometry.of(truth.timestamps, truth.world_T_ego)
+    return frames, truth, degraded_odometry(exact, settings.odometry, np.random.default_rng(seed))
 
 
 def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:

@@ -10,6 +10,9 @@
     NAME/METHOD/velocities   arrows of one second
     NAME/METHOD/ellipses     that hold the true centre with 90 % in the plane, if the covariance is right
     NAME/METHOD/edges        lines from source to target, the thicker the higher the rate
+    NAME/graph/nodes         variables of the running graph with their names, earlier ones 2 m below, where the run kept
+                             a journal
+    NAME/graph/KIND          lines from each factor of a kind to its variables
 
 Metres about the vehicle's first place, z up: viewers count in float32. All layers of a moment are drawn at it, so that
 nothing outlives its moment.
@@ -18,8 +21,10 @@ nothing outlives its moment.
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +42,7 @@ from pipelines.view.drawing import (
     Ellipses,
     Facts,
     Lines,
+    Marks,
     Points,
     Pose,
     Shape,
@@ -45,21 +51,28 @@ from pipelines.view.drawing import (
 )
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.boxes import Boxes
+from saga_fg.errors import InputError
 
 TRAIL = 4.0  # s
+SUNK = 2.0  # m, earlier states below the newest ones
 HELD = 2 * np.log(10.0)  # squared sigmas of the ellipse that holds 90 % in the plane
-DETECTION, SEEN, HIDDEN, PATH, EDGE, POINT = map(
-    one_colour, ((140, 140, 140), (60, 180, 75), (30, 90, 38), (90, 90, 200), (250, 190, 60), (200, 200, 200))
+DETECTION, SEEN, HIDDEN, PATH, EDGE, POINT, NODE = map(
+    one_colour,
+    ((140, 140, 140), (60, 180, 75), (30, 90, 38), (90, 90, 200), (250, 190, 60), (200, 200, 200), (230, 230, 230)),
 )
 
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """A scene with results, and its LiDAR scans if there are any; their points are thinned to `spacing`, m."""
+    """A scene with results, and its LiDAR scans if there are any; their points are thinned to `spacing`, m.
+
+    graphs  of the frames, from the journal of the run (`saga_fg.tracking.graph_record`)
+    """
 
     report: ReportScene
     scans: ScanSequence | None = None
     spacing: float = 0.1
+    graphs: Sequence[Mapping[str, Any]] = ()
 
 
 def draw_scene(view: SceneView) -> Iterator[Drawing]:
@@ -76,9 +89,8 @@ def draw_scene(view: SceneView) -> Iterator[Drawing]:
     )
     if scans is not None:
         yield Drawing(f"{root}/ego", "lidar", Pose(scans.ego_T_lidar))
-        yield from in_order(_moments(view.report, origin, start), _scans(root, scans, start, view.spacing))
-    else:
-        yield from _moments(view.report, origin, start)
+    points = () if scans is None else _scans(root, scans, start, view.spacing)
+    yield from in_order(_moments(view.report, origin, start), points, _graphs(view, origin, start))
 
 
 def _moments(report: ReportScene, origin: FloatArray, start: float) -> Iterator[Drawing]:
@@ -107,6 +119,43 @@ def _scans(root: str, scans: ScanSequence, start: float, spacing: float) -> Iter
         points = scans[k].points
         points = points[voxel_downsample(points, spacing)]
         yield Drawing(f"{root}/ego/lidar", "points", Points(points, POINT, 0.03), time)
+
+
+def _graphs(view: SceneView, origin: FloatArray, start: float) -> Iterator[Drawing]:
+    """Each frame's running graph. Raises `InputError` for what is none."""
+    root, moments = (
+        view.report.scene.name,
+        {round(t, 3): k for k, t in enumerate(view.report.scene.timestamps.tolist())},
+    )
+    try:
+        drawn = [_graph(graph, origin) for graph in view.graphs]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(f"{root}: expected graphs as --explain writes them: {error!r:.80}") from error
+    kinds = sorted({kind for _, lines in drawn for kind in lines})
+    for graph, (marks, lines) in zip(view.graphs, drawn, strict=True):
+        when = float(graph["time"]) - start, moments.get(round(graph["time"], 3))
+        yield Drawing(root, "graph/nodes", marks, *when)
+        for number, kind in enumerate(kinds):
+            shape = Lines(lines.get(kind, []), one_colour(colour_of(number)), np.array([0.05]))
+            yield Drawing(root, f"graph/{re.sub('[^A-Za-z0-9]+', '_', kind)}", shape, *when)
+
+
+def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Marks, dict[str, list[FloatArray]]]:
+    """Variables, and by kind lines from the middle of each factor to its variables; upwards where there is only one."""
+    nodes = graph["nodes"]
+    newest = max((node["time"] for node in nodes if node["time"] is not None), default=None)
+    depth = [0.0 if node["time"] in (newest, None) else -SUNK for node in nodes]
+    places = np.array([[*node["position"], z] for node, z in zip(nodes, depth, strict=True)]).reshape(-1, 3)
+    places[:, :2] -= origin[:2]
+    lines: dict[str, list[FloatArray]] = {}
+    for factor in graph["factors"]:
+        ends = places[factor["nodes"]]
+        middle = ends[:2].mean(axis=0) if len(ends) > 1 else ends[0] + [0.0, 0.0, SUNK]
+        for n, end in enumerate(ends):
+            acting = n >= 2 and "edges" in factor
+            kind = f"{factor['kind']} {factor['edges'][n - 2][0]}" if acting else factor["kind"]
+            lines.setdefault(kind, []).append(np.stack([middle, end]))
+    return Marks(places, [node["name"] for node in nodes], NODE, 0.25), lines
 
 
 class _Method:

@@ -17,7 +17,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.frame import Frame
-from saga_fg.graph import FactorProvider
+from saga_fg.graph import FactorProvider, SceneFactorGraph
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.modes import Mixture, ModeTable
 from saga_fg.node import Motion, NodeType
@@ -235,6 +235,10 @@ class JointTrackState:
         """(n, 2, 2) of where tracks are, seen from the vehicle's pose in the running graph."""
         assert isinstance(self._estimator, GraphFilter)
         return relative_covariances(self._estimator, ids, self.types_of(label))
+
+    def running_graph(self) -> SceneFactorGraph:
+        """The estimator's graph."""
+        return self._estimator.graph()
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""

@@ -4,6 +4,7 @@
     matched  the candidates with their squared distances in sigmas, which was chosen, why the others were not
     missed   the same with none chosen
     ended    how long unseen, how much believed, and which limit was passed
+    graph    the running graph of the interval that the frame ended (`saga_fg.tracking.graph_record`), once a frame
 
 `matched` and `missed` also say which edges acted on the prediction, and what each contributed. Positions are in world
 coordinates.
@@ -21,6 +22,7 @@ from saga_fg.association import gate, mahalanobis
 from saga_fg.by_class import class_settings
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.edge_effects import EdgeEffect, edge_effects
+from saga_fg.tracking.graph_record import graph_of_frame
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.observer import Stage, TrackerView
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
@@ -39,6 +41,7 @@ class Journal:
         self._before: TrackerView | None = None  # at the end of the frame before
         self._predicted: TrackerView | None = None
         self._effects: list[EdgeEffect] = []
+        self._start: float | None = None
 
     def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
         """Take note of a stage."""
@@ -48,8 +51,12 @@ class Journal:
         elif stage == "believe":
             self._tell_matches(view())
         elif stage == "births":
-            self._before = view()
-            self._tell_births(self._before)
+            now = view()
+            self._start = now.timestamp if self._start is None else self._start
+            graph = graph_of_frame(self._before, now, self._start)
+            self._write({"event": "graph", "time": now.timestamp, "sensor": now.sensor, **graph})
+            self._before = now
+            self._tell_births(now)
         elif stage == "deaths":
             now = view()
             self._tell_deaths(now)

@@ -13,6 +13,8 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.association import Matching
+from saga_fg.boxes import Boxes
+from saga_fg.graph import SceneFactorGraph
 from saga_fg.interactions import NodeTable
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.tracking.columns import TrackColumns
@@ -35,6 +37,8 @@ class TrackerView:
     observed    the frame's detections, from the stage `observe` on
     matching    rows of tracks and of detections, from the stage `associate` on
     born        (b,) rows of the detections that the last b tracks were born from, at the stage `births`
+    boxes       of the tracks, in the world
+    running     the running graph, where factor providers take part; its positions are local
     """
 
     timestamp: float
@@ -47,6 +51,8 @@ class TrackerView:
     observed: Observed | None
     matching: Matching | None
     born: IntArray
+    boxes: Boxes
+    running: SceneFactorGraph | None
 
     def places(self) -> FloatArray:
         """(n, 2) positions of the tracks in the world, m."""

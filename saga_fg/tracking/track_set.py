@@ -434,7 +434,7 @@ class TrackSet:
             self.observer.after(stage, lambda: self._view(frame.sensor, observed, matching, fresh))
 
     def _view(self, sensor: str, observed: Observed | None, matching: Matching | None, born: IntArray) -> TrackerView:
-        columns, P = self._columns.select(np.arange(len(self))), self._kinematics().P
+        columns, now = self._columns.select(np.arange(len(self))), self._kinematics()
         columns.last_seen += self.start
         columns.last_in_view += self.start
         return TrackerView(
@@ -442,12 +442,14 @@ class TrackSet:
             sensor,
             columns,
             self._nodes(),
-            P,
+            now.P,
             self._origin,
             self.graph,
             observed,
             matching,
             born,
+            self._boxes(now.position, now.velocity),
+            self._state.running_graph() if self.providers else None,
         )
 
     def _boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:

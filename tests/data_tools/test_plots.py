@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from data_tools.metrics import LabelErrors, RecallCurves
 from data_tools.plots import (
@@ -12,6 +13,7 @@ from data_tools.plots import (
     error_histograms,
     png,
     recall_sweep,
+    running_graph_picture,
     trails,
 )
 from saga_fg import Annotations, Boxes, Detections, Tracks
@@ -100,3 +102,32 @@ def test_recall_sweeps_leave_out_what_is_not_reached() -> None:
         assert max(line.get_xdata()) <= 0.75
         assert set(line.get_ydata()) == {0.5}
     assert png(figure).startswith(b"\x89PNG")
+
+
+def test_a_running_graph_is_drawn_where_it_is() -> None:
+    car = {"name": "car 1 at 1.00 s", "kind": "object", "time": 1.0, "position": [20.0, 0.0]}
+    nodes = [
+        car | {"covariance": [[1, 0], [0, 4]]},
+        car | {"name": "car 1 at 0.90 s", "time": 0.9, "position": [19.9, 0.0]},
+        car | {"name": "car 2 at 0.90 s", "time": 0.9, "position": [40.0, 5.0]},
+        {"name": "post 3", "kind": "landmark", "time": None, "position": [30.0, -9.0]},
+    ]
+    factors = [
+        {"kind": "interaction", "nodes": [0, 1, 2], "edges": [["CarFollowing", 0.5]]},
+        {"kind": "detection", "nodes": [0]},
+    ]
+    figure = running_graph_picture({"nodes": nodes, "factors": factors}, "a graph")
+    (ax,) = figure.axes
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    factors_of = ["interaction factor", "detection factor", "car following"]
+    assert labels == ["object at 1.00 s", "landmark", "earlier", *factors_of]
+    assert [text.get_text() for text in ax.texts] == ["car 1", "post 3"]
+    drawn = [line.get_xydata() for line in ax.lines]
+    assert any(np.array_equal(line, [[20.0, 0.0]]) for line in drawn)
+    ends = [line[-1].tolist() for line in drawn if len(line) == 2]
+    assert [40.0, 5.0] in ends  # of the edge from car 2
+    set_back = next(line[0] for line in drawn if len(line) == 1 and 10 < line[0][0] < 19.5)
+    assert set_back[1] == pytest.approx(0.0)  # straight behind, where it can be seen
+    (around,) = running_graph_picture({"nodes": nodes, "factors": factors}, centre=[20, 0], radius=5.0).axes
+    assert around.get_xlim() == (15.0, 25.0)
+    running_graph_picture({"nodes": [], "factors": []})

@@ -12,14 +12,18 @@ from typer.testing import CliRunner
 
 from pipelines.bench.contenders import GtsamWindow, Ours, OurWindow, Textbook
 from pipelines.bench.estimator_figures import Row, Soak, criteria, exponents
-from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
+from pipelines.bench.estimators import KINDS, EstimatorBenchSettings, bench_estimators
 from pipelines.bench.flocks import flock
 from pipelines.bench.measuring import size_of
+from pipelines.bench.running_graph import Vehicles
 from pipelines.cli import app
 from saga_fg import InputError
-from saga_fg.estimators import JointKalmanFilter
+from saga_fg.estimators import IncrementalSmoother, JointKalmanFilter
+from saga_fg.graph import OBJECT
 
-TINY = EstimatorBenchSettings(sizes=(4, 8), frames=2, batch_frames=4, batch_nodes=6, soak_frames=20, soak_nodes=5)
+TINY = EstimatorBenchSettings(
+    sizes=(4, 8), frames=2, batch_frames=4, batch_nodes=6, soak_frames=20, soak_nodes=5, scenes=2, scene_frames=5
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +47,9 @@ def test_every_exact_estimator_is_exact(result) -> None:
 
 def test_ratios_are_those_of_the_times(result) -> None:
     for row in result.rows:
-        baseline = {"filter": "textbook", "fixed lag": "GTSAM's", "batch": "textbook"}[row.case]
+        textbook = dict.fromkeys(("filter", "batch"), "textbook")
+        others = {"fixed lag": "GTSAM's", "running graph": "linear", "nonlinear": "whole graph"}
+        baseline = (textbook | others)[row.case]
         (base,) = [
             other
             for other in result.rows
@@ -54,16 +60,43 @@ def test_ratios_are_those_of_the_times(result) -> None:
 
 
 def test_the_endurance_run_tells_its_start_and_end(result) -> None:
-    assert [(soak.graph, soak.frames) for soak in result.soaks] == [("connected", 20), ("components", 20)]
+    told = [(soak.contender, soak.graph, soak.frames) for soak in result.soaks]
+    assert told == [("isam2", "connected", 20), ("isam2", "components", 20), ("drivers", "components", 20)]
     for soak in result.soaks:
         assert min(soak.milliseconds) > 0
         assert min(soak.memory) > 1
 
 
+def test_the_running_graph_is_measured_on_what_is_nonlinear(result) -> None:
+    drivers = {(row.graph, row.contender) for row in result.rows if row.case == "running graph" and row.nodes == 8}
+    assert drivers == {(kind, name) for kind in KINDS for name in ("linear", "intelligent driver")}
+    whole, window = (row for row in result.rows if row.case == "nonlinear")
+    assert math.isnan(whole.largest_error)
+    assert window.largest_error >= window.average_error >= 0
+    assert whole.band == window.band
+    assert window.band[0] < 1 < window.band[1]
+
+
+def test_vehicles_take_each_others_places() -> None:
+    """One place after the other gets a new vehicle; those behind it go on behind that one."""
+    smoother, vehicles = IncrementalSmoother(), Vehicles(10, 5, life=10)
+    seen: set[int] = set()
+    for k in range(25):
+        smoother.step(0.1 * k, [vehicles])
+        there = smoother.graph().of(OBJECT, k)
+        new = there.keys() - seen
+        assert len(there) == 10
+        assert len(new) == (10 if k == 0 else 1)
+        seen |= new
+        places = np.stack([smoother.state(there[i].key)[:2] for i in vehicles.ids(k).tolist()])
+        expected = vehicles.start[:, :2] + [0.8 * k, 0.0]
+        assert np.abs(places - expected).max() < 3.0
+
+
 def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     path = tmp_path / "figures.json"
-    arguments = "bench estimators --sizes 4 --frames 1 --batch-frames 2 --batch-nodes 4 --soak-frames 10 --soak-nodes 4"
-    run = CliRunner().invoke(app, [*arguments.split(), "--json", str(path)])
+    sizes = "--sizes 4 --frames 1 --batch-frames 2 --batch-nodes 4 --soak-frames 10 --soak-nodes 4 --scenes 1"
+    run = CliRunner().invoke(app, ["bench", "estimators", *sizes.split(), "--json", str(path)])
     assert run.exit_code == 0, run.output
     for words in ("figures to reach", "isam2", "gtsam 4", "MB at the end", "not measured"):
         assert words in run.stdout

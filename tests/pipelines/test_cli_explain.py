@@ -93,6 +93,49 @@ def test_an_event_that_nobody_wrote(folder: Path, tmp_path: Path, change: dict[s
     assert result.stdout == ""
 
 
+def test_the_running_graph_is_drawn(folder: Path, tmp_path: Path) -> None:
+    arguments = ("explain", folder / "tracks.csv", "--graph", "--time", "0.55", "--output")
+    done = saga_fg(*arguments, tmp_path / "g.svg", "--scene", "b")
+    assert done.exit_code == 0, done.output
+    drawn = (tmp_path / "g.svg").read_text()
+    for words in ("b: the running graph at 0.50 s", "car 1", "car 2", "interaction factor", "detection factor"):
+        assert f"<!-- {words}" in drawn
+    assert saga_fg(*arguments, tmp_path / "g.png", "--scene", "a", "--track", "2").exit_code == 0
+    assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--graph", "--output", "g.txt"), "ends in .png, .svg or .pdf"),
+        (("--graph", "--output", "g.png"), "--scene: expected one of those with graphs, a, b"),
+        (
+            ("--graph", "--output", "g.png", "--scene", "a", "--time", "9"),
+            "expected 0 to 2.90 s after",
+        ),
+        (("--graph", "--output", "g.png", "--scene", "a", "--track", "9"), "--track 9: expected a track that is there"),
+        ((), "expected --track, or --graph"),
+    ],
+)
+def test_graphs_that_are_not_there(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = saga_fg("explain", folder / "tracks.csv", *arguments)
+    assert done.exit_code == 2
+    assert expected in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_graph_that_nobody_wrote(tmp_path: Path) -> None:
+    for broken in ({"nodes": 3, "factors": []}, {"nodes": [], "factors": [{"kind": "birth", "nodes": [4]}]}, {}):
+        event = {"scene": "a", "event": "graph", "time": 1.0, "sensor": "lidar", **broken}
+        (tmp_path / "t.csv.journal.jsonl").write_text(json.dumps(event) + "\n")
+        done = saga_fg("explain", tmp_path / "t.csv", "--graph", "--output", tmp_path / "g.png")
+        assert done.exit_code == 2
+        assert "expected graphs as --explain writes them" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("option", "expected"), [(("--method", "centerpoint"), "keeps no journal"), (("--workers", "1"), "goes without")]
 )

@@ -12,8 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.simulator import simulate_scene
-from data_tools.trajectories import read_kitti_poses, read_tum_poses
+from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.bench.joint import JointBench, bench_joint
+from pipelines.bench.joint_online import bench_online
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.slam.joint import keyframes, run_joint
@@ -103,3 +104,27 @@ def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
     assert 0.05 < first.std(axis=0).mean() < 0.2
     again = observe_poles(poses, 1, settings)
     assert [len(now) for now in seen] == [len(now) for now in again]
+
+
+def test_online_objects_are_scored_where_both_report_them() -> None:
+    scenes = [simulate_scene(replace(SHORT, duration=3.0), seed, f"street {seed}") for seed in (1, 2)]
+    config = load_config("simulated")
+    result = bench_online(scenes, config, [0], lag=1.0)
+    for scene, row in zip(scenes, result.rows, strict=True):
+        run = run_joint(scene, config, JointSettings(), "lidar", 0, lag=1.0)
+        assert run.online is not None
+        online = Trajectory(run.online.timestamps, run.online.newest)
+        assert row.ate == (run.errors()[0].ate, trajectory_errors(online, run.truth).ate)
+        assert row.pairs > 20
+        assert 0 < row.median_velocity[1] < row.velocity[1] < 5
+        assert 0 < row.position[1] < 2
+    squares = np.array([np.square(row.position) * row.pairs for row in result.rows]).sum(axis=0)
+    assert result.position.estimate == pytest.approx(np.sqrt(squares[1] / squares[0]) - 1)
+
+
+def test_the_online_benchmark_prints_both_and_wants_the_truth() -> None:
+    scene = replace(simulate_scene(SHORT, 1), ground_truth=None)
+    with pytest.raises(InputError, match="expected ground truth"):
+        bench_online([scene], load_config("simulated"), [0], lag=1.0)
+    done = CliRunner().invoke(app, ["bench", "joint", "--online", "--poles"])
+    assert "--online: expected neither --poles nor --lanes" in done.output

@@ -24,6 +24,7 @@ from pipelines.tracking import track_scene
 from pipelines.view import SceneView, draw_scene, read_slam_view, write_view
 from pipelines.view.scenes import HELD, ellipses
 from saga_fg import InputError
+from saga_fg.tracking import Journal
 
 Rows = dict[str, dict[Any, Any]]
 """Column -> time (None: always) -> value."""
@@ -55,9 +56,11 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
     config = load_config("simulated")
     scene = SimulatedTraffic(SimulatorSettings(duration=2.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
-    done = track_scene(scene, config.new_tracker("saga"))
+    events: list[dict[str, Any]] = []
+    done = track_scene(scene, config.new_tracker("saga", Journal(config.tracker, events.append)))
     shown = scene_of_run({"saga": done}, config.tracker.edges, config.sensors)
-    write_view(tmp_path / "a.rrd", "a", ["scene-0001"], draw_scene(SceneView(shown)))
+    graphs = [event for event in events if event["event"] == "graph"]
+    write_view(tmp_path / "a.rrd", "a", ["scene-0001"], draw_scene(SceneView(shown, graphs=graphs)))
     found = read_back(tmp_path / "a.rrd")
     origin, k = scene.world_T_ego[0, :3, 3], 12
     time = round(float(scene.timestamps[k] - scene.timestamps[0]), 9)
@@ -86,6 +89,18 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
     seen = len(at("truth/seen", "Boxes3D:centers"))
     assert seen == scene.ground_truth[k].visible.sum()
     assert seen + len(at("truth/hidden", "Boxes3D:centers")) == len(scene.ground_truth[k])
+    graph = [each for each in graphs if abs(each["time"] - scene.timestamps[k]) < 1e-4][-1]
+    assert at("graph/nodes", "Points3D:labels") == [node["name"] for node in graph["nodes"]]
+    np.testing.assert_allclose(
+        np.array(at("graph/nodes", "Points3D:positions"))[:, :2],
+        np.array([node["position"] for node in graph["nodes"]]) - origin[:2],
+        atol=2e-3,
+    )
+    detections = [factor for factor in graph["factors"] if factor["kind"] == "detection"]
+    assert len(at("graph/detection", "LineStrips3D:strips")) == len(detections) > 0
+    assert len(at("graph/interaction", "LineStrips3D:strips")) == 2 * sum(
+        factor["kind"] == "interaction" for factor in graph["factors"]
+    )
     np.testing.assert_allclose(at("ego", "Transform3D:translation")[0], scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
 
 

@@ -63,7 +63,7 @@ def test_matches_name_the_candidates_and_why_they_were_rejected() -> None:
 
 def test_what_another_track_took_is_named() -> None:
     events, _ = run(frame(0.0, 0.0, 1.0), frame(0.1, 0.0, 1.0), frame(0.2, 0.9))
-    last = {event["track"]: event for event in events if event["time"] == 0.2}
+    last = {event["track"]: event for event in events if event["time"] == 0.2 and "track" in event}
     assert last[2]["event"] == "matched"
     assert last[1]["event"] == "missed"
     assert last[1]["candidates"][0]["outcome"] == "taken by track 2"
