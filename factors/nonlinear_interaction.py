@@ -36,7 +36,7 @@ class NonlinearInteraction:
     predict(x, others, dt) -> (d,): the node's state dt seconds later, from its state x (d,) and its neighbours' states
     others, a list of (d_j,), which may be empty. jacobians(x, others, dt) -> (F, [F_j, ...]), of shapes (d, d) and
     (d, d_j); central differences of `predict` when absent. angles: components of the state that are angles in rad, so
-    that turning past pi is no jump.
+    that turning past pi is no jump. name: for messages, by default that of `predict`.
 
         def repel(x, others, dt): ...
 
@@ -48,6 +48,7 @@ class NonlinearInteraction:
     predict: Prediction
     jacobians: Derivative | None = None
     angles: tuple[int, ...] = ()
+    name: str = ""
 
     def factor(
         self,
@@ -75,7 +76,7 @@ class NonlinearInteraction:
             jacobians=partial(_jacobians, self, step),
             robust=robust,
             angles=self.angles,
-            name=getattr(self.predict, "__name__", "interaction"),
+            name=self._named,
         )
 
     def factors(
@@ -113,8 +114,12 @@ class NonlinearInteraction:
             jacobians=partial(_jacobians, self, step),
             robust=robust,
             angles=self.angles,
-            name=f"{getattr(self.predict, '__name__', 'interaction')} interactions",
+            name=f"{self._named} interactions",
         )
+
+    @property
+    def _named(self) -> str:
+        return self.name or str(getattr(self.predict, "__name__", "interaction"))
 
     def affine(
         self, x: ArrayLike, others: Sequence[ArrayLike], dt: float

@@ -185,7 +185,7 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
 @cache
 def interaction(law: AccelerationLaw) -> NonlinearInteraction:
     """The law for factors with keys (next, own, neighbours), states (p, v); stacks too."""
-    return NonlinearInteraction(partial(_predict, law), partial(_jacobians, law))
+    return NonlinearInteraction(partial(_predict, law), partial(_jacobians, law), name=type(law).__name__)
 
 
 def held(by_state: FloatArray, dt: float) -> FloatArray:

@@ -7,6 +7,7 @@ Levenberg-Marquardt finds on the graph they export.
 import gtsam
 import numpy as np
 import pytest
+from graph_keys import keys_of
 
 from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SceneGraph
 from saga_fg.discretisation import discretise
@@ -121,9 +122,9 @@ def test_smoothers_reach_the_minimum_of_the_graph(seed):
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-14)
     parameters.setAbsoluteErrorTol(1e-14)
-    solved = gtsam.LevenbergMarquardtOptimizer(exported.graph, exported.values, parameters).optimize()
-    for moment, keys in zip(smoother.smoothed(), exported.keys, strict=True):
-        for node, key in keys.items():
+    solved = gtsam.LevenbergMarquardtOptimizer(exported.native(), exported.values, parameters).optimize()
+    for epoch, moment in enumerate(smoother.smoothed()):
+        for node, key in keys_of(exported, epoch).items():
             sigma = np.sqrt(np.diag(moment.covariance([node])[0]))
             assert np.abs((moment.mean([node])[0] - solved.atVector(key)) / sigma).max() < 1e-5
     window = driven(FixedLagSmoother(100.0), seed=seed)
