@@ -8,6 +8,7 @@ keeps its variable.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
@@ -15,8 +16,9 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from factors import FactorError, joint_prior_factor, marginal_moments
-from saga_fg.arrays import BoolArray
+from factors import FactorError, joint_prior_factor, marginal_factors, marginal_moments
+from factors.marginal import Elimination
+from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, predict
@@ -25,8 +27,9 @@ from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
-_SMALL = 64  # size of the largest component for which the first limit holds, since it is eliminated by QR
-_LIMITS = 1e11, 1e6  # variance predicted over process noise, up to which factors keep enough digits
+_SMALL = 64  # size of the largest component that is eliminated by QR
+_LIMIT = 1e11  # variance predicted over process noise, up to which factors keep enough digits
+_LIMIT_WIDE = 1e6  # the same by Cholesky
 
 
 def joint_gaussian(
@@ -48,8 +51,9 @@ def joint_gaussian(
     blocks = zeros(partition)
     for k, name in enumerate(number.tolist()):
         rows = np.flatnonzero(own == k)
+        mine, wide = [keys[row] for row in rows.tolist()], int(layout.dims[rows].sum()) > _SMALL
         try:
-            P = marginal_moments(parts[name], [keys[row] for row in rows.tolist()], "qr")[1]
+            P = _covariance(parts[name], mine, "cholesky" if wide else "qr")
         except FactorError as error:
             raise graph.undetermined(error) from error
         blocks[partition.group[rows[0]]][partition.row[rows[0]]] = P
@@ -61,6 +65,15 @@ def joint_gaussian(
         for node, key in zip(layout.nodes.tolist(), keys, strict=True)
     ]
     return BlockGaussian(partition, np.concatenate([np.empty(0), *mean]), blocks)
+
+
+def _covariance(linear: gtsam.GaussianFactorGraph, keys: Sequence[int], elimination: Elimination) -> FloatArray:
+    """The joint covariance (D, D) of variables, all others eliminated."""
+    others = set(linear.keyVector()) - set(keys)
+    if elimination == "cholesky":  # where it fails, QR has twice the digits
+        with contextlib.suppress(FactorError):
+            linear = marginal_factors(linear, others, elimination)
+    return marginal_moments(linear, keys, "qr")[1]
 
 
 def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
@@ -86,12 +99,15 @@ def stays(dynamics: Dynamics) -> BoolArray:
     return same & ~told
 
 
-def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray) -> BoolArray:
-    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable."""
+def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) -> BoolArray:
+    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable.
+
+    window: whether there is one to be lost, so that wide components are to keep their factors while that can be.
+    """
     prediction = Prediction.of(x, dynamics)
     label = prediction.components.label
-    wide = np.bincount(label, weights=x.layout.dims)[label] > _SMALL
-    return np.isin(label, label[(prediction.ratio > np.where(wide, *_LIMITS[::-1])) & ~still])
+    wide = np.bincount(label, weights=x.layout.dims)[label] > (np.inf if window else _SMALL)
+    return np.isin(label, label[(prediction.ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
 
 
 def in_moments(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:
