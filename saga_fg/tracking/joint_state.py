@@ -83,7 +83,7 @@ class JointTrackState:
     ) -> None:
         """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0 with variance 1.
 
-        With sightings from the vehicle, of which they are to be told next, nothing is known of where they are.
+        Where they are is what they were `seen` to be from the vehicle, if that is given.
         """
         if seen is not None:
             now = now._replace(P=np.tile(_ANYWHERE**2 * np.eye(2), (len(ids), 1, 1)))
@@ -104,6 +104,8 @@ class JointTrackState:
             else:
                 estimator.add(ids[rows], mean, P)
         self._born.update(dict.fromkeys(ids.tolist(), self._estimator.time))
+        if seen is not None:
+            self._see(ids, label, seen)
 
     def remove(self, ids: IntArray) -> None:
         """Marginalise tracks: what they told of their neighbours stays."""
