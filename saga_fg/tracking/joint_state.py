@@ -220,7 +220,7 @@ class JointTrackState:
     def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
         """(n, 2, 2) of where tracks are, seen from the vehicle's pose in the running graph."""
         assert isinstance(self._estimator, GraphFilter)
-        return relative_covariances(self._estimator, ids, self.types_of(label))
+        return relative_covariances(self._estimator, ids, self._by_type(label))
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
@@ -231,11 +231,6 @@ class JointTrackState:
     def node(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of some nodes, which need not be tracks."""
         return self._read(ids, label)
-
-    def places(self, ids: IntArray, label: StrArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (k, 2) of some nodes now, and their covariances (k, 2, 2)."""
-        now = self._read(ids, label)
-        return now.position, now.P
 
     def positions_before(self, ids: IntArray, label: StrArray, delay: float) -> tuple[FloatArray, FloatArray]:
         """Positions (n, 2) `delay` s ago, by own motion, and their covariances (n, 2, 2)."""
