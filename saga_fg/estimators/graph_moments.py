@@ -8,6 +8,7 @@ keeps its variable.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
@@ -15,8 +16,9 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from factors import FactorError, joint_prior_factor, marginal_moments
-from saga_fg.arrays import BoolArray
+from factors import FactorError, joint_prior_factor, marginal_factors, marginal_moments
+from factors.marginal import Elimination
+from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, predict
@@ -48,8 +50,9 @@ def joint_gaussian(
     blocks = zeros(partition)
     for k, name in enumerate(number.tolist()):
         rows = np.flatnonzero(own == k)
+        mine, wide = [keys[row] for row in rows.tolist()], int(layout.dims[rows].sum()) > _SMALL
         try:
-            P = marginal_moments(parts[name], [keys[row] for row in rows.tolist()], "qr")[1]
+            P = _covariance(parts[name], mine, "cholesky" if wide else "qr")
         except FactorError as error:
             raise graph.undetermined(error) from error
         blocks[partition.group[rows[0]]][partition.row[rows[0]]] = P
@@ -61,6 +64,15 @@ def joint_gaussian(
         for node, key in zip(layout.nodes.tolist(), keys, strict=True)
     ]
     return BlockGaussian(partition, np.concatenate([np.empty(0), *mean]), blocks)
+
+
+def _covariance(linear: gtsam.GaussianFactorGraph, keys: Sequence[int], elimination: Elimination) -> FloatArray:
+    """The joint covariance (D, D) of variables, all others eliminated."""
+    others = set(linear.keyVector()) - set(keys)
+    if elimination == "cholesky":  # where it fails, QR has twice the digits
+        with contextlib.suppress(FactorError):
+            linear = marginal_factors(linear, others, elimination)
+    return marginal_moments(linear, keys, "qr")[1]
 
 
 def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
@@ -111,7 +123,7 @@ def condense(graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, in
     for number in range(x.partition.count):
         rows = np.flatnonzero(x.partition.label == number)
         keys = [now[ids[row]] for row in rows.tolist()]
-        old = {label[earlier[ids[row]]] for row in rows.tolist()}
+        old = {label.get(earlier[ids[row]]) for row in rows.tolist()}
         gone = [key for key, part in label.items() if part in old and key not in keys]
         mean = np.split(x.mean[x.layout.places(rows)], np.cumsum(x.layout.dims[rows])[:-1])
         base = graph.base

@@ -148,9 +148,9 @@ class JointKalmanFilter:
         """All that the filter knows."""
         return self._state
 
-    def graph(self) -> FactorGraph:
-        """One joint prior a component: the filter keeps nothing of the past but this."""
-        return prior_graph(self._state)
+    def graph(self) -> FactorGraph | SceneFactorGraph:
+        """One joint prior a component: the filter keeps nothing of the past but this. With providers by name."""
+        return self._beside.priors(self._state, self._time) if self.providers else prior_graph(self._state)
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""

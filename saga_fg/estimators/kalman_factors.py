@@ -28,6 +28,7 @@ from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import WhitenedFactor, correct_whitened
 from saga_fg.estimators.dynamics import Dynamics, identity, predict
+from saga_fg.estimators.graph_moments import condense
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.partition import Partition
@@ -72,6 +73,14 @@ class Beside:
         nodes = x.without(others)
         return motion.dynamics(nodes.layout, nodes.mean).beside(x.layout, others)
 
+    def priors(self, x: BlockGaussian, time: float) -> SceneFactorGraph:
+        """All that is known at `time`, as one prior for each component."""
+        graph, ids = self.at(x, time)
+        graph.marginalise([key for key in graph.variables if key not in ids])
+        keys = {node: key for key, node in ids.items()}
+        condense(graph, x, keys, keys)
+        return graph
+
     def at(self, x: BlockGaussian, time: float) -> tuple[SceneFactorGraph, dict[int, int]]:
         """The variables at `time`, and the id in the joint state of each that is in it, by key."""
         graph, joint = self.graph.copy(), x.layout.nodes.tolist()
@@ -80,15 +89,14 @@ class Beside:
             graph.advance(time)
         else:  # asked again: the nodes have changed since
             graph.marginalise([key for key in graph.variables if key not in ids])
+        _move(graph, x, ids)
         nodes = []
         for node, state in zip(joint, np.split(x.mean, x.layout.offsets[1:-1]), strict=bool(joint)):
             if node not in ids:
                 kind, number = node_kind(node)
                 nodes.append((node, NewVariable(kind, number, state, label=self.labels.get(node, ""))))
         keys = graph.add_variables("tracks", [new for _, new in nodes])
-        ids |= {key: node for key, (node, _) in zip(keys, nodes, strict=True)}
-        _move(graph, x, ids)
-        return graph, ids
+        return graph, ids | {key: node for key, (node, _) in zip(keys, nodes, strict=True)}
 
 
 def asked(

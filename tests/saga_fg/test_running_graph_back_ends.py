@@ -19,6 +19,7 @@ from factors import (
     ResidualFactor,
     ResidualFactors,
     Robust,
+    SolverSettings,
     Vector,
     bearing_range_factor,
     between_factor,
@@ -158,6 +159,24 @@ def test_poses_and_landmarks_are_blocks_of_the_kalman_filter(noise):
     way = variable.type.local(its_pose, pose)
     assert np.abs(way / np.sqrt(np.diag(its_P))).max() < 0.2 * np.sqrt(noise)
     assert pytest.approx(its_P, rel=0.2 * np.sqrt(noise), abs=1e-9) == P
+
+
+@pytest.mark.parametrize("name", BACK_ENDS)
+def test_the_graph_says_what_the_estimator_knows(name):
+    """Law 4: readable names, and solved on its own it comes to the estimate."""
+    estimator = BACK_ENDS[name]([Surroundings()])
+    for operation in random_program(np.random.default_rng(7), moments=4, kinds=(CAR,)):
+        operation.run(estimator)
+        estimator.ask(ORIGIN)
+    graph = estimator.graph().copy()
+    nodes = estimator.nodes.tolist()
+    newest = graph.of(OBJECT, graph.epoch)
+    assert set(nodes) <= newest.keys()
+    assert {"landmark 3", f"ego pose 0 at {estimator.time:.2f} s"} <= set(map(str, graph.variables.values()))
+    graph.solve(SolverSettings(tolerance=1e-10))
+    for node in nodes:
+        sigma = np.sqrt(np.diag(estimator.covariance([node])[0]))
+        assert np.abs((graph.state(newest[node].key) - estimator.mean([node])[0]) / sigma).max() < 1e-7
 
 
 CARS = straight([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)], [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])

@@ -9,10 +9,12 @@ import traceback
 import gtsam
 import numpy as np
 import pytest
+from random_graphs import CAR
 
 from factors import ResidualFactor, ResidualFactors, Vector, gaussian_factor, interaction_factor, prior_factor
-from saga_fg import InputError
-from saga_fg.estimators import IncrementalSmoother, RelinearisationSettings
+from saga_fg import InputError, SceneGraph
+from saga_fg.discretisation import discretise
+from saga_fg.estimators import GraphFilter, IncrementalSmoother, JointKalmanFilter, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, LANDMARK, OBJECT, Additions, GraphError, NewVariable, SceneFactorGraph, key_of
 
 UNIT = gtsam.noiseModel.Isotropic.Sigma
@@ -236,8 +238,27 @@ def case(name, failures):
             np.testing.assert_allclose(smoother.state(key), untouched.state(key), atol=1e-12)
             np.testing.assert_allclose(smoother.covariance(key), untouched.covariance(key), atol=1e-10)
         assert smoother.graph().variables.keys() == untouched.graph().variables.keys()
+        for back_end in (JointKalmanFilter, GraphFilter):
+            in_the_tracker(back_end, function, message)
     except BaseException:
         failures.put(traceback.format_exc())
+
+
+def in_the_tracker(back_end, function, message):
+    """The same for an estimator of the tracker."""
+    given = Given(lambda view, key: Additions())
+    estimator = back_end([given])
+    estimator.add([7, 12], np.ones((2, 4)), np.stack([np.eye(4)] * 2), {7: "car", 12: "car"})
+    estimator.predict(discretise(SceneGraph.of([7, 12], CAR), 3.4))
+    estimator.ask(np.zeros(2))
+    before = estimator.joint_mean([7, 12]), estimator.joint_covariance([7, 12])
+    harmless, given.function = given.function, function
+    with pytest.raises(GraphError, match=message):
+        estimator.ask(np.zeros(2))
+    given.function = harmless
+    estimator.ask(np.zeros(2))
+    np.testing.assert_allclose(estimator.joint_mean([7, 12]), before[0], atol=1e-12)
+    np.testing.assert_allclose(estimator.joint_covariance([7, 12]), before[1], atol=1e-10)
 
 
 @pytest.mark.parametrize("name", CASES)
