@@ -130,7 +130,7 @@ class GraphFilter:
             return
         standing, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
         keys = {n: key if n in standing else node_key(n, epoch) for n, key in self._keys.items()}
-        chosen = lossy(x, dynamics, still)
+        chosen = lossy(x, dynamics, still, window=self._lag > 0)
         unused = np.isin(transition.nodes, nodes[still | chosen])
         change = self._in_moments(dynamics, chosen, keys) if chosen.any() else None
         smoother = self._changed()

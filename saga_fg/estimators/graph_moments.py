@@ -27,8 +27,9 @@ from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
-_SMALL = 64  # size of the largest component for which the first limit holds, since it is eliminated by QR
-_LIMITS = 1e11, 1e6  # variance predicted over process noise, up to which factors keep enough digits
+_SMALL = 64  # size of the largest component that is eliminated by QR
+_LIMIT = 1e11  # variance predicted over process noise, up to which factors keep enough digits
+_LIMIT_WIDE = 1e6  # the same by Cholesky
 
 
 def joint_gaussian(
@@ -98,12 +99,15 @@ def stays(dynamics: Dynamics) -> BoolArray:
     return same & ~told
 
 
-def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray) -> BoolArray:
-    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable."""
+def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) -> BoolArray:
+    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable.
+
+    window: whether there is one to be lost, so that wide components are to keep their factors while that can be.
+    """
     prediction = Prediction.of(x, dynamics)
     label = prediction.components.label
-    wide = np.bincount(label, weights=x.layout.dims)[label] > _SMALL
-    return np.isin(label, label[(prediction.ratio > np.where(wide, *_LIMITS[::-1])) & ~still])
+    wide = np.bincount(label, weights=x.layout.dims)[label] > (np.inf if window else _SMALL)
+    return np.isin(label, label[(prediction.ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
 
 
 def in_moments(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:

@@ -20,6 +20,7 @@ from saga_fg.transition import Transition
 
 if TYPE_CHECKING:  # it is made of measurements itself
     from saga_fg.estimators.factor_graph import FactorGraph
+    from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ class Estimator(Protocol):
         """Joint covariance of some nodes, in the order given, of any sizes."""
         ...
 
-    def graph(self) -> FactorGraph:
+    def graph(self) -> FactorGraph | SceneFactorGraph:
         """The equivalent factor graph and its solution; GTSAM's own solvers come to the same."""
         ...
 
