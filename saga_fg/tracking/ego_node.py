@@ -7,18 +7,20 @@ which the node is then tied. A driver behind it does what it does (the edge rule
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.by_class import class_settings
+from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.geometry import yaw_of
 from saga_fg.interactions import NodeTable
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.ego_pose import Sightings
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics
+from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
 
 EGO_ID = 0  # tracks begin at 1, the road's nodes count down from -1
@@ -45,24 +47,37 @@ class EgoNode:
     def __len__(self) -> int:
         return int(self.present)
 
+    @property
+    def _estimated(self) -> bool:
+        return self.settings is not None and self.settings.estimated
+
+    def located(self, frame: Frame, world_T_ego: FloatArray | None) -> Frame:
+        """The frame with the pose of the running graph, where that is estimated."""
+        if not self._estimated:
+            return frame
+        if world_T_ego is None:
+            raise InputError("ego.estimated: expected a provider that adds the vehicle's pose (saga_fg.providers)")
+        return replace(frame, world_T_ego=world_T_ego)
+
+    def sightings(self, frame: Frame, observed: Observed) -> Sightings | None:
+        """What was observed, in the frame of the vehicle whose pose is estimated; None for what is not seen from it."""
+        if not self._estimated or frame.coordinates == "world" or frame.world_T_ego is None:
+            return None
+        return Sightings.of(frame.world_T_ego, observed.boxes.position, observed.R[:, :2, :2])
+
     def place(self, frame: Frame, time: float, origin: FloatArray, state: JointTrackState) -> None:
         """Take in where a frame of `time`, s, has the vehicle; `origin` (2,) of local positions."""
         if self.settings is None or frame.world_T_ego is None or time <= self.time:
             return
-        pose, R = frame.world_T_ego, self.settings.deviation**2 * np.eye(2)
-        place = (pose[:2, 3] - origin)[None]
-        label = np.array([self.settings.label])
-        seen = Sightings(np.zeros((1, 3)), R[None]) if self.settings.estimated else None
-        measured = True
-        if not self.present:
-            speed = self.motion.birth_speed**2 * np.eye(2)
-            state.add(_ID, label, Kinematics(place, np.zeros((1, 2)), R[None], speed[None]), seen=seen)
-            measured = seen is not None
-        if measured:
-            full = np.zeros((1, 4, 4))
-            full[0, :2, :2] = R
-            z = np.concatenate([place, np.zeros((1, 2))], axis=1)
-            state.update(_ID, label, z, full, np.zeros(1, dtype=bool), 0.0, seen)
+        pose, R, label = frame.world_T_ego, np.zeros((1, 4, 4)), np.array([self.settings.label])
+        R[0, :2, :2] = self.settings.deviation**2 * np.eye(2)
+        z = np.concatenate([pose[:2, 3] - origin, np.zeros(2)])[None]
+        seen = Sightings(np.zeros((1, 3)), R[:, :2, :2]) if self.settings.estimated else None
+        if self.present:
+            state.update(_ID, label, z, R, np.zeros(1, dtype=bool), 0.0, seen)
+        else:
+            speed = self.motion.birth_speed**2 * np.eye(2)[None]
+            state.add(_ID, label, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), seen=seen)
         velocity = state.node(_ID, label).velocity[0]
         self.present, self.time, self.yaw = True, time, float(yaw_of(pose[:3, :3]))
         self.has_moved = self.has_moved or bool(np.hypot(*velocity) > MOVING)

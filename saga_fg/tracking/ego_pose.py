@@ -7,6 +7,7 @@ detection is compared with the covariance of r, and not with that of p.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -47,24 +48,29 @@ def local_pose(graph: SceneFactorGraph) -> FloatArray | None:
     return pose.matrix() if isinstance(pose, gtsam.Pose3) else yaw_transform(pose.x(), pose.y(), 0.0, pose.theta())
 
 
-def relative_covariances(estimator: GraphFilter, ids: IntArray, types: tuple[NodeType, ...]) -> FloatArray:
-    """Covariances (n, 2, 2) of where objects are, seen from the vehicle, in the axes of the world."""
+def relative_covariances(
+    estimator: GraphFilter, ids: IntArray, groups: Sequence[tuple[NodeType, IntArray]]
+) -> FloatArray:
+    """Covariances (n, 2, 2) of where objects are, seen from the vehicle, in the axes of the world.
+
+    groups: rows of `ids` whose states mean the same, with a type of theirs
+    """
     key = key_of(EGO_POSE, 0, estimator.graph().epoch)
     pose = estimator.graph().state(key)
-    planar = isinstance(pose, gtsam.Pose2)
-    matrix = pose.matrix()[None]
-    turn = matrix[0, :2, :2]
-    joint = estimator.covariance_with([key], ids)
-    d, start, result = pose.dim(), pose.dim(), np.zeros((len(ids), 2, 2))
-    for row, (node, node_type) in enumerate(zip(ids.tolist(), types, strict=True)):
+    T, d, result = pose.matrix(), pose.dim(), np.zeros((len(ids), 2, 2))
+    n, turn = len(T) - 1, T[:2, :2]
+    for node_type, rows in groups:
         x, y = node_type.index(POSITION).tolist()
-        state = estimator.mean([node])
-        z = pose.transformTo(state[0, [x, y]] if planar else np.append(state[0, [x, y]], pose.z()))
-        seen = relative_detection_factors([[0, 1]], [z], np.eye(2), node_type.dim, (x, y))
+        states, poses = estimator.mean(ids[rows]), np.broadcast_to(T, (len(rows), *T.shape))
+        places = np.tile(T[:n, n], (len(rows), 1))
+        places[:, :2] = states[:, [x, y]]
+        keys = np.stack([np.zeros(len(rows)), np.arange(1, len(rows) + 1)], axis=1).astype(np.uint64)
+        seen = relative_detection_factors(keys, (places - T[:n, n]) @ T[:n, :n], np.eye(2), node_type.dim, (x, y))
         assert seen.jacobians is not None
-        J_pose, J_state = (np.asarray(J)[0] for J in seen.jacobians(matrix, state))
-        mine = np.r_[0:d, start : start + node_type.dim]
-        G = turn @ np.concatenate([J_pose, J_state], axis=1)
-        result[row] = G @ joint[np.ix_(mine, mine)] @ G.T
-        start += node_type.dim
+        J_pose, J_state = (np.asarray(J) for J in seen.jacobians(poses, states))
+        G = turn @ np.concatenate([J_pose, J_state], axis=2)
+        joint = estimator.covariance_with([key], ids[rows])
+        for k, row in enumerate(rows.tolist()):
+            mine = np.r_[0:d, d + k * node_type.dim : d + (k + 1) * node_type.dim]
+            result[row] = G[k] @ joint[np.ix_(mine, mine)] @ G[k].T
     return result

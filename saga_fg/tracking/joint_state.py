@@ -86,7 +86,7 @@ class JointTrackState:
     ) -> None:
         """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0.
 
-        With sightings from the vehicle, of which they are to be told next, nothing is known of where they are.
+        Where they are is what they were `seen` to be from the vehicle, if that is given.
         """
         if seen is not None:
             now = now._replace(P=np.tile(_ANYWHERE**2 * np.eye(2), (len(ids), 1, 1)))
@@ -110,6 +110,8 @@ class JointTrackState:
             else:
                 estimator.add(ids[rows], mean, P)
         self._born.update(dict.fromkeys(ids.tolist(), self._estimator.time))
+        if seen is not None:
+            self._see(ids, label, seen)
 
     def remove(self, ids: IntArray) -> None:
         """Marginalise tracks: what they told of their neighbours stays."""
@@ -234,7 +236,7 @@ class JointTrackState:
     def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
         """(n, 2, 2) of where tracks are, seen from the vehicle's pose in the running graph."""
         assert isinstance(self._estimator, GraphFilter)
-        return relative_covariances(self._estimator, ids, self.types_of(label))
+        return relative_covariances(self._estimator, ids, self._by_type(label))
 
     def running_graph(self) -> SceneFactorGraph:
         """The estimator's graph."""
@@ -249,11 +251,6 @@ class JointTrackState:
     def node(self, ids: IntArray, label: StrArray) -> Kinematics:
         """Of some nodes, which need not be tracks."""
         return self._read(ids, label)
-
-    def places(self, ids: IntArray, label: StrArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (k, 2) of some nodes now, and their covariances (k, 2, 2)."""
-        now = self._read(ids, label)
-        return now.position, now.P
 
     def positions_before(self, ids: IntArray, label: StrArray, delay: float) -> tuple[FloatArray, FloatArray]:
         """Positions (n, 2) `delay` s ago, by own motion, and their covariances (n, 2, 2)."""

@@ -103,7 +103,7 @@ class Roadside:
         seen = sensor.in_world(frame)
         seen = seen.select(of_classes(seen.boxes.label, SIGHTINGS))
         R = sensor.detection_covariance(seen, sensor.origin(frame))
-        position, P = state.places(self.id[lights], self.label[lights])
+        position, _, P, _ = state.node(self.id[lights], self.label[lights])
         z = seen.boxes.position[:, :2] - origin
         d2, log_det = mahalanobis(position, P, z, R)
         apart = np.hypot(*np.moveaxis(z[None] - position[:, None], -1, 0))
@@ -129,7 +129,7 @@ class Roadside:
         n, m = len(tracks), len(self)
         if m == 0:
             return tracks
-        position, _ = state.places(self.id, self.label)
+        position = state.node(self.id, self.label).position
         moved = tracks.has_moved
         beliefs = [self.beliefs[light] for light in self.light if light]
         closed = self.settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))

@@ -20,7 +20,6 @@ from saga_fg.boxes import Boxes
 from saga_fg.by_class import class_values
 from saga_fg.chi_square import chi_square_quantile
 from saga_fg.edge_rules import EdgeRule, build_graph
-from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.graph import FactorProvider
 from saga_fg.interactions import NodeTable
@@ -110,11 +109,11 @@ class TrackSet:
                 self.roadside.learn(road_map, self._origin, self._state)
         self._state.hear(frame, self._origin)
         self.predict(max(now, before))
-        frame = self._located(frame)
+        frame = self._tables.ego.located(frame, self.world_T_ego)
         if delay == 0:
             self._tables.ego.place(frame, self._time, self._origin, self._state)
         observed = observe(frame, sensor, self.settings.classes)
-        seen = self._seen_from_ego(frame, observed)
+        seen = self._tables.ego.sightings(frame, observed)
         self._tell("predict", frame)
         self.roadside.heed(frame, sensor, self._origin, self._state, delay)
         self._tell("observe", frame, observed)
@@ -172,24 +171,6 @@ class TrackSet:
         self._tables.standing.predict(dt, self._kinematics(), settings)
         others = len(self._tables.ego) + len(self.roadside)
         return np.concatenate([self._tables.standing.noise_scale(settings), np.ones(others)])
-
-    def _located(self, frame: Frame) -> Frame:
-        """The frame with the vehicle's pose, where that is estimated."""
-        if self.settings.ego is None or not self.settings.ego.estimated:
-            return frame
-        world_T_ego = self.world_T_ego
-        if world_T_ego is None:
-            raise InputError(
-                "ego.estimated: expected a provider that adds the vehicle's pose, as saga_fg.providers has"
-            )
-        return replace(frame, world_T_ego=world_T_ego)
-
-    def _seen_from_ego(self, frame: Frame, observed: Observed) -> Sightings | None:
-        """What was observed, in the frame of the vehicle whose pose is estimated; None for what is not seen from it."""
-        if self.settings.ego is None or not self.settings.ego.estimated or frame.coordinates == "world":
-            return None
-        assert frame.world_T_ego is not None
-        return Sightings.of(frame.world_T_ego, observed.boxes.position, observed.R[:, :2, :2])
 
     def _associate(
         self, observed: Observed, sensor: Sensor, delay: float, said: FloatArray, seen: Sightings | None
@@ -329,9 +310,6 @@ class TrackSet:
         )
         mine = None if sightings is None else sightings.select(born)
         self._state.add(ids, boxes.label, kinematics, delay, mine)
-        if mine is not None:
-            still = np.zeros((len(born), 4))
-            self._state.update(ids, boxes.label, still, observed.R[born], np.zeros(len(born), dtype=bool), delay, mine)
         self._update_range_rate(observed, born, ids, boxes.label, delay)
         confirmed = p >= self.settings.existence.confirm
         seen, told = self._time - delay, (observed.told[0][born], observed.told[1][born])

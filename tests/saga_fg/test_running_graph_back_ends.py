@@ -167,7 +167,8 @@ def test_the_graph_says_what_the_estimator_knows(name):
     estimator = BACK_ENDS[name]([Surroundings()])
     for operation in random_program(np.random.default_rng(7), moments=4, kinds=(CAR,)):
         operation.run(estimator)
-        estimator.ask(ORIGIN)
+        estimator.hear(None, ORIGIN)
+        estimator.ask()
     graph = estimator.graph().copy()
     nodes = estimator.nodes.tolist()
     newest = graph.of(OBJECT, graph.epoch)

@@ -113,7 +113,7 @@ def test_the_map_is_corrected_by_what_is_seen():
     frames = [replace(frame, road_map=wrong) for frame in queue_frames()]
     tracker = tracked(frames)
     light = tracker.roadside.id[tracker.roadside.label == "traffic_light"]
-    position, P = tracker._tracks._state.places(light, np.array(["traffic_light"]))
+    position, _, P, _ = tracker._tracks._state.node(light, np.array(["traffic_light"]))
     assert position[0, 1] + tracker._tracks._origin[1] == pytest.approx(0.0, abs=0.15)
     assert P[0, 1, 1] < 0.1
 
