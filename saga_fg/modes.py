@@ -55,7 +55,7 @@ _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurem
 class Stationary:
     """What stands: its position drifts, its velocity is forgotten."""
 
-    drift: float = setting(0.02, "how far the place drifts, standard deviation after one second, m")
+    drift: float = setting(0.2, "how far the place drifts, standard deviation after one second, m")
     speed: float = setting(0.1, "standard deviation of a component of the velocity, m/s")
     halt_time: float = setting(0.1, "time constant with which a velocity is forgotten, s")
 

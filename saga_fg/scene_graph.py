@@ -104,9 +104,14 @@ class NonlinearEdges:
     given: FloatArray
 
     def __post_init__(self) -> None:
-        rate = checked(f"edges of {self.interaction}: rate", self.rate, (len(self.target),))
-        if (rate < 0).any() or (self.target == self.source).any() or len(self.given) != len(self.target):
-            raise InputError(f"edges of {self.interaction}: expected rates >= 0 and no edge of a node to itself")
+        what, given = f"edges of {self.interaction}", np.asarray(self.given)
+        count = len(checked_rows(f"{what}: target", self.target))
+        for name in ("target", "source"):
+            object.__setattr__(self, name, checked_rows(f"{what}: {name}", getattr(self, name), count))
+        object.__setattr__(self, "rate", checked(f"{what}: rate", self.rate, (count,)))
+        object.__setattr__(self, "given", checked(f"{what}: given", given, (count, *given.shape[1:])))
+        if (self.rate < 0).any() or (self.target == self.source).any():
+            raise InputError(f"{what}: expected rates >= 0 and no edge of a node to itself")
 
     def __len__(self) -> int:
         return len(self.target)

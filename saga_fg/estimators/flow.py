@@ -19,7 +19,8 @@ import scipy.linalg
 
 from factors import ResidualFactors
 from factors.validation import KeyArray
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import FloatArray, IntArray, checked
+from saga_fg.errors import InputError
 from saga_fg.interactions import POSITION, VELOCITY
 from saga_fg.node import NodeType, NonlinearMotion
 from saga_fg.nonlinear_interactions import AccelerationLaw, held
@@ -46,7 +47,13 @@ class Push:
         """a (m, 2) and its derivatives (m, 2, 4), (m, 2, 2 or 4)."""
         other = np.zeros((len(self.at), 4))
         other[:, : len(self.other_pv)] = states[self.slot][self.at][:, self.other_pv]
-        value, by_own, by_other = self.law.accelerations(states[0][self.at][:, self.pv], other, self.given)
+        what, m = f"law {type(self.law).__name__}", len(self.at)
+        try:
+            found = self.law.accelerations(states[0][self.at][:, self.pv], other, self.given)
+            value = checked(f"{what}: accelerations", found[0], (m, 2))
+            by_own, by_other = (checked(f"{what}: derivatives", by, (m, 2, 4)) for by in found[1:])
+        except Exception as error:  # of a researcher's law: anything
+            raise error if isinstance(error, InputError) else InputError(f"{what}: {error!r}") from error
         w = self.weight[:, None, None]
         return w[:, 0] * value, w * by_own, w * by_other[..., : len(self.other_pv)]
 

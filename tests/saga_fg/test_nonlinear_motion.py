@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from graph_keys import keys_of
 
-from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SceneGraph
+from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SagaError, SceneGraph
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import (
     BatchSmoother,
@@ -162,6 +162,43 @@ def test_a_flow_is_the_motion_the_law_and_the_linear_edges():
     x = flow.predict([np.array([straight]), np.array([START[0]])])[0]
     joint = np.concatenate([START[0], straight, *START[2:]])
     np.testing.assert_allclose(x, (linear.F_matrix @ joint + linear.b)[5:10], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", BACK_ENDS)
+@pytest.mark.parametrize("what", ["nan", "shape", "raises"])
+def test_a_law_that_fails_is_one_clear_error_after_which_all_goes_on(name, what):
+    class Broken(SmoothDriver):
+        def accelerations(self, own, other, given):
+            good = super().accelerations(own, other, given)
+            if what == "raises":
+                raise ZeroDivisionError("by me")
+            return good._replace(value=good.value * np.nan) if what == "nan" else good._replace(by_own=good.value)
+
+    estimator = BACK_ENDS[name]()
+    estimator.add([0, 1], [[0.0, 0.0, 8.0, 0.0], [12.0, 0.0, 8.0, 0.0]], [np.eye(4)] * 2)
+    edges = NonlinearEdges(Broken(), [0], [1], [1.0], [4.0])
+    broken = discretise(SceneGraph(np.arange(2), (WALKER,) * 2, nonlinear=(edges,)), 0.1)
+    with pytest.raises(SagaError, match="law Broken"):
+        estimator.predict(broken)
+    estimator.predict(discretise(SceneGraph.of([0, 1], WALKER), 0.1))
+    assert estimator.mean([0])[0, 0] == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rate": [-1.0]}, "rates >= 0"),
+        ({"rate": [np.nan]}, "finite"),
+        ({"source": [0]}, "itself"),
+        ({"given": [np.inf]}, "finite"),
+        ({"given": [1.0, 2.0]}, "shape"),
+        ({"source": [9]}, "row 9 is outside 2 nodes"),
+    ],
+)
+def test_bad_edges_are_refused(change, message):
+    good = {"target": [0], "source": [1], "rate": [1.0], "given": [4.0]}
+    with pytest.raises(InputError, match=message):
+        SceneGraph(np.arange(2), (WALKER,) * 2, nonlinear=(NonlinearEdges(SmoothDriver(), **{**good, **change}),))
 
 
 def test_functions_by_hand_go_with_linear_graphs_only():

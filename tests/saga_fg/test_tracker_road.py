@@ -9,12 +9,13 @@ from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettin
 from saga_fg.edge_rules import Following
 from saga_fg.interactions import SharedVelocity
 from saga_fg.node import ConstantVelocity, RandomWalk
+from saga_fg.nonlinear_interactions import SmoothDriver
 from saga_fg.rigid_coupling import Attached
 from saga_fg.road import Lane, RoadMap, StopLine, TrafficLight
 from saga_fg.road.cone_geometry import ConeGeometry
 from saga_fg.road.cones import ConeEdge
 from saga_fg.road.lane_keeping import InLane
-from saga_fg.road.stopping import RedLight
+from saga_fg.road.stopping import RedLight, SmoothStopping
 from saga_fg.tracking import ClassSettings
 
 MAP = RoadMap(
@@ -65,6 +66,18 @@ def test_cars_are_expected_to_brake_for_a_red_light_one_after_the_other():
     assert green[1] == pytest.approx(9.0, abs=0.5)
     assert red[1] < green[1] - 2.0
     assert red[1] < red[2] < green[2] - 0.3
+
+
+@pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
+def test_drivers_without_corners_brake_for_a_red_light_one_after_the_other(estimator):
+    edges = RedLight(interaction=SmoothStopping()), replace(FOLLOW, interaction=SmoothDriver(), lateral_scale=3.0)
+    settings = replace(SETTINGS, edges=edges, estimator=estimator, report_coasting=20.0)
+    red, green = (tracked(queue_frames(colour, duration=2.0), settings) for colour in ("red", "green"))
+    assert speeds_at(red, 4.9)[1] < speeds_at(green, 4.9)[1] - 2.0
+    assert speeds_at(red, 4.9)[2] < speeds_at(green, 4.9)[2] - 1.0
+    stopped = red.tracks(9.9)
+    assert stopped.boxes.position[:, 0].max() < 0.0
+    assert np.abs(stopped.boxes.velocity).max() < 2.0  # the second one still closes up
 
 
 def test_the_light_is_believed_by_noisy_reports():
