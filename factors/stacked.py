@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from factors.differences import stacked_differences, wrap_angles
 from factors.errors import FactorError
 from factors.gaussian import gaussian_graph, whitened_factors
+from factors.nonlinear import ResidualFactor
 from factors.robust import RobustLoss
 from factors.validation import (
     FloatArray,
@@ -87,6 +89,31 @@ class ResidualFactors:
     def keys(self) -> tuple[int, ...]:
         """All keys, each once."""
         return tuple(np.unique(self.rows).tolist())
+
+    def singles(self) -> list[ResidualFactor]:
+        """Return the same as factors of their own, each of which evaluates the whole stack."""
+        return [
+            ResidualFactor(
+                keys=tuple(keys),
+                variables=self._variables,
+                residual=partial(self._single_residual, k),
+                covariance=self.covariances[k],
+                jacobians=partial(self._single_jacobians, k),
+                robust=self.robust,
+                angles=self.angles,
+                name=self.name,
+            )
+            for k, keys in enumerate(self.rows.tolist())
+        ]
+
+    def _single_residual(self, k: int, *states: FloatArray) -> FloatArray:
+        return np.asarray(self._residuals(self._filled(self._stacks(states), np.array([k])))[k])
+
+    def _single_jacobians(self, k: int, *states: FloatArray) -> list[FloatArray]:
+        return [J[k] for J in self._jacobians(self._filled(self._stacks(states), np.array([k])))]
+
+    def _stacks(self, states: Sequence[Any]) -> list[FloatArray]:
+        return [variable.array(x)[None] for variable, x in zip(self._variables, states, strict=True)]
 
     def states(self, values: gtsam.Values, chosen: IntArray | None = None) -> list[FloatArray]:
         """Return the states of each column, (N, d_k) or (N, 3, 3) or (N, 4, 4); of the rows `chosen` (n,) if given."""

@@ -4,17 +4,20 @@
 2. the others with the edges that follow from round 1: ends and beginnings that meet become one object;
 3. the objects so joined, with edges: detections nobody took are claimed, objects with too little evidence dropped, and
    stands recognised;
-4. what is left, from first to last detection, with edges, robust losses and pinned stands: the final states.
+4. what is left, from first to last detection, with edges, robust losses, pinned stands, and factors of users' own: the
+   final states.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.by_class import class_values
+from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import (
     Evidence,
     Lives,
@@ -33,6 +36,7 @@ from saga_fg.smoothing import (
     standing_states,
 )
 from saga_fg.tracking import TrackerSettings
+from saga_fg.tracking.provider_names import new_provider
 from saga_fg.tracking.settings import ClassSettings
 
 TAKES_PART = 0.5  # share of the score an object needs that a tracklet needs to become part of one
@@ -64,10 +68,16 @@ class SmoothedObjects:
 
 
 def smooth_objects(
-    evidence: Evidence, track_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
+    evidence: Evidence,
+    track_of: IntArray,
+    settings: SmoothingSettings,
+    tracker: TrackerSettings,
+    providers: Sequence[FactorProvider] = (),
 ) -> SmoothedObjects:
-    """All rounds. track_of (N,): the online track of each detection, -1 for none."""
-    rounds = _Rounds(evidence, settings, tracker)
+    """All rounds. track_of (N,): the online track of each detection, -1 for none; providers: in place of those of the
+    settings, asked from the first moment on every time the final states are solved for.
+    """
+    rounds = _Rounds(evidence, settings, tracker, providers)
     label, moment = evidence.boxes.label, evidence.moment
     everything = lives_of_evidence(track_of, label, moment)
     ahead = max(settings.extension, settings.joining.max_gap)
@@ -109,7 +119,7 @@ def smooth_known_objects(
     evidence: Evidence, object_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
 ) -> StateTable:
     """The last round alone, without stands, where it is known which object (N,) each detection is of, -1 for none."""
-    rounds = _Rounds(evidence, settings, tracker)
+    rounds = _Rounds(evidence, settings, tracker, ())
     lives = lives_of_evidence(object_of, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, object_of, lives, rounds.velocity_prior(lives), settings.classes)
     return rounds.final(lives, object_of, states, Standing(settings.standing))
@@ -122,6 +132,7 @@ class _Rounds:
     evidence: Evidence
     settings: SmoothingSettings
     tracker: TrackerSettings
+    providers: Sequence[FactorProvider]
 
     def velocity_prior(self, lives: Lives) -> FloatArray:
         """(n, 2, 2) covariance of the velocity of something new."""
@@ -149,7 +160,8 @@ class _Rounds:
             loss = self.settings.robust
             weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)
             prior, classes = self.velocity_prior(lives), self.settings.classes
-            states = smooth_states(self.evidence, object_of, lives, prior, classes, edges, weight, standing)
+            asked = self.providers or [new_provider(name) for name in self.settings.providers]
+            states = smooth_states(self.evidence, object_of, lives, prior, classes, edges, weight, standing, asked)
         return states
 
     def _edges(self, lives: Lives, object_of: IntArray, states: StateTable) -> SmoothedEdges:

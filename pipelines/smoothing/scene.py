@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from pipelines.config import Method
@@ -14,6 +14,7 @@ from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import smooth_objects
 from pipelines.tracking import Progress
 from saga_fg.dataset import Dataset, Scene
+from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
 from saga_fg.track import Tracks
 
@@ -40,9 +41,16 @@ class SmoothedScene:
 
 
 def smooth_scene(
-    scene: Scene, config: SmoothConfig, method: Method = "saga", progress: Progress | None = None
+    scene: Scene,
+    config: SmoothConfig,
+    method: Method = "saga",
+    progress: Progress | None = None,
+    providers: Sequence[FactorProvider] = (),
 ) -> SmoothedScene:
-    """Smooth one recording, with the edges of the tracker's settings unless `method` is another than `saga`."""
+    """Smooth one recording, with the edges of the tracker's settings unless `method` is another than `saga`.
+
+    providers: of factors of your own, in place of those that the configuration names
+    """
     tracking = config.tracking.of_method(method)
     with one_thread():
         start = time.perf_counter()
@@ -50,7 +58,7 @@ def smooth_scene(
         tracker = tracking.new_tracker(method)
         classes = tracking.tracker.classes
         track_of = track_evidence(scene.name, scene.frames, tracker, evidence, config.sensors, classes, progress)
-        objects = smooth_objects(evidence, track_of, config.smoothing, tracking.tracker)
+        objects = smooth_objects(evidence, track_of, config.smoothing, tracking.tracker, providers)
         labels = label_moments(evidence, objects, scene.timestamps, config.smoothing)
         counts = count_labels(evidence, objects, labels, scene.timestamps)
         seconds = time.perf_counter() - start

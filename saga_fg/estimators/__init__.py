@@ -3,7 +3,6 @@
 from saga_fg.estimators.batch import BatchSmoother
 from saga_fg.estimators.batch_graph import BatchSolver
 from saga_fg.estimators.bounded import BoundedKalmanFilter
-from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_engine import RelinearisationSettings
@@ -27,7 +26,6 @@ __all__ = [
     "Births",
     "BoundedKalmanFilter",
     "Estimator",
-    "FactorGraph",
     "FixedLagSmoother",
     "GaussNewtonSettings",
     "Gaussian",

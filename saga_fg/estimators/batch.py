@@ -17,13 +17,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import Robust
+from factors import FactorError, Robust, nonlinear_graph
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.elimination import NoSolution, marginal_covariances, solved_tree, tree_covariances
 from saga_fg.estimators.elimination_order import Order, cheapest_order
-from saga_fg.estimators.factor_graph import FactorGraph
+from saga_fg.estimators.factor_graph import recording_factors
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
@@ -32,6 +32,8 @@ from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, Sighting
 from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
+from saga_fg.graph.errors import GraphError
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 log = logging.getLogger(__name__)
@@ -168,8 +170,8 @@ class BatchSmoother:
             for moment, layout, mean in zip(moments, layouts, self._means(), strict=True)
         ]
 
-    def graph(self) -> FactorGraph:
-        """The recording as a GTSAM graph; outliers found by graduated non-convexity count by their weights."""
+    def graph(self) -> SceneFactorGraph:
+        """The recording as a running graph; outliers found by graduated non-convexity count by their weights."""
         self._graduate()
         return self._recording.graph(self._means())
 
@@ -247,16 +249,13 @@ class BatchSmoother:
     def _solution(self) -> _Sparse | None:
         """The solution in a sparse order, None where that of time is better or the only one."""
         if self.order != "time" and self._sparse is None:
-            equivalent = self._recording.graph(self._recording.rough_means())
             try:
-                limit, linear = self._settings.max_iterations, self._recording.linear
-                values, tree = solved_tree(equivalent, self.order, limit, linear)
-                self._sparse = _Sparse.of(equivalent, values, tree)
-            except NoSolution as reason:
+                self._sparse = _Sparse.of(self._recording, self.order, self._settings.max_iterations)
+            except (NoSolution, FactorError, GraphError) as reason:
                 self._give_up(reason)
         return self._sparse
 
-    def _give_up(self, reason: NoSolution) -> None:
+    def _give_up(self, reason: Exception) -> None:
         """Sparse elimination does not do for this recording."""
         log.info("eliminated in the order of time: %s", reason)
         self._order, self._sparse = "time", None
@@ -270,22 +269,34 @@ class _Sparse:
     """Means of every moment, and the tree from which covariances can be had."""
 
     means: list[FloatArray]
-    equivalent: FactorGraph
+    keys: list[dict[int, int]]  # of each moment's nodes
+    dims: dict[int, int]
     tree: gtsam.GaussianBayesTree
     known: list[MarginalCovariances] | None = None
 
     @staticmethod
-    def of(equivalent: FactorGraph, values: gtsam.Values, tree: gtsam.GaussianBayesTree) -> _Sparse:
-        means = [
-            np.concatenate([np.empty(0), *(values.atVector(key) for key in keys.values())]) for keys in equivalent.keys
-        ]
-        return _Sparse(means, equivalent, tree)
+    def of(recording: Recording, order: Order, max_iterations: int) -> _Sparse:
+        """Raises `NoSolution`, `FactorError` or `GraphError` where it cannot be had in this order."""
+        means = recording.rough_means()
+        recorded = recording_factors(recording.prior, recording.moments, recording.layouts, means)
+        states, dims, start = dict[int, FloatArray](), dict[int, int](), gtsam.Values()
+        for one, layout, mean in zip(recorded, recording.layouts, means, strict=True):
+            states |= zip(one.keys.values(), np.split(mean, layout.offsets[1:-1]), strict=False)
+        for key, state in states.items():
+            start.insert(key, state)
+            dims[key] = len(state)
+        factors = [factor for one in recorded for kind in one.factors.values() for factor in kind]
+        linear = nonlinear_graph([factor for factor in factors if isinstance(factor, gtsam.JacobianFactor)], dims)
+        others = [factor for factor in factors if not isinstance(factor, gtsam.JacobianFactor)]
+        values, tree = solved_tree(linear, others, start, order, max_iterations)
+        keys = [one.keys for one in recorded]
+        solved = [np.concatenate([np.empty(0), *(values.atVector(key) for key in own.values())]) for own in keys]
+        return _Sparse(solved, keys, dims, tree)
 
     def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
         """Of all single states, by moment."""
         if self.known is None:
-            blocks = tree_covariances(self.tree, self.equivalent.values.dims())
-            self.known = marginal_covariances(blocks, self.equivalent.keys, layouts)
+            self.known = marginal_covariances(tree_covariances(self.tree, self.dims), self.keys, layouts)
         return self.known
 
 

@@ -17,6 +17,7 @@ from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.graph.errors import GraphError
 from saga_fg.graph.point import Point
 from saga_fg.graph.providers import FactorProvider, GraphView, ask
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -44,6 +45,7 @@ class BatchSolver:
         self._settings = settings or SolverSettings()
         self._graph = SceneFactorGraph()
         self._solution: GraphSolution | None = None
+        self._lent = False  # whether somebody may hold the graph
         if graph is not None:
             self.restore(graph)
 
@@ -54,13 +56,11 @@ class BatchSolver:
 
     def step(self, time: float, providers: Sequence[FactorProvider] | None = None) -> None:
         """Begin the epoch at `time`, s, and ask the providers, by default those of the solver."""
-        graph = self._graph.copy()
-        graph.advance(time)
-        self._asked(graph, self.providers if providers is None else providers)
+        self._asked(time, self.providers if providers is None else providers)
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch."""
-        self._asked(self._graph.copy(), providers)
+        self._asked(None, providers)
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Integrate variables out, linearised at the solution; what they knew of others stays."""
@@ -72,6 +72,7 @@ class BatchSolver:
         """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
         if self._solution is None:
             graph = self._graph.copy()
+            graph.drop_strangers()  # when a provider asks, others have added some already
             self._solution = _solved(graph, self._settings)
             self._graph = graph
         return self._solution
@@ -81,6 +82,7 @@ class BatchSolver:
     def graph(self) -> SceneFactorGraph:
         """The graph itself, solved: its variables, factors and values. To be read, not changed."""
         self.solve()
+        self._lent = True
         return self._graph
 
     def state(self, key: int) -> object:
@@ -108,14 +110,22 @@ class BatchSolver:
             raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
         self._changed(graph.copy())
 
-    def _asked(self, graph: SceneFactorGraph, providers: Sequence[FactorProvider]) -> None:
+    def _asked(self, time: float | None, providers: Sequence[FactorProvider]) -> None:
+        known = self._graph
+        graph = known.copy(share_values=not self._lent)
         view = GraphView(graph, self.covariance, self.origin)
-        for provider in providers:
-            ask(provider, graph, view)
+        try:
+            if time is not None:
+                graph.advance(time)
+            for provider in providers:
+                ask(provider, graph, view)
+        except GraphError:
+            known.drop_strangers()
+            raise
         self._changed(graph)
 
     def _changed(self, graph: SceneFactorGraph) -> None:
-        self._graph, self._solution = graph, None
+        self._graph, self._solution, self._lent = graph, None, False
 
 
 def _solved(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:

@@ -32,12 +32,13 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.cover import Bounds, Cover
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
+from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.graph_parts import adjacency
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.overlapping import gathered, propagated
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 
@@ -169,11 +170,11 @@ class BoundedKalmanFilter:
         scaled = self._rescaled(joint, distinct, chosen)
         return scaled.joint(inverse)
 
-    def graph(self) -> FactorGraph:
+    def graph(self) -> SceneFactorGraph:
         """One joint prior for the nodes at home in each cluster: the filter keeps nothing of the past but this."""
         cover = self._cover
         label = np.unique(cover.home, return_inverse=True)[1].astype(np.int64)
-        return prior_graph(gathered(self._state, Partition(cover.layout, label), cover.own))
+        return prior_graph(gathered(self._state, Partition(cover.layout, label), cover.own), self._time)
 
     def snapshot(self) -> BoundedState:
         """The whole state, as a value."""

@@ -19,10 +19,10 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
+from factors import Linearisable, linearised
 from saga_fg.arrays import FloatArray
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.elimination_order import Order, sparse_ordering
-from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.fixed_point import FixedPoint
 from saga_fg.estimators.layout import Layout
 
@@ -37,16 +37,20 @@ class NoSolution(Exception):  # noqa: N818 -- it is no error of the caller's
 
 
 def solved_tree(
-    equivalent: FactorGraph, order: Order, max_iterations: int, linear_problem: bool
+    graph: gtsam.NonlinearFactorGraph,
+    factors: Sequence[Linearisable],
+    values: gtsam.Values,
+    order: Order,
+    max_iterations: int,
 ) -> tuple[gtsam.Values, gtsam.GaussianBayesTree]:
-    """The minimum of a graph and its Bayes tree there, from the values given. Raises `NoSolution`.
+    """The minimum of the linear factors in `graph` and others, and the Bayes tree there. Raises `NoSolution`.
 
     Of a linear problem the first step should be all; what is left of it tells how many digits elimination has.
     """
-    values, ordering, accelerated = equivalent.values, None, FixedPoint()
+    ordering, accelerated, linear_problem = None, FixedPoint(), not factors
     first = length = np.inf
     for iteration in range(max_iterations):
-        linear = equivalent.graph.linearize(values)
+        linear = linearised(graph, factors, values)
         ordering = ordering or _ordering(linear, order)
         try:
             tree = linear.eliminateMultifrontal(ordering)

@@ -1,12 +1,11 @@
-"""A recording as a GTSAM factor graph: the equivalent problem, for GTSAM's own solvers and for anybody's factors.
+"""The factors of a recording, and the running graph that they make: the equivalent problem, for anybody's solver.
 
     prior        one joint factor for each component of what was known before; one factor for each node that appears
-    interaction  one n-ary factor a node and interval
+    interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}, one n-ary factor a node and interval
     detection    one factor a measurement
 
-Every node has a variable of its own at every moment. Linear factors are native (`gtsam.LinearContainerFactor` about
-zero); nonlinear and robust ones are `gtsam.CustomFactor`s. Directions of an interval's noise without variance are hard
-constraints (`gtsam.noiseModel.Constrained`).
+Every node has a variable of its own at every moment, but for one that nothing moves or disturbs, such as a pole: it
+keeps the variable of the moment before, since a direction without noise has no factor.
 """
 
 from __future__ import annotations
@@ -21,95 +20,106 @@ import numpy as np
 from factors import (
     FactorError,
     ResidualFactor,
-    Vector,
-    detection_factor,
+    ResidualFactors,
+    detection_factors,
     gaussian_factors,
     interaction_factor,
     interaction_factors,
     joint_prior_factor,
-    nonlinear_graph,
     prior_factors,
 )
 from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion, NodeMotion, Standstill
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.sighting import Sighting
+from saga_fg.graph.keys import node_key, node_kind
+from saga_fg.graph.parts import NewVariable
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Blocks
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
+Factors = list[gtsam.JacobianFactor | ResidualFactor | ResidualFactors]
 
 
 @dataclass(frozen=True, eq=False)
-class FactorGraph:
-    """graph; values: the estimator's answer, the minimum of the graph; keys: for each moment, the key of each node."""
+class MomentFactors:
+    """keys: of the variable of each node at a moment; factors that come in with it, by what they are."""
 
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    keys: tuple[dict[int, int], ...]
+    keys: dict[int, int]
+    factors: dict[str, Factors]
 
 
-def prior_graph(x: BlockGaussian) -> FactorGraph:
-    """The graph of what a filter knows: one joint prior for each component."""
-    return recording_graph(x, [Moment(0.0)], [x.layout], [x.mean])
+def prior_graph(x: BlockGaussian, time: float) -> SceneFactorGraph:
+    """The graph of what a filter knows at `time`, s: one joint prior for each component."""
+    return recording_graph(x, [Moment(time)], [x.layout], [x.mean])
 
 
 def recording_graph(
     prior: BlockGaussian, moments: Sequence[Moment], layouts: Sequence[Layout], means: Sequence[FloatArray]
-) -> FactorGraph:
+) -> SceneFactorGraph:
     """The graph of `moments` after `prior`; layouts and smoothed means of each moment's joint state.
 
     Raises `InputError` where a covariance has become singular, so that no factor can be made of it.
     """
     try:
-        return _recording_graph(prior, moments, layouts, means)
+        recorded = recording_factors(prior, moments, layouts, means)
     except FactorError as error:
         raise InputError(f"graph: {error}") from error
+    graph = SceneFactorGraph()
+    for moment, layout, mean, one in zip(moments, layouts, means, recorded, strict=True):
+        graph.advance(max(moment.time, float(np.nextafter(graph.time, np.inf))))  # two may be at the same time
+        new = [
+            NewVariable(*node_kind(node), mean[layout.offsets[row] : layout.offsets[row + 1]])
+            for row, node in enumerate(layout.nodes.tolist())
+            if one.keys[node] not in graph.variables
+        ]
+        graph.add_variables("recording", new)
+        for name, factors in one.factors.items():
+            graph.add_factors(name, factors)
+    return graph
 
 
-def _recording_graph(
+def recording_factors(
     prior: BlockGaussian, moments: Sequence[Moment], layouts: Sequence[Layout], means: Sequence[FloatArray]
-) -> FactorGraph:
-    keys: list[dict[int, int]] = []
-    dims: dict[int, int] = {}
-    values = gtsam.Values()
-    for layout, mean in zip(layouts, means, strict=True):
-        own = {}
-        for row, node in enumerate(layout.nodes.tolist()):
-            key = own[node] = gtsam.symbol("x", len(dims))
-            dims[key] = int(layout.dims[row])
-            values.insert(key, mean[layout.offsets[row] : layout.offsets[row + 1]])
-        keys.append(own)
-    linear = _prior_factors(prior, keys[0]) if len(prior.layout) else []
-    graph = gtsam.NonlinearFactorGraph()
+) -> list[MomentFactors]:
+    """The factors moment by moment, nonlinear ones and noise at the means. Raises `FactorError`, as the graph."""
+    result: list[MomentFactors] = []
+    keys: dict[int, int] = {}  # of nodes that have a variable already
+    moved: Factors = []
     for k, (moment, layout) in enumerate(zip(moments, layouts, strict=True)):
-        for birth in moment.births:
-            linear += prior_factors([keys[k][node] for node in birth.nodes.tolist()], birth.means, birth.covariances)
-        for sighting in moment.sightings:
-            seen = [keys[k][node] for node in sighting.measured.nodes.tolist()]
-            if sighting.loss is None and isinstance(sighting.measured, Measurements):
-                linear += _detection_factors(seen, sighting, layout, means[k])
-            else:
-                for factor in _nonlinear_detections(seen, sighting):
-                    graph.add(factor.as_custom_factor())
+        keys = {node: keys.get(node) or node_key(node, k) for node in layout.nodes.tolist()}
+        seen = [_detections(keys, sighting, layout, means[k]) for sighting in moment.sightings]
+        factors: dict[str, Factors] = {
+            "interactions": moved,
+            "prior": _prior_factors(prior, keys) if k == 0 and len(prior.layout) else [],
+            "births": [
+                factor
+                for birth in moment.births
+                for factor in prior_factors([keys[n] for n in birth.nodes.tolist()], birth.means, birth.covariances)
+            ],
+            "detections": [factor for one in seen for factor in one],
+        }
+        result.append(MomentFactors(keys, factors))
         if moment.motion is not None:
             gone = layout.rows(moment.gone)
             stay = layout.without(gone) if len(gone) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
-            native, nonlinear = motion_factors(moment.motion, stay, at, keys[k], keys[k + 1])
-            linear += native
-            for factor in nonlinear:
-                graph.add(factor.as_custom_factor())
-    graph.push_back(nonlinear_graph(linear, dims))
-    return FactorGraph(graph, values, tuple(keys))
+            resting = stay.nodes[_resting(moment.motion.dynamics(stay, at))].tolist()
+            now, keys = keys, {node: keys[node] for node in resting}
+            then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
+            native, nonlinear = motion_factors(moment.motion, stay, at, now, then)
+            moved = [*native, *nonlinear]
+    return result
 
 
-def _prior_factors(x: BlockGaussian, keys: dict[int, int]) -> list[gtsam.JacobianFactor]:
+def _prior_factors(x: BlockGaussian, keys: dict[int, int]) -> Factors:
     """One joint factor a component."""
-    factors = []
+    factors: Factors = []
     for label in range(x.partition.count):
         rows = np.flatnonzero(x.partition.label == label)
         means = [x.mean[x.layout.places(rows[k : k + 1])] for k in range(len(rows))]
@@ -118,36 +128,44 @@ def _prior_factors(x: BlockGaussian, keys: dict[int, int]) -> list[gtsam.Jacobia
     return factors
 
 
-def _detection_factors(
-    keys: list[int], sighting: Sighting, layout: Layout, mean: FloatArray
-) -> list[gtsam.JacobianFactor]:
-    """Native factors of linear measurements, one each."""
-    _, z, H, R = sighting.linearised(layout, mean)
-    seen = np.flatnonzero(H.any(axis=(1, 2)))  # a weight of zero leaves nothing to say
-    return gaussian_factors(np.array(keys, dtype=np.uint64)[seen, None], [H[seen]], z[seen], R[seen])
-
-
-def _nonlinear_detections(keys: list[int], sighting: Sighting) -> list[ResidualFactor]:
-    measured, robust = sighting.measured, sighting.loss
-    weights = np.ones(len(keys)) if sighting.weights is None else sighting.weights
-    factors = []
-    for k in np.flatnonzero(weights > 0).tolist():
-        z, R = measured.z[k], measured.R[k] / weights[k]
-        if isinstance(measured, Measurements):
-            H = measured.H[k]
-            residual, jacobians = partial(_linear_residual, H, z), partial(_linear_jacobian, H)
-            factors.append(ResidualFactor((keys[k],), (Vector(H.shape[1]),), residual, R, jacobians, robust))
-        else:
-            factors.append(detection_factor(keys[k], measured.model, z, R, robust))
-    return factors
+def _detections(keys: dict[int, int], sighting: Sighting, layout: Layout, mean: FloatArray) -> Factors:
+    """Native factors where measurements are linear; a weight of zero leaves nothing to say."""
+    measured = sighting.measured
+    names = np.array([[keys[node]] for node in measured.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
+    if sighting.loss is None and isinstance(measured, Measurements):
+        _, z, H, R = sighting.linearised(layout, mean)
+        heard = np.flatnonzero(H.any(axis=(1, 2)))
+        return list(gaussian_factors(names[heard], [H[heard]], z[heard], R[heard]))
+    weights = np.ones(len(names)) if sighting.weights is None else sighting.weights
+    heard = np.flatnonzero(weights > 0)
+    names, z, R = names[heard], measured.z[heard], measured.R[heard] / weights[heard, None, None]
+    if not isinstance(measured, Measurements):
+        return [detection_factors(names[:, 0], measured.model, z, R, sighting.loss)]
+    H = measured.H[heard]
+    residual, jacobian = partial(_linear_residual, H, z), partial(_linear_jacobian, H)
+    return [ResidualFactors(names, (H.shape[2],), residual, R, jacobian, sighting.loss, name="robust detections")]
 
 
 def _linear_residual(H: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
-    return np.asarray(H @ x - z)
+    return np.asarray((H @ x[:, :, None])[:, :, 0] - z)
 
 
 def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
     return [H]
+
+
+def _resting(dynamics: Dynamics) -> BoolArray:
+    """(n,) which nodes stay exactly where they are."""
+    layout = dynamics.layout
+    moved = np.zeros(len(layout), dtype=bool)
+    np.logical_or.at(moved, np.repeat(np.arange(len(layout)), layout.dims), dynamics.b != 0)
+    for blocks in dynamics.Q:
+        moved[blocks.target[blocks.values.any(axis=(1, 2))]] = True
+    for blocks in dynamics.F:
+        same = blocks.target == blocks.source
+        moved[blocks.target[~same]] = True
+        moved[blocks.target[same][(blocks.values[same] != np.eye(*blocks.values.shape[1:])).any(axis=(1, 2))]] = True
+    return ~moved
 
 
 def motion_factors(
@@ -164,10 +182,11 @@ def motion_factors(
         noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
         regular[blocks.target] = _is_regular(blocks.values)
     regular[layout.rows(list(special))] = False
+    same = now == then  # of who rests
     kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
     for blocks in dynamics.F:
         kinds[np.unique(blocks.target)] += 1
-    together = regular & (kinds == 1)
+    together = regular & (kinds == 1) & ~same
     native: list[gtsam.JacobianFactor] = []
     for blocks in dynamics.F:
         mine = np.flatnonzero(together[blocks.target])
@@ -179,7 +198,7 @@ def motion_factors(
             names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
             native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
     nonlinear = []
-    for row in np.flatnonzero(~together).tolist():
+    for row in np.flatnonzero(~together & ~same).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
         if node in special:
@@ -187,7 +206,9 @@ def motion_factors(
             continue
         heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
-        native.append(_interaction_factor(int(then[row]), [key for key, _ in heard], [F for _, F in heard], b, Q))
+        if not _is_regular(Q):
+            raise FactorError(f"node {node}: expected noise in all directions of its state")
+        native.append(interaction_factor(int(then[row]), [key for key, _ in heard], [F for _, F in heard], b, Q))
     return native, nonlinear
 
 
@@ -210,18 +231,3 @@ def _nonlinear_motion(
     dims = layout.dims[layout.rows([motion.node, *motion.neighbours])].tolist()
     neighbours = [keys[other] for other in motion.neighbours]
     return motion.interaction.factor(next_keys[motion.node], keys[motion.node], neighbours, dims, dt, Q)
-
-
-def _interaction_factor(
-    next_key: int, keys: list[int], F: list[FloatArray], b: FloatArray, Q: FloatArray
-) -> gtsam.JacobianFactor:
-    """|| x' - sum_j F_j x_j - b ||_Q, with hard constraints where Q has no variance."""
-    if _is_regular(Q):
-        return interaction_factor(next_key, keys, F, b, Q)
-    variances, directions = np.linalg.eigh(Q)
-    sigmas = np.sqrt(np.where(variances > _SINGULAR * variances[-1], variances, 0.0))
-    terms = [(next_key, directions.T), *((key, -directions.T @ block) for key, block in zip(keys, F, strict=True))]
-    model = gtsam.noiseModel.Constrained.MixedSigmas(1.0, sigmas)
-    factor = gtsam.GaussianConditional(terms, 0, directions.T @ b, model).clone()
-    assert isinstance(factor, gtsam.JacobianFactor)
-    return factor

@@ -23,12 +23,12 @@ from factors import Robust
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.factor_graph import FactorGraph
 from saga_fg.estimators.motion import Motion, NodeMotion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, along_the_way
 from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 
@@ -114,8 +114,8 @@ class FixedLagSmoother:
         """The filter's, of the nodes that are there now, and perhaps of some that just went."""
         return self._recording.newest()
 
-    def graph(self) -> FactorGraph:
-        """The window as a GTSAM graph: a prior at its start, all factors since, the smoothed means as values."""
+    def graph(self) -> SceneFactorGraph:
+        """The window as a running graph: a prior at its start, all factors since, the smoothed means as values."""
         return self._recording.graph()
 
     def snapshot(self) -> RecordingState:

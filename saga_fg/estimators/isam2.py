@@ -26,7 +26,7 @@ from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
 from saga_fg.estimators.dynamics import Dynamics, predict
-from saga_fg.estimators.factor_graph import FactorGraph, recording_graph
+from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.moment import Birth, Moment, passed
 from saga_fg.estimators.motion import Motion, Standstill
@@ -35,6 +35,7 @@ from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Sighting, whitened
 from saga_fg.estimators.smoothed import Newest
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 log = logging.getLogger(__name__)
@@ -162,7 +163,7 @@ class IncrementalFilter:
         """The filter's, of the nodes that are there now, and perhaps of some that just went."""
         return self._newest().x
 
-    def graph(self) -> FactorGraph:
+    def graph(self) -> SceneFactorGraph:
         """The last interval: what was known before it as prior, its factors, and everything seen since."""
         self._held, x = _solved(self._held)
         held = self._held

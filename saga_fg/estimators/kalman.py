@@ -19,9 +19,10 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import Dynamics, predict
-from saga_fg.estimators.factor_graph import FactorGraph, prior_graph
+from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
@@ -101,9 +102,9 @@ class JointKalmanFilter:
         """All that the filter knows."""
         return self._state
 
-    def graph(self) -> FactorGraph:
+    def graph(self) -> SceneFactorGraph:
         """One joint prior a component: the filter keeps nothing of the past but this."""
-        return prior_graph(self._state)
+        return prior_graph(self._state, self._time)
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""

@@ -9,17 +9,15 @@ Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md fo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
 from saga_fg.errors import InputError
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
-
-if TYPE_CHECKING:  # it is made of measurements itself
-    from saga_fg.estimators.factor_graph import FactorGraph
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +109,8 @@ class Estimator(Protocol):
         """Joint covariance of some nodes, in the order given, of any sizes."""
         ...
 
-    def graph(self) -> FactorGraph:
-        """The equivalent factor graph and its solution; GTSAM's own solvers come to the same."""
+    def graph(self) -> SceneFactorGraph:
+        """The equivalent factor graph, its values the solution; `solve()` and GTSAM's own solvers come to the same."""
         ...
 
     def snapshot(self) -> Any:

@@ -24,13 +24,14 @@ from saga_fg.estimators.backward import (
     smoothed_means,
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.factor_graph import FactorGraph, recording_graph
+from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.fixed_point import FixedPoint
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.moment import Birth, Moment, Pass, arrival, passed, reckoned
 from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.estimators.sighting import Sighting
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.settings import setting
 
 log = logging.getLogger(__name__)
@@ -239,7 +240,7 @@ class Recording:
             self._marginals = [MarginalCovariances.of(whole) for whole in wholes][::-1]
         return self._marginals
 
-    def graph(self, means: Sequence[FloatArray] | None = None) -> FactorGraph:
+    def graph(self, means: Sequence[FloatArray] | None = None) -> SceneFactorGraph:
         """The equivalent factor graph, with the smoothed means, or others, as values."""
         return recording_graph(self._prior, self._moments, self._layouts, self.means() if means is None else means)
 

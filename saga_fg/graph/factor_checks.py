@@ -22,7 +22,15 @@ import numpy as np
 
 from factors import Linearisable, OrientedPlane, PlanarPose, ResidualFactor, ResidualFactors, SpatialPose, Vector
 from saga_fg.graph.errors import GraphError
-from saga_fg.graph.factor_groups import CustomGroup, FactorGroup, LinearGroup, NativeGroup, SingleGroup, StackedGroup
+from saga_fg.graph.factor_groups import (
+    CustomGroup,
+    FactorGroup,
+    LinearGroup,
+    NativeGroup,
+    SingleGroup,
+    StackedGroup,
+    members,
+)
 from saga_fg.graph.keys import described
 from saga_fg.graph.variables import GraphVariable
 
@@ -58,7 +66,7 @@ def _flat(factors: Any) -> Iterable[Any]:
 
 def _members(factors: Any) -> Iterable[Any]:
     if isinstance(factors, gtsam.NonlinearFactorGraph):
-        return [factors.at(i) for i in range(factors.size()) if factors.exists(i)]
+        return members(factors)
     return list(factors)
 
 

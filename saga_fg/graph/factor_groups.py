@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from factors import FactorError, Linearisable, ResidualFactors
+from factors import FactorError, Linearisable, ResidualFactor, ResidualFactors, nonlinear_graph, nonlinear_graph_at
 from factors.differences import central_differences
 from factors.gaussian import gaussian_graph, native_factor, whitened_factors
 from saga_fg.arrays import FloatArray, IntArray
@@ -36,8 +36,20 @@ class FactorGroup(Protocol):
     def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
         """The rows `chosen`, on increments from the base. Raises what the factors raise."""
 
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        """The rows `chosen` as GTSAM's own factors."""
+
+
+class SolvableGroup(FactorGroup, Protocol):
+    """A group that GTSAM does not evaluate itself."""
+
     def error(self, chosen: IntArray, point: Point) -> float:
         """The cost, -log phi, of the rows `chosen` together."""
+
+
+def members(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
+    """The factors of a graph."""
+    return [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +70,10 @@ class LinearGroup:
             result.append(native_factor(keys, point.dims(keys), augmented))
         return result
 
-    def error(self, chosen: IntArray, point: Point) -> float:
-        total = 0.0
-        for row in chosen.tolist():
-            augmented = self.factors[row].augmentedJacobian()
-            x = np.concatenate([point.values.atVector(key) for key in self.rows[row]])
-            total += 0.5 * float(np.sum((augmented[:, :-1] @ x - augmented[:, -1]) ** 2))
-        return total
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        keys = {key for row in chosen.tolist() for key in self.rows[row]}
+        dims = dict(zip(keys, point.dims(list(keys)), strict=True))
+        return members(nonlinear_graph([self.factors[row] for row in chosen.tolist()], dims))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +104,9 @@ class PriorGroup:
 
     def error(self, chosen: IntArray, point: Point) -> float:
         return 0.5 * sum(float(np.sum(f.augmentedJacobian()[:, -1] ** 2)) for f in self.here(chosen, point))
+
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        return members(nonlinear_graph_at(self.linearised(chosen, point), point.base))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +142,10 @@ class StackedGroup:
     def error(self, chosen: IntArray, point: Point) -> float:
         return float(self.factors.errors(point.values, chosen).sum())
 
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        singles = self.factors.singles()
+        return [singles[row].as_custom_factor() for row in chosen.tolist()]
+
 
 @dataclass(frozen=True, eq=False)
 class SingleGroup:
@@ -156,6 +172,11 @@ class SingleGroup:
     def error(self, chosen: IntArray, point: Point) -> float:
         return self.factor.error(point.values)
 
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        if not isinstance(self.factor, ResidualFactor):
+            raise FactorError(f"{self.name}: expected a ResidualFactor, which GTSAM's solvers can call")
+        return [self.factor.as_custom_factor()]
+
 
 @dataclass(frozen=True, eq=False)
 class NativeGroup:
@@ -170,8 +191,8 @@ class NativeGroup:
         made = self.factor.linearize(point.values)
         return [point.from_base(list(made.keys()), made.augmentedJacobian())]
 
-    def error(self, chosen: IntArray, point: Point) -> float:
-        return float(self.factor.error(point.values))
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        return [self.factor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +224,9 @@ class CustomGroup:
     def error(self, chosen: IntArray, point: Point) -> float:
         return float(self.factor.error(point.values))
 
+    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+        return [self.factor]
+
     def _residual(self, keys: Sequence[int], states: Sequence[Any]) -> FloatArray:
         values = gtsam.Values()  # its own variables alone: GTSAM copies all of them for every call
         for key, state in zip(keys, states, strict=True):
@@ -219,7 +243,7 @@ class CustomGroup:
 class ActiveRows:
     """The rows of a group that are still there, for `factors.solve`."""
 
-    group: FactorGroup
+    group: SolvableGroup
     chosen: IntArray
     point: Point
 

@@ -58,6 +58,16 @@ def key_of(kind: Kind, id: int, epoch: int | None) -> int:  # noqa: A002 -- an i
     return ord(kind.letter) << 2 * _BITS | int(id) << _BITS | when
 
 
+def node_kind(node: int) -> tuple[Kind, int]:
+    """Kind and id of a node of an estimator; those of a road map count down from -1."""
+    return (OBJECT, node) if node >= 0 else (MAP_NODE, -node)
+
+
+def node_key(node: int, epoch: int | None) -> int:
+    """The key of a node of an estimator."""
+    return key_of(*node_kind(node), epoch)
+
+
 def key_id(key: int) -> KeyId:
     """Return the parts of a key. Raises `GraphError` for one of another scheme."""
     letter = chr(int(key) >> 2 * _BITS)

@@ -23,7 +23,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, nonlinear_graph, solve
+from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
 from factors.marginal import Elimination
 from factors.validation import format_key
 from saga_fg.arrays import BoolArray, IntArray
@@ -236,25 +236,41 @@ class SceneFactorGraph:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
         for held in sorted(self._groups.values(), key=lambda held: held.sharpness):
-            if isinstance(held.factors, NativeGroup):
-                native.add(held.factors.factor)
-            elif isinstance(held.factors, LinearGroup):
-                rows, held_rows = held.rows.tolist(), held.factors.rows
-                dims = {key: self._variables[key].dim for row in rows for key in held_rows[row]}
-                native.push_back(nonlinear_graph([held.factors.factors[row] for row in rows], dims))
+            if isinstance(held.factors, LinearGroup | NativeGroup):
+                for factor in held.factors.native(held.rows, point):
+                    native.add(factor)
             else:
-                ours.append(ActiveRows(held.factors, held.rows, point))
+                ours.append(ActiveRows(held.factors, held.rows, point))  # type: ignore[arg-type]
         return native, ours
 
-    def copy(self) -> SceneFactorGraph:
-        """A graph of its own with the same variables and factors, which are shared."""
+    def native(self) -> gtsam.NonlinearFactorGraph:
+        """All factors as GTSAM's own, for its solvers from `values`; ours call back into Python, which is slow."""
+        graph, point = gtsam.NonlinearFactorGraph(), self.point()
+        for held in self._groups.values():
+            for factor in held.factors.native(held.rows, point):
+                graph.add(factor)
+        return graph
+
+    def copy(self, share_values: bool = False) -> SceneFactorGraph:
+        """A graph of its own with the same variables and factors, which are shared.
+
+        share_values: what is added to the copy comes into these values, too, which costs less than copying them; only
+        one of the two can go on, this one with `drop_strangers`
+        """
         other = SceneFactorGraph()
         other.__dict__ |= self.__dict__
         other._variables, other._groups = dict(self._variables), dict(self._groups)
         other._touching, other._fresh = dict(self._touching), dict(self._fresh)
         other._factor_counts = dict(self._factor_counts)
-        other._base, other._values = self.base, self.values
+        if not share_values:
+            other._base, other._values = self.base, self.values
         return other
+
+    def drop_strangers(self) -> None:
+        """Erase values of variables that are not in the graph."""
+        for values in (self._base, self._values):
+            for key in set(values.keys()) - self._variables.keys():
+                values.erase(key)
 
     def undetermined(self, error: Exception) -> GraphError:
         """What a solver said, in the words of this graph."""

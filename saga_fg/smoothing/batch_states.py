@@ -6,14 +6,15 @@ r"""The states of all objects at all moments of a recording, given everything th
     standing      || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object stands
 
 over one factor graph (`saga_fg.estimators.BatchSmoother`; long recordings in windows, by `WindowedSmoother`, which
-comes to the same within a millimetre and does not keep all matrices of an hour). The edges of an interval follow from
+comes to the same within a millimetre and does not keep all matrices of an hour; with factors of users' own the running
+graph itself, `saga_fg.smoothing.graph_states`). The edges of an interval follow from
 given states at its start: those of an earlier, simpler round. Robust losses (`factors.robust`) are reached by
 reweighting between rounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,11 +23,13 @@ from factors import Robust
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.by_class import class_settings
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import BatchSmoother, Measurements, Smoothed, WindowedSmoother
+from saga_fg.estimators import BatchSmoother, Births, Measurements, Smoothed, WindowedSmoother
+from saga_fg.graph import FactorProvider
 from saga_fg.interactions import VELOCITY
 from saga_fg.node import NodeType
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.smoothing.evidence import Evidence
+from saga_fg.smoothing.graph_states import Epoch, states_in_graph
 from saga_fg.smoothing.settings import OfflineClass, StandingSettings
 from saga_fg.smoothing.states import Lives, StateTable
 
@@ -66,61 +69,88 @@ def smooth_states(
     graph_of: GraphOf = no_edges,
     weight: FloatArray | None = None,
     standing: Standing | None = None,
+    providers: Sequence[FactorProvider] = (),
 ) -> StateTable:
     """Smoothed states of every object at every moment of its life.
 
     object_of (N,) the object of each detection, negative for none; velocity_prior (n, 2, 2) of the lives' velocities;
     weight (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
+    providers   asked once a moment for factors of their own
     """
-    standing = standing or Standing()
-    weight = np.ones(len(evidence)) if weight is None else weight
-    types = _node_types(lives, classes)
-    start = _first_positions(evidence, object_of, lives)
-    smoother: BatchSmoother | WindowedSmoother
+    parts = _epochs(
+        evidence,
+        object_of,
+        lives,
+        velocity_prior,
+        _node_types(lives, classes),
+        graph_of,
+        np.ones(len(evidence)) if weight is None else weight,
+        standing or Standing(),
+    )
+    epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
-    smoother = WindowedSmoother() if long else BatchSmoother(likelihoods=False, order="time")
-    parts: list[tuple[int, IntArray, FloatArray, FloatArray]] = []
+    states = _smoothed(epochs, WindowedSmoother() if long else BatchSmoother(likelihoods=False, order="time"))
+    if not providers:
+        return states
+    labels = dict(zip(lives.id.tolist(), lives.label.tolist(), strict=True))
+    return states_in_graph(list(epochs), states, evidence, labels, providers)
 
-    def keep(moments: Sequence[Smoothed]) -> None:
-        for state in moments:
-            parts.append((begin + len(parts), state.nodes, state.mean(state.nodes), state.covariance(state.nodes)))
 
+def _epochs(
+    evidence: Evidence,
+    object_of: IntArray,
+    lives: Lives,
+    velocity_prior: FloatArray,
+    types: Sequence[NodeType],
+    graph_of: GraphOf,
+    weight: FloatArray,
+    standing: Standing,
+) -> Iterator[Epoch]:
+    """Everything from the first moment of a life to the last one."""
+    start = _first_positions(evidence, object_of, lives)
     present = np.empty(0, dtype=np.int64)
-    moments = evidence.moment
-    bounds = np.searchsorted(moments, np.arange(len(evidence.times) + 1))
-    begin = int(lives.first.min(initial=0))
-    end = int(lives.last.max(initial=-1))
-    for k in range(begin, end + 1):
+    bounds = np.searchsorted(evidence.moment, np.arange(len(evidence.times) + 1))
+    begin = int(lives.first.min(initial=len(evidence.times)))
+    for k in range(begin, int(lives.last.max(initial=-1)) + 1):
+        transition = None
         if k > begin:
             graph = graph_of(k - 1, lives.id[present], tuple(types[i] for i in present.tolist()))
             still = standing.at(k - 1, graph.nodes) & standing.at(k, graph.nodes)
             graph = replace(graph, diffusion_scale=np.where(still, standing.settings.noise, graph.diffusion_scale))
-            smoother.predict(discretise(graph, float(evidence.times[k] - evidence.times[k - 1])))
+            transition = discretise(graph, float(evidence.times[k] - evidence.times[k - 1]))
         born = np.flatnonzero(lives.first == k)
-        if len(born):
-            mean = np.concatenate([start[born], np.zeros((len(born), 2))], axis=1)
-            P = np.zeros((len(born), 4, 4))
-            P[:, :2, :2] = UNKNOWN_POSITION**2 * np.eye(2)
-            P[:, 2:, 2:] = velocity_prior[born]
-            smoother.add(lives.id[born], mean, P)
-            present = np.concatenate([present, born])
-        _measure(smoother, evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
+        P = np.zeros((len(born), 4, 4))
+        P[:, :2, :2] = UNKNOWN_POSITION**2 * np.eye(2)
+        P[:, 2:, 2:] = velocity_prior[born]
+        births = Births(lives.id[born], np.concatenate([start[born], np.zeros((len(born), 2))], axis=1), P)
+        present = np.concatenate([present, born])
+        measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
         pinned = lives.id[present][standing.at(k, lives.id[present])]
         if len(pinned):
-            H = types[0].selector(VELOCITY)
-            smoother.update(
-                Measurements(pinned, np.zeros((len(pinned), 2)), H, standing.settings.velocity**2 * np.eye(2))
-            )
+            H, R = types[0].selector(VELOCITY), standing.settings.velocity**2 * np.eye(2)
+            measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lives.last[present] == k
-        if gone.any():
-            smoother.marginalise(lives.id[present[gone]])
-            present = present[~gone]
+        yield Epoch(k, transition, births, measured, lives.id[present[gone]])
+        present = present[~gone]
+
+
+def _smoothed(epochs: Iterable[Epoch], smoother: BatchSmoother | WindowedSmoother) -> StateTable:
+    """By recursions over the joint state, in NumPy."""
+    states: list[Smoothed] = []
+    begin = 0
+    for count, epoch in enumerate(epochs):
+        begin = epoch.moment - count
+        if epoch.transition is not None:
+            smoother.predict(epoch.transition)
+        smoother.add(epoch.births.nodes, epoch.births.means, epoch.births.covariances)
+        for measurements in epoch.measurements:
+            smoother.update(measurements)
+        smoother.marginalise(epoch.gone)
         if isinstance(smoother, WindowedSmoother):
-            keep(smoother.final())
-    if end < begin:
-        return StateTable.of_moments([])
-    keep(smoother.finish() if isinstance(smoother, WindowedSmoother) else smoother.smoothed())
-    return StateTable.of_moments([part for part in parts if len(part[1])])
+            states += smoother.final()
+    states += smoother.finish() if isinstance(smoother, WindowedSmoother) else smoother.smoothed()
+    parts = [(begin + k, s.nodes, s.mean(s.nodes), s.covariance(s.nodes)) for k, s in enumerate(states) if len(s.nodes)]
+    return StateTable.of_moments(parts)
 
 
 def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, loss: Robust) -> FloatArray:
@@ -135,11 +165,10 @@ def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, 
     return weight
 
 
-def _measure(
-    smoother: BatchSmoother | WindowedSmoother, evidence: Evidence, object_of: IntArray, rows: slice, weight: FloatArray
-) -> None:
-    """Take in the attributed detections of a moment."""
+def _measured(evidence: Evidence, object_of: IntArray, rows: slice, weight: FloatArray) -> list[Measurements]:
+    """The attributed detections of a moment."""
     mine = np.arange(rows.start, rows.stop)[object_of[rows] >= 0]
+    measured = []
     for velocity in (True, False):
         chosen = mine[evidence.with_velocity[mine] == velocity]
         if len(chosen) == 0:
@@ -147,7 +176,8 @@ def _measure(
         k = 4 if velocity else 2
         z = np.concatenate([evidence.boxes.position[chosen, :2], evidence.boxes.velocity[chosen]], axis=1)[:, :k]
         R = evidence.R[chosen, :k, :k] / weight[chosen, None, None]
-        smoother.update(Measurements(object_of[chosen], z, np.eye(4)[:k], R))
+        measured.append(Measurements(object_of[chosen], z, np.eye(4)[:k], R))
+    return measured
 
 
 def _node_types(lives: Lives, classes: Mapping[str, OfflineClass]) -> list[NodeType]:

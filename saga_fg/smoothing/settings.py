@@ -94,6 +94,10 @@ class SmoothingSettings:
         "huber", "robust loss of the detections"
     )
     loss_scale: float = setting(2.0, "residual from which the loss differs from a square, standard deviations")
+    providers: tuple[str, ...] = setting(
+        (),
+        "factor providers of your own as MODULE:NAME, asked once a moment for the final states, made anew every time",
+    )
     reweightings: int = setting(1, "times the weights of the loss, and the edges, are found again at the final states")
     extension: float = setting(1.5, "how far before its birth and after its end an object is looked for, s")
     prior_time: float = setting(1.0, "looks without a detection that every object starts with, as a time, s")

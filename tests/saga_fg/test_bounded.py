@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from estimator_programs import TextbookEstimator, births, random_program, run
 from flocks import flock, prior_deviation
+from graph_keys import keys_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_graphs import BUS, CAR, CONE, random_graph
@@ -278,10 +279,9 @@ def test_what_a_node_told_of_a_neighbour_in_another_cluster_stays_when_it_leaves
 def test_its_graph_has_its_means_and_marginal_covariances():
     estimator, _ = crowd()
     answer = estimator.graph()
-    step = answer.graph.linearize(answer.values).optimize()
-    marginals = gtsam.Marginals(answer.graph, answer.values)
-    (keys,) = answer.keys
-    for node, key in keys.items():
+    step = answer.native().linearize(answer.values).optimize()
+    marginals = gtsam.Marginals(answer.native(), answer.values)
+    for node, key in keys_of(answer, 0).items():
         assert np.abs(step.at(key)).max() <= 1e-9, "the values are the minimum"
         assert np.allclose(answer.values.atVector(key), estimator.mean([node])[0])
         assert np.allclose(marginals.marginalCovariance(key), estimator.covariance([node])[0], rtol=1e-8, atol=1e-10)

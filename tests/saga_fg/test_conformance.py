@@ -24,12 +24,13 @@ from estimator_programs import (
     run,
 )
 from estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
+from graph_keys import newest_key
 from random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
 from road_scenes import road_program
 
 from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators import BatchSolver, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.transition import Blocks
 
 ESTIMATORS = [
@@ -236,13 +237,26 @@ def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
         start.insert(key, np.zeros_like(equivalent.values.atVector(key)))
     settings = gtsam.GaussNewtonParams()
     settings.setLinearSolverType("MULTIFRONTAL_QR")
-    solved = gtsam.GaussNewtonOptimizer(equivalent.graph, start, settings).optimize()
-    marginals = gtsam.Marginals(equivalent.graph, solved)
+    solved = gtsam.GaussNewtonOptimizer(equivalent.native(), start, settings).optimize()
+    marginals = gtsam.Marginals(equivalent.native(), solved)
     for node in estimator.nodes.tolist():
-        key, P = equivalent.keys[-1][node], estimator.covariance([node])[0]
+        key, P = newest_key(equivalent, node), estimator.covariance([node])[0]
         for values in (solved, equivalent.values):
             assert np.abs((values.atVector(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 1e-7
         assert np.linalg.norm(marginals.marginalCovariance(key) - P) < 1e-6 * np.linalg.norm(P)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_batch_solver_solves_the_estimators_graph_to_the_same_answer(make, seed):
+    """Its graph is a running graph: nodes of a map by their kind, moments by their time, poles with one variable."""
+    estimator, _ = run(random_program(np.random.default_rng(seed), moments=6), make())
+    estimator.add([-4], np.array([[3.0, 1.0]]), 0.1 * np.eye(2)[None])
+    solver = BatchSolver(graph=estimator.graph())
+    for node in estimator.nodes.tolist():
+        key, P = newest_key(estimator.graph(), node), estimator.covariance([node])[0]
+        assert np.abs((solver.state(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 5e-9
+        assert np.linalg.norm(solver.covariance(key) - P) < 5e-9 * np.linalg.norm(P)
+    assert str(solver.graph().variable(key)) == f"map node 4 at {estimator.time:.2f} s"
 
 
 def test_any_subset_in_any_order_can_be_read(make):

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from estimator_scenario import EXACT, Textbook, covariance_error, mean_error, part, random_scenario, tell
+from graph_keys import keys_of
 from random_graphs import BUS, CAR, CONE, POLE
 
 from factors import NonlinearInteraction, RangeBearing, Robust
@@ -149,9 +150,9 @@ def test_gtsam_solves_the_same_graph_to_the_same_answer(robust):
     smoother = BatchSmoother(likelihoods=False)
     platoon(smoother, frames=12, outliers=0.2, robust=robust)
     equivalent = smoother.graph()
-    solved = gtsam.LevenbergMarquardtOptimizer(equivalent.graph, equivalent.values).optimize()
-    for moment, keys in zip(smoother.smoothed(), equivalent.keys, strict=True):
-        for node, key in keys.items():
+    solved = gtsam.LevenbergMarquardtOptimizer(equivalent.native(), equivalent.values).optimize()
+    for epoch, moment in enumerate(smoother.smoothed()):
+        for node, key in keys_of(equivalent, epoch).items():
             sigma = np.sqrt(np.diag(moment.covariance([node])[0]))
             assert np.abs((solved.atVector(key) - moment.mean([node])[0]) / sigma).max() < 1e-6
 

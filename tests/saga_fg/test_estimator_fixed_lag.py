@@ -17,12 +17,14 @@ from estimator_scenario import (
     random_scenario,
     tell,
 )
+from graph_keys import keys_of
 from random_graphs import BUS, CAR, CONE, POLE
 
 from factors import NonlinearInteraction, RangeBearing, Robust
 from saga_fg import InputError, SceneGraph, UnknownNodeError
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import FixedLagSmoother, GraduatedNonConvexity, Measurements, NodeMotion, Observations
+from saga_fg.graph import OBJECT, key_of
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.6, 100.0])
@@ -100,28 +102,28 @@ def test_gtsam_solves_the_same_graph_to_the_same_answer():
         start.insert(key, np.zeros_like(equivalent.values.atVector(key)))
     settings = gtsam.GaussNewtonParams()
     settings.setLinearSolverType("MULTIFRONTAL_QR")
-    solved = gtsam.GaussNewtonOptimizer(equivalent.graph, start, settings).optimize()
-    marginals = gtsam.Marginals(equivalent.graph, solved)
+    solved = gtsam.GaussNewtonOptimizer(equivalent.native(), start, settings).optimize()
+    marginals = gtsam.Marginals(equivalent.native(), solved)
     smoothed = smoother.smoothed()
-    assert len(smoothed) == len(equivalent.keys)
-    for moment, keys in zip(smoothed, equivalent.keys, strict=True):
-        assert set(keys) == set(moment.nodes.tolist())
-        for node, key in keys.items():
+    assert len(smoothed) == equivalent.epoch + 1
+    for epoch, moment in enumerate(smoothed):
+        assert set(equivalent.of(OBJECT, epoch)) == set(moment.nodes.tolist())
+        for node, key in keys_of(equivalent, epoch).items():
             own = moment.covariance([node])[0]
             sigma = np.sqrt(np.diag(own))
             assert np.abs((solved.atVector(key) - moment.mean([node])[0]) / sigma).max() < 1e-8
             assert covariance_error(marginals.marginalCovariance(key), own) < 1e-7
 
 
-def test_a_state_that_nothing_disturbs_is_a_hard_constraint_of_the_graph():
+def test_a_state_that_nothing_disturbs_keeps_its_variable():
     smoother = FixedLagSmoother(1.0)
     smoother.add([5], [[1.0, 2.0]], [np.diag([4.0, 1.0])])
     smoother.predict(discretise(SceneGraph.of([5], POLE), 0.5))
     smoother.update(Measurements([5], [[3.0]], [[1.0, 0.0]], [[1.0]]))
     equivalent = smoother.graph()
-    solved = gtsam.GaussNewtonOptimizer(equivalent.graph, equivalent.values).optimize()
-    for keys in equivalent.keys:
-        np.testing.assert_allclose(solved.atVector(keys[5]), [2.6, 2.0], atol=1e-12)
+    assert [str(variable) for variable in equivalent.variables.values()] == ["object 5 at 0.00 s"]
+    solved = gtsam.GaussNewtonOptimizer(equivalent.native(), equivalent.values).optimize()
+    np.testing.assert_allclose(solved.atVector(key_of(OBJECT, 5, 0)), [2.6, 2.0], atol=1e-12)
     np.testing.assert_allclose(smoother.smoothed()[0].mean([5]), [[2.6, 2.0]], atol=1e-12)
 
 
@@ -159,9 +161,9 @@ def assert_minimum(smoother):
     equivalent = smoother.graph()
     settings = gtsam.GaussNewtonParams()
     settings.setLinearSolverType("MULTIFRONTAL_QR")
-    solved = gtsam.GaussNewtonOptimizer(equivalent.graph, equivalent.values, settings).optimize()
-    for moment, keys in zip(smoother.smoothed(), equivalent.keys, strict=True):
-        for node, key in keys.items():
+    solved = gtsam.GaussNewtonOptimizer(equivalent.native(), equivalent.values, settings).optimize()
+    for epoch, moment in enumerate(smoother.smoothed()):
+        for node, key in keys_of(equivalent, epoch).items():
             sigma = np.sqrt(np.diag(moment.covariance([node])[0]))
             assert np.abs((solved.atVector(key) - moment.mean([node])[0]) / sigma).max() < 1e-6
     return equivalent, solved
@@ -172,8 +174,8 @@ def test_nonlinear_and_robust_measurements_are_solved_by_gauss_newton(robust):
     smoother = radar_window(robust)
     equivalent, solved = assert_minimum(smoother)
     if robust is None:
-        marginals = gtsam.Marginals(equivalent.graph, solved)
-        newest = equivalent.keys[-1]
+        marginals = gtsam.Marginals(equivalent.native(), solved)
+        newest = keys_of(equivalent, equivalent.epoch)
         for node in (1, 2, 3):
             assert covariance_error(smoother.covariance([node])[0], marginals.marginalCovariance(newest[node])) < 1e-6
     last = smoother.smoothed()[-1]
@@ -295,7 +297,7 @@ def test_an_empty_frame_and_no_nodes_at_all():
     assert smoother.update(Measurements([], np.empty((0, 2)), np.empty((0, 2, 4)), np.eye(2))) == 0.0
     assert smoother.nodes.tolist() == []
     assert len(smoother.smoothed()) == 2
-    assert smoother.graph().graph.size() == 0
+    assert smoother.graph().native().size() == 0
 
 
 def test_only_means_when_only_means_are_wanted():

@@ -135,6 +135,38 @@ def test_errors_are_named_and_leave_the_solver_as_it_was():
     assert len(BatchSolver().graph().variables) == 0
 
 
+class Curious:
+    """Asks how well the pedestrians of the epoch before are known; fails once."""
+
+    name = "curious"
+
+    def __init__(self):
+        self.known, self.fails = [], False
+
+    def factors(self, view):
+        self.known += [view.covariance(one.key) for one in view.before(OBJECT).values()]
+        if self.fails:
+            raise ValueError("enough")
+        return Additions()
+
+
+def test_a_provider_sees_what_was_known_before_its_epoch():
+    scene, curious = traffic(np.random.default_rng(4), frames=5), Curious()
+    estimators = [make([*providers(scene), curious]) for make in (BatchSolver, lambda p: IncrementalSmoother(p, None))]
+    for k, moment in enumerate(scene.moments):
+        answers = []
+        for estimator in estimators:
+            curious.known, curious.fails = [], k == 3
+            if curious.fails:
+                with pytest.raises(GraphError, match="provider curious: enough"):
+                    estimator.step(moment.time)
+            curious.known, curious.fails = [], False
+            estimator.step(moment.time)
+            answers.append(curious.known)
+        np.testing.assert_allclose(*answers, rtol=1e-3, atol=1e-9)
+    assert len(answers[0]) > 2
+
+
 def test_what_is_marginalised_stays_known():
     """The same at the end as of a whole graph, and after a pickle."""
     scene = traffic(np.random.default_rng(1), frames=6)
