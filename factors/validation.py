@@ -62,11 +62,13 @@ def checked_key_array(name: str, keys: ArrayLike) -> KeyArray:
 
 
 def checked_key_rows(name: str, rows: ArrayLike, columns: int) -> KeyArray:
-    """Return `rows` as an array of GTSAM keys (n, columns), columns > 0, or raise `FactorError`."""
+    """Return `rows` as an array of GTSAM keys (n, columns), columns > 0, or raise `FactorError`; [] are none."""
     try:
         array = np.asarray(rows)
     except ValueError as error:
         raise FactorError(f"{name}: expected rows of the same length") from error
+    if array.shape == (0,):
+        array = np.empty((0, columns), dtype=np.uint64)
     if array.ndim != 2 or array.shape[1] != columns or not columns:
         raise FactorError(f"{name}: expected shape (any, {columns}), got {array.shape}")
     return checked_key_array(name, array.reshape(-1)).reshape(array.shape)

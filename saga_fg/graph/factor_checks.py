@@ -53,7 +53,7 @@ def grouped(provider: str, factors: Any, variables: Mapping[int, GraphVariable])
         groups.append(LinearGroup(tuple(linear), tuple(tuple(factor.keys()) for factor in linear)))
     for group in groups:
         _check_variables(provider, group, variables)
-    return groups
+    return [group for group in groups if group.rows]
 
 
 def _flat(factors: Any) -> Iterable[Any]:

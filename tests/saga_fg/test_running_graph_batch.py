@@ -135,6 +135,23 @@ def test_errors_are_named_and_leave_the_solver_as_it_was():
     assert len(BatchSolver().graph().variables) == 0
 
 
+class Nobody:
+    """Factors on all cars, of which there are none."""
+
+    name = "nobody"
+
+    def factors(self, view):
+        rows = [[one.key] for one in view.now(OBJECT).values() if one.label == "car"]
+        return Additions(factors=[ResidualFactors(rows, (4,), lambda x: x.max(axis=0), np.eye(1))])
+
+
+@pytest.mark.parametrize("make", [BatchSolver, IncrementalSmoother])
+def test_a_provider_may_find_nobody_to_speak_of(make):
+    estimator = make([Nobody()])
+    estimator.step(0.0)
+    assert list(estimator.graph().factors()) == []
+
+
 class Curious:
     """Asks how well the pedestrians of the epoch before are known; fails once."""
 
