@@ -3,12 +3,12 @@
 from saga_fg.landmarks.association import associate, log_odds
 from saga_fg.landmarks.edge import LaneEdgeLandmark
 from saga_fg.landmarks.joint_estimate import Innovation, JointEstimate
-from saga_fg.landmarks.mapper import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting, landmarks_of
+from saga_fg.landmarks.mapper import LandmarkMap, LandmarkMapper, MapperSettings, Sighting
 from saga_fg.landmarks.merging import duplicates
 from saga_fg.landmarks.plane import PlaneLandmark
 from saga_fg.landmarks.point import PointLandmark
 from saga_fg.landmarks.pole import PoleLandmark
-from saga_fg.landmarks.protocol import LandmarkDetector, LandmarkFactors, LandmarkType, Observation
+from saga_fg.landmarks.protocol import Landmark, LandmarkDetector, LandmarkFactors, LandmarkType, Observation
 from saga_fg.landmarks.providers import MeasuredMotion, Sightings, landmark_key, pose_key
 
 __all__ = [
@@ -32,7 +32,6 @@ __all__ = [
     "associate",
     "duplicates",
     "landmark_key",
-    "landmarks_of",
     "log_odds",
     "pose_key",
 ]
