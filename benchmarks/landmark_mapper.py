@@ -15,7 +15,7 @@ import numpy as np
 from saga_fg.landmarks import LandmarkMapper, Observation, PoleLandmark
 
 REACH, GAP = 25.0, 3.3  # m; between poles
-Q = np.diag([0.002, 0.002, 0.003, 0.03, 0.02, 0.02]) ** 2
+Q = np.diag([0.0005, 0.0005, 0.001, 0.02, 0.01, 0.01]) ** 2
 R = 0.1**2 * np.eye(2)
 
 

@@ -14,15 +14,15 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
 from data_tools.trajectories import Trajectory
-from factors import Robust, Solution, between_factor
+from factors import Robust, between_factor
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.drive import LEAST, Drive, drive_by_lidar, drive_by_poses
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, find_loops
@@ -32,9 +32,8 @@ from pipelines.tracking import Progress
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.ego import JointSettings, OdometryNoise
 from saga_fg.estimators import BatchSolver
-from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.geometry import inverse_transform
-from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
+from saga_fg.graph import Additions, FactorProvider, GraphView
 from saga_fg.landmarks import (
     Landmark,
     LandmarkDetector,
@@ -44,7 +43,6 @@ from saga_fg.landmarks import (
     Observation,
     Sighting,
     Sightings,
-    landmark_key,
     pose_key,
 )
 from saga_fg.settings import require_positive, setting, settings_group
@@ -152,13 +150,12 @@ def lidar_slam(
     loops = find_loops(clouds, landmark_map.world_T_pose, s.loops) if s.loop_closures else []
     count = len(drive.keyframes)
     certain = [mark for mark in landmark_map.landmarks if mark.confirmed]
-    known = known_providers(certain, landmark_map.sightings, loops, range(count), s.robust_scale)
-    graph = SceneFactorGraph()
+    sightings, closed = known_providers(certain, landmark_map.sightings, loops, range(count), s.robust_scale)
+    solver = BatchSolver()
     for k, (time, place) in enumerate(zip(scans.timestamps[drive.keyframes], landmark_map.world_T_pose, strict=True)):
-        graph.advance(time)
         motion, covariance = motions[k - 1] if k else (place, _START)
-        ask_all([MeasuredMotion(motion, covariance, place), *known, *providers], graph)
-    solution = BatchSolver(graph=graph).solve()
+        solver.step(time, [MeasuredMotion(motion, covariance, place), sightings, closed, *providers])
+    solution = solver.solve()
     world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
     return LidarSlam(
         drive,
@@ -166,7 +163,7 @@ def lidar_slam(
         _trajectory(scans, drive.carried(world_T_lidar)),
         _trajectory(scans, drive.carried(np.array(online))),
         np.array([solution.marginal(pose_key(k)) for k in range(count)]),
-        updated(certain, solution),
+        sightings.landmarks(solution, s.mapper.confirm),
         landmark_map.sightings,
         [each.extent for scan in seen for each in scan],
         loops,
@@ -201,24 +198,14 @@ def known_providers(
     loops: Sequence[LoopClosure],
     epochs: Sequence[int],
     robust_scale: float,
-) -> list[FactorProvider]:
+) -> tuple[Sightings, Loops]:
     """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
     robust, start = Robust("geman-mcclure", robust_scale), {mark.number: mark.state for mark in landmarks}
     seen: dict[int, list[tuple[int, Observation]]] = {}
     for sighting in sightings:
         if sighting.landmark in start:
             seen.setdefault(epochs[sighting.pose], []).append((sighting.landmark, sighting.observation))
-    return [Sightings(seen, start, robust), Loops(loops, epochs, robust)]
-
-
-def updated(landmarks: Iterable[Landmark], solution: Solution | GraphSolution) -> list[Landmark]:
-    """The landmarks where a solution has them."""
-    found = []
-    for mark in landmarks:
-        key = landmark_key(mark.number)
-        state, covariance = mark.kind.variable.read(solution.values, key), solution.marginal(key)
-        found.append(replace(mark, state=state, covariance=covariance))
-    return found
+    return Sightings(seen, start, robust), Loops(loops, epochs, robust)
 
 
 def _trajectory(scans: ScanSequence, world_T_lidar: FloatArray) -> Trajectory:

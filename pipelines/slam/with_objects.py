@@ -16,7 +16,7 @@ import numpy as np
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.scan_sequence import ScanSequence
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers, updated
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers
 from saga_fg.arrays import FloatArray
 from saga_fg.ego import JointEstimate, Odometry, estimate_jointly, estimate_online
 from saga_fg.ego.record import in_ego
@@ -72,23 +72,17 @@ def with_objects(
         np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),
     )
     at = np.searchsorted(rows, result.keyframes)
+    known = known_providers(result.landmarks, result.sightings, result.loops, at.tolist(), s.robust_scale)
+    start = result.drive.poses[0]
     estimate = estimate_jointly(
-        seen,
-        odometry,
-        new_tracker,
-        s.objects,
-        result.drive.poses[0],
-        new_providers=lambda: [
-            *known_providers(result.landmarks, result.sightings, result.loops, at.tolist(), s.robust_scale),
-            *new_providers(),
-        ],
+        seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *new_providers()]
     )
     poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
     slam = replace(
         result,
         trajectory=Trajectory(scans.timestamps, poses),
         covariances=estimate.pose_covariances[at],
-        landmarks=updated(result.landmarks, estimate.solution),
+        landmarks=known[0].landmarks(estimate.solution, s.mapper.confirm),
         world_T_lidar=estimate.world_T_ego[at],
     )
     if lag is not None:
@@ -96,7 +90,7 @@ def with_objects(
         for sighting in result.sightings:
             observed[at[sighting.pose]].append(sighting.observation)
         online = estimate_online(
-            seen, odometry, new_tracker(), lag, s.objects, result.drive.poses[0], observed, s.mapper, new_providers()
+            seen, odometry, new_tracker(), lag, s.objects, start, observed, s.mapper, new_providers()
         )
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))

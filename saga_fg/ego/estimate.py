@@ -15,7 +15,7 @@ from saga_fg.ego.record import EgoMoment
 from saga_fg.ego.standing import SlowErrors
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.interactions import POSITION, VELOCITY
-from saga_fg.landmarks import Landmark, Sightings, landmarks_of, pose_key
+from saga_fg.landmarks import Landmark, Sightings, pose_key
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +67,7 @@ class JointEstimate:
     @cached_property
     def landmarks(self) -> list[Landmark]:
         """Those that were told apart along the path."""
-        seen = {} if self.sightings is None else self.sightings.seen
-        return landmarks_of((one for now in seen.values() for one in now), self.solution)
+        return [] if self.sightings is None else self.sightings.landmarks(self.solution)
 
     @cached_property
     def slow_errors(self) -> SlowErrors:

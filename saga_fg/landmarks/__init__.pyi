@@ -1,12 +1,12 @@
 from .association import associate, log_odds
 from .edge import LaneEdgeLandmark
 from .joint_estimate import Innovation, JointEstimate
-from .mapper import Landmark, LandmarkMap, LandmarkMapper, MapperSettings, Sighting, landmarks_of
+from .mapper import LandmarkMap, LandmarkMapper, MapperSettings, Sighting
 from .merging import duplicates
 from .plane import PlaneLandmark
 from .point import PointLandmark
 from .pole import PoleLandmark
-from .protocol import LandmarkDetector, LandmarkFactors, LandmarkType, Observation
+from .protocol import Landmark, LandmarkDetector, LandmarkFactors, LandmarkType, Observation
 from .providers import MeasuredMotion, Sightings, landmark_key, pose_key
 
 __all__ = [
@@ -30,7 +30,6 @@ __all__ = [
     "associate",
     "duplicates",
     "landmark_key",
-    "landmarks_of",
     "log_odds",
     "pose_key",
 ]

@@ -14,25 +14,23 @@ which is the better one, without any truth (Laplace's approximation at the solut
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from factors import ResidualFactor, Solution, SolverSettings, Variable
+from factors import ResidualFactor, SolverSettings, Variable
 from saga_fg.arrays import FloatArray
 from saga_fg.estimators.batch_graph import BatchSolver
 from saga_fg.estimators.graph_engine import RelinearisationSettings
-from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.graph import Additions, GraphView
 from saga_fg.landmarks.association import associate
 from saga_fg.landmarks.joint_estimate import JointEstimate
 from saga_fg.landmarks.merging import duplicates
-from saga_fg.landmarks.protocol import LandmarkType, Observation
+from saga_fg.landmarks.protocol import Landmark, Observation
 from saga_fg.landmarks.providers import MeasuredMotion, Sightings, landmark_key, pose_key, sighting_factors
 from saga_fg.settings import require_between, setting
 
@@ -64,45 +62,12 @@ class Sighting:
 
 
 @dataclass(frozen=True, eq=False)
-class Landmark:
-    """A landmark of the map: its state, the covariance (d, d) of that, and how often it was seen."""
-
-    number: int
-    kind: LandmarkType
-    state: Any
-    covariance: FloatArray
-    sightings: int
-    confirmed: bool
-
-
-@dataclass(frozen=True, eq=False)
 class LandmarkMap:
     """world_T_pose: (N, d + 1, d + 1); landmarks in the order of their numbers; sightings in the order they came."""
 
     world_T_pose: FloatArray
     landmarks: list[Landmark]
     sightings: list[Sighting]
-
-
-def landmarks_of(
-    seen: Iterable[tuple[int, Observation]], solution: Solution | GraphSolution, confirm: int = 1
-) -> list[Landmark]:
-    """The landmarks, by number, of which these observations are, where a solution has them."""
-    kinds, counts = dict[int, LandmarkType](), Counter[int]()
-    for number, observation in seen:
-        kinds[number] = observation.kind
-        counts[number] += 1
-    return [
-        Landmark(
-            number,
-            kinds[number],
-            kinds[number].variable.read(solution.values, landmark_key(number)),
-            solution.marginal(landmark_key(number)),
-            count,
-            count >= confirm,
-        )
-        for number, count in sorted(counts.items())
-    ]
 
 
 class LandmarkMapper:
@@ -204,10 +169,10 @@ class LandmarkMapper:
         """Everything, smoothed."""
         self.smooth()
         solver = BatchSolver(graph=self._smoother.snapshot(), settings=_SOLVER)
-        sightings = list(self._sightings())
-        seen = ((s.landmark, s.observation) for s in sightings)
+        seen = {row: now for chunk in self._smoothed.values() for row, now in chunk.items()}
+        sightings = [Sighting(row, observation, number) for row, now in seen.items() for number, observation in now]
         poses = np.stack([_pose(solver, row) for row in range(self._poses)])
-        return LandmarkMap(poses, landmarks_of(seen, solver.solve(), self.settings.confirm), sightings)
+        return LandmarkMap(poses, Sightings(seen, {}).landmarks(solver.solve(), self.settings.confirm), sightings)
 
     def _read(self) -> None:
         """Make the Gaussian that of the graph."""
@@ -216,12 +181,6 @@ class LandmarkMapper:
         landmarks = {n: (self.estimate.kinds[n], self._smoother.state(landmark_key(n))) for n in numbers}
         P = self._smoother.joint_covariance(keys, rough=True)
         self.estimate = JointEstimate(_pose(self._smoother, self._poses - 1), P, landmarks)
-
-    def _sightings(self) -> Iterator[Sighting]:
-        for chunk in self._smoothed.values():
-            for row, now in chunk.items():
-                for number, observation in now:
-                    yield Sighting(row, observation, number)
 
     def _apart(self) -> set[tuple[int, int]]:
         """Pairs of landmarks that were seen from one pose."""

@@ -78,6 +78,18 @@ class Observation:
         object.__setattr__(self, "covariance", covariance)
 
 
+@dataclass(frozen=True, eq=False)
+class Landmark:
+    """A landmark of the map: its state, the covariance (d, d) of that, and how often it was seen."""
+
+    number: int
+    kind: LandmarkType
+    state: Any
+    covariance: FloatArray
+    sightings: int
+    confirmed: bool
+
+
 class LandmarkDetector(Protocol):
     """Finds landmarks in the data of a moment: a frame, or the points (N, 3), m, of a scan in the scanner's frame."""
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from factors import ResidualFactor, ResidualFactors, Robust, between_factor, pose, pose_prior_factor
+from factors import ResidualFactor, ResidualFactors, Robust, Solution, between_factor, pose, pose_prior_factor
 from saga_fg.arrays import FloatArray
+from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
-from saga_fg.landmarks.protocol import LandmarkType, Observation
+from saga_fg.landmarks.protocol import Landmark, LandmarkType, Observation
 
 
 def pose_key(epoch: int) -> int:
@@ -71,6 +73,18 @@ class Sightings:
         ]
         last = max(self.seen, default=None)
         return Additions(new, named={last: sighting_factors(self.seen, self.robust)} if last == view.epoch else {})
+
+    def landmarks(self, solution: Solution | GraphSolution, confirm: int = 1) -> list[Landmark]:
+        """The landmarks by number, where a solution has them; confirm: observations that make one certain."""
+        kinds, counts = dict[int, LandmarkType](), Counter[int]()
+        for number, observation in (one for now in self.seen.values() for one in now):
+            kinds[number] = observation.kind
+            counts[number] += 1
+        found = []
+        for n, kind in sorted(kinds.items()):
+            state, covariance = kind.variable.read(solution.values, landmark_key(n)), solution.marginal(landmark_key(n))
+            found.append(Landmark(n, kind, state, covariance, counts[n], counts[n] >= confirm))
+        return found
 
 
 def sighting_factors(

@@ -9,7 +9,7 @@ import pytest
 from factors import Robust
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import GraphError, SceneFactorGraph, ask_all
-from saga_fg.landmarks import MeasuredMotion, Observation, PoleLandmark, Sightings, landmark_key, landmarks_of, pose_key
+from saga_fg.landmarks import MeasuredMotion, Observation, PoleLandmark, Sightings, landmark_key, pose_key
 
 Q = np.diag([0.01, 0.01, 0.02, 0.1, 0.05, 0.05]) ** 2
 POLE, R = PoleLandmark(), 0.1**2 * np.eye(2)
@@ -45,7 +45,7 @@ def test_epochs_at_once_one_by_one_and_as_a_whole_are_the_same() -> None:
         P = smoother.joint_covariance(keys)
         np.testing.assert_allclose(P, exact, atol=1e-6)
         np.testing.assert_allclose(smoother.joint_covariance(keys, rough=True), P, rtol=1e-5, atol=1e-9)
-    for mark, place in zip(landmarks_of(sightings.seen[6], whole.solve(), 2), POLES, strict=True):
+    for mark, place in zip(sightings.landmarks(whole.solve(), 5), POLES, strict=True):
         off = mark.state - place[:2]
         assert off @ np.linalg.solve(mark.covariance, off) < 14
         assert not mark.confirmed
