@@ -68,7 +68,7 @@ class OnlineEstimator:
         if not (math.isfinite(lag) and lag >= 0):
             raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._lag, self._settings = lag, settings or JointSettings()
-        self._registration = Registration(tracker, self._settings.motion_noise)
+        self._registration = Registration(tracker, self._settings.online_motion_noise)
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
         self._landmarks = WindowLandmarks(mapper or MapperSettings())

@@ -44,6 +44,7 @@ class JointSettings:
     standing_drift: float = setting(0.05, "how far an object that stands may wander, m after one second")
     standing_speed: float = setting(0.1, "standard deviation of the velocity of an object that stands, m/s")
     motion_noise: float = setting(1000.0, "factor on the noise of the objects' motion: traffic brakes and turns as one")
+    online_motion_noise: float = setting(1.0, "the same online, where the objects' velocities are wanted as they come")
     outlier_scale: float = setting(3.0, "detections farther off than this count less (Cauchy), standard deviations")
     landmark_reach: float = setting(2.5, "a landmark seen farther than this from where it was last is another one, m")
     lanes: LaneSettings | None = settings_group(
@@ -55,7 +56,7 @@ class JointSettings:
 
     def __post_init__(self) -> None:
         require_positive(self, "start_noise", "standing_window", "standing_drift", "standing_speed")
-        require_positive(self, "motion_noise", "landmark_reach")
+        require_positive(self, "motion_noise", "online_motion_noise", "landmark_reach")
         if DEFAULT not in self.moving_speed or not all(0 < speed < math.inf for speed in self.moving_speed.values()):
             raise InputError(
                 f"moving_speed: expected positive numbers by class, {DEFAULT} among them, got {dict(self.moving_speed)}"
