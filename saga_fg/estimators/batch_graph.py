@@ -17,9 +17,10 @@ from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.point import Point
-from saga_fg.graph.providers import FactorProvider, GraphView, ask
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
 
@@ -54,9 +55,12 @@ class BatchSolver:
         """Time of the newest epoch, s."""
         return self._graph.time
 
-    def step(self, time: float, providers: Sequence[FactorProvider] | None = None) -> None:
-        """Begin the epoch at `time`, s, and ask the providers, by default those of the solver."""
-        self._asked(time, self.providers if providers is None else providers)
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
+        """Begin the epoch at `time`, s, and ask the providers, by default those of the solver.
+
+        frame: what they are told of the epoch
+        """
+        self._asked(time, self.providers if providers is None else providers, frame)
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch."""
@@ -110,14 +114,14 @@ class BatchSolver:
             raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
         self._changed(graph.copy())
 
-    def _asked(self, time: float | None, providers: Sequence[FactorProvider]) -> None:
+    def _asked(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:
         known = self._graph
         graph = known.copy(share_values=not self._lent)
-        view = GraphView(graph, self.covariance, self.origin)
+        view = GraphView(graph, self.covariance, self.origin, frame)
         try:
             if time is not None:
                 graph.advance(time)
-            for provider in providers:
+            for provider in providers if time is None else (*beginnings(providers), *providers):
                 ask(provider, graph, view)
         except GraphError:
             known.drop_strangers()

@@ -116,7 +116,7 @@ class IncrementalSmoother:
         graph = self._graph.copy()
         for time, providers in epochs:
             graph.advance(time)
-            self._ask(graph, providers)
+            self._ask(graph, [*beginnings(providers), *providers])
         self._move_to(graph)
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:

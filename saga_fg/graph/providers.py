@@ -124,8 +124,8 @@ class GraphView:
 
 def ask_all(providers: Iterable[FactorProvider], graph: SceneFactorGraph) -> None:
     """Add what providers give at the present epoch of a recording that is solved as a whole."""
-    view = GraphView(graph, _unknown, np.zeros(2))
-    for provider in providers:
+    view, asked = GraphView(graph, _unknown, np.zeros(2)), list(providers)
+    for provider in (*beginnings(asked), *asked):
         ask(provider, graph, view)
 
 
