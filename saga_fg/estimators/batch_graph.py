@@ -60,7 +60,16 @@ class BatchSolver:
 
         frame: what they are told of the epoch
         """
-        self._asked(time, self.providers if providers is None else providers, frame)
+        asked = self.providers if providers is None else providers
+        unchanged, begun = (self._graph, self._solution, self._lent), beginnings(asked)
+        self._asked(time, begun or asked, frame)
+        if begun:
+            try:
+                self._asked(None, asked, frame)
+            except GraphError:
+                self._graph, self._solution, self._lent = unchanged
+                self._graph.drop_strangers()
+                raise
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch."""
@@ -121,7 +130,7 @@ class BatchSolver:
         try:
             if time is not None:
                 graph.advance(time)
-            for provider in providers if time is None else (*beginnings(providers), *providers):
+            for provider in providers:
                 ask(provider, graph, view)
         except GraphError:
             known.drop_strangers()
