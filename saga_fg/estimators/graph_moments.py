@@ -28,7 +28,7 @@ from saga_fg.estimators.prediction import Prediction
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 
 _SMALL = 64  # size of the largest component that is eliminated by QR
-_LIMIT = 1e11  # variance predicted over process noise, up to which factors keep enough digits
+_LIMIT = 1e8  # variance predicted over process noise, up to which factors keep enough digits
 _LIMIT_WIDE = 1e6  # the same by Cholesky
 
 

@@ -128,6 +128,12 @@ def test_tiny_intervals(make, dt):
     in_step(random_program(rng, moments=6, intervals=(dt, 0.4)), make())
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_milliseconds_beside_seconds(make, seed):
+    """Nodes of all kinds: the noise of constant acceleration falls with the fifth power of the interval."""
+    in_step(random_program(np.random.default_rng(seed), moments=9, intervals=(1e-3, 0.05, 1.0)), make())
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_thousand_seconds_without_a_word(make, seed):
     """Nodes that are measured just before and after a long gap.
