@@ -61,13 +61,14 @@ def g2o(
     graph = read_g2o(file)
     with working("optimising"), located(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         optimised = optimise_poses(graph, loss)
+        covariances = optimised.covariances()
     guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):
             errors["GTSAM Levenberg-Marquardt"] = levenberg_marquardt(graph)
             errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
-    write_pose_graph(output, graph, optimised, errors)
+    write_pose_graph(output, graph, optimised, covariances, errors)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
     typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (guess in the file {guess:.6g})")
     for name, error in errors.items():

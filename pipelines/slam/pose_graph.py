@@ -21,12 +21,17 @@ from saga_fg.arrays import FloatArray
 from saga_fg.pose_graph import OptimisedPoses, PoseGraph
 
 
-def write_pose_graph(output: Path, graph: PoseGraph, optimised: OptimisedPoses, errors: dict[str, float]) -> None:
-    """Write the results of one graph to a folder, all or none of them. errors: by name, as they shall be recorded."""
+def write_pose_graph(
+    output: Path, graph: PoseGraph, optimised: OptimisedPoses, covariances: FloatArray, errors: dict[str, float]
+) -> None:
+    """Write the results of one graph to a folder, all or none of them.
+
+    covariances: of its poses; errors: by name, as they shall be recorded
+    """
     d = graph.dim
     with atomic_directory(output) as folder:
         write_g2o(folder / "poses.g2o", graph.at(optimised.world_T_pose))
-        _write_covariances(folder / "covariances.csv", graph, optimised.covariances())
+        _write_covariances(folder / "covariances.csv", graph, covariances)
         write_figures(folder / "errors.json", {"best": optimised.start, **errors})
         paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
         write_bytes(folder / "above.png", png(paths_from_above(paths)))
