@@ -21,6 +21,7 @@ from factors import FactorError, Robust, nonlinear_graph
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.elimination import NoSolution, marginal_covariances, solved_tree, tree_covariances
 from saga_fg.estimators.elimination_order import Order, cheapest_order
 from saga_fg.estimators.factor_graph import recording_factors
@@ -28,10 +29,11 @@ from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
+from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
@@ -49,7 +51,7 @@ class BatchState:
     graduated: bool
 
 
-class BatchSmoother:
+class BatchSmoother(NewestMarginals):
     """The exact smoother over everything. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     settings     of Gauss-Newton, for what is nonlinear or robust
@@ -114,18 +116,6 @@ class BatchSmoother:
     def marginalise(self, nodes: ArrayLike) -> None:
         self._recording.leave(nodes)
 
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().mean(nodes)
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().covariance(nodes)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_mean(nodes)
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_covariance(nodes)
-
     @property
     def order(self) -> Order:
         """The order of elimination in which this recording is solved."""
@@ -186,9 +176,9 @@ class BatchSmoother:
         self._graduated = state.graduated
         self._changed()
 
-    def _newest(self) -> Newest:
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         self._graduate()
-        return Newest(self._recording.layout, self._recording.newest())
+        return live_rows(self._recording.newest(), self._recording.layout, nodes)
 
     def _graduate(self) -> None:
         """Find the weights of graduated non-convexity, from all ones."""

@@ -21,9 +21,9 @@ from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetec
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.motion import Motion
+from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.estimators.smoothed import Newest
 from saga_fg.frame import Frame
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
@@ -42,7 +42,7 @@ class GraphState:
     beside: tuple[int, ...]
 
 
-class GraphFilter:
+class GraphFilter(NewestMarginals):
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
@@ -160,18 +160,6 @@ class GraphFilter:
         self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
         self._posterior = None
 
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().mean(nodes)
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().covariance(nodes)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_mean(nodes)
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_covariance(nodes)
-
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian of all nodes."""
         if self._posterior is None:
@@ -219,8 +207,8 @@ class GraphFilter:
         keys = {**dict.fromkeys(beside), **self._keys}
         return self._smoother.joint_gaussian(layout, [keys[node] or node for node in layout.nodes.tolist()])
 
-    def _newest(self) -> Newest:
-        return Newest(self._layout, self.posterior())
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+        return self.posterior(), self._layout.rows(nodes)
 
     def _changed(self) -> IncrementalSmoother:
         self._posterior = None
