@@ -28,7 +28,7 @@ from saga_fg.estimators.factor_graph import recording_factors
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
-from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
@@ -91,9 +91,8 @@ class BatchSmoother(NewestMarginals):
         self._recording.add(nodes, means, covariances)
         self._changed()
 
-    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
-        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
-        self._recording.move(Motion(transition, tuple(nonlinear)))
+    def predict(self, transition: Transition) -> None:
+        self._recording.move(Motion(transition))
         self._changed()
 
     def update(

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
@@ -23,7 +22,7 @@ from factors import Robust
 from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
@@ -76,9 +75,8 @@ class FixedLagSmoother(NewestMarginals):
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         self._recording.add(nodes, means, covariances)
 
-    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
-        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
-        self._recording.move(Motion(transition, tuple(nonlinear)))
+    def predict(self, transition: Transition) -> None:
+        self._recording.move(Motion(transition))
         self._recording.forget(self.time - self._lag)
 
     def update(

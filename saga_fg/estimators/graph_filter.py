@@ -17,7 +17,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.graph_moments import condense, in_moments, lossy, stays
-from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
+from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.motion import Motion
@@ -151,7 +151,7 @@ class GraphFilter(NewestMarginals):
             return 0.0
         x = self.posterior()
         likelihood = innovation_likelihood(x, *sighting.linearised(x.layout, x.mean))
-        self._changed().extend([LinearDetections(measurements, self._keys)])
+        self._changed().extend([DetectionFactors(measurements, self._keys)])
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
