@@ -30,7 +30,6 @@ from factors import (
 from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion, Standstill
@@ -108,7 +107,7 @@ def recording_factors(
             gone = layout.rows(moment.gone)
             stay = layout.without(gone) if len(gone) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
-            resting = stay.nodes[_resting(moment.motion.dynamics(stay, at))].tolist()
+            resting = stay.nodes[moment.motion.dynamics(stay, at).still].tolist()
             now, keys = keys, {node: keys[node] for node in resting}
             then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
             native, nonlinear = motion_factors(moment.motion, stay, at, now, then)
@@ -151,20 +150,6 @@ def _linear_residual(H: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
 
 def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
     return [H]
-
-
-def _resting(dynamics: Dynamics) -> BoolArray:
-    """(n,) which nodes stay exactly where they are."""
-    layout = dynamics.layout
-    moved = np.zeros(len(layout), dtype=bool)
-    np.logical_or.at(moved, np.repeat(np.arange(len(layout)), layout.dims), dynamics.b != 0)
-    for blocks in dynamics.Q:
-        moved[blocks.target[blocks.values.any(axis=(1, 2))]] = True
-    for blocks in dynamics.F:
-        same = blocks.target == blocks.source
-        moved[blocks.target[~same]] = True
-        moved[blocks.target[same][(blocks.values[same] != np.eye(*blocks.values.shape[1:])).any(axis=(1, 2))]] = True
-    return ~moved
 
 
 def motion_factors(

@@ -16,7 +16,7 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.graph_moments import condense, in_moments, lossy, stays
+from saga_fg.estimators.graph_moments import condense, in_moments, lossy
 from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
@@ -125,7 +125,7 @@ class GraphFilter(NewestMarginals):
         motion.check(self._layout)
         x, nodes = self.posterior(), self._layout.nodes
         dynamics = motion.dynamics(self._layout, x.mean)
-        still = stays(dynamics)
+        still = dynamics.still
         if transition.dt == 0 and still.all():
             return
         standing, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
