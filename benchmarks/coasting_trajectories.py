@@ -23,7 +23,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.metrics import Average, Interval, relative_change_of_errors
+from benchmarks.block_bootstrap import Average, relative_change_of_errors
+from data_tools.metrics import Interval
 from pipelines.figures import FigureTable, cell
 from pipelines.tracking import Progress
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray

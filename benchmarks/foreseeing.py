@@ -1,7 +1,7 @@
 """A tracker that knows how drivers drive: its predictions of vehicles are a floor for those of any model of them.
 
 It tracks as the one it is made from, so that it starts from the same estimates, and asks the simulator for the rest
-(`data_tools.simulator.foresight`): what is left is the error of the estimates, carried on, and what differs from driver
+(`benchmarks.foresight`): what is left is the error of the estimates, carried on, and what differs from driver
 to driver and from moment to moment.
 """
 
@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.foresight import foreseen
 from benchmarks.predictions import own_tracks
-from data_tools.simulator.foresight import foreseen
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import World
 from pipelines.tracking import OnlineTracker

@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.affected import affected
 from benchmarks.foreseeing import Foreseeing
 from benchmarks.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, without_parts
 from benchmarks.predictions import FOLLOWED, Asked, in_view, moving, prediction_errors
 from data_tools.metrics import Interval, paired_bootstrap, ratio_of_sums
-from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import build_world

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.graph_tracking import JointGraphTracking, SeparateGraphTracking
+from benchmarks.scaling_plot import scaling_plot
 from data_tools.atomic_files import write_bytes
-from data_tools.plots import png, scaling_plot
+from data_tools.plots import png
 from pipelines.bench.contenders import Filter, Ours
 from pipelines.bench.flocks import DT, Flock, Frame, flock
 from pipelines.bench.measuring import timed

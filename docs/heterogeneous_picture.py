@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from benchmarks.affected import affected
 from benchmarks.heterogeneous import cars_alone
-from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import World, build_world

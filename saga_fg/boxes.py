@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, checked, checked_labels
+from saga_fg.arrays import FloatArray, StrArray, checked, checked_labels
+from saga_fg.columns import Columns
 from saga_fg.errors import InputError
 from saga_fg.geometry import transform_points, wrap_angle
 
@@ -19,7 +20,7 @@ MAX_SIZE = 1e5  # m
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
+class Boxes(Columns):
     """N boxes, validated once. NaN means "not measured", allowed in size, yaw and velocity only.
 
     label     (N,)    class names
@@ -89,22 +90,9 @@ class Boxes:
         return cls.of([], np.empty((0, 3)))
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Boxes]) -> Self:
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
         """All boxes of `parts`, in order."""
-        if not parts:
-            return cls.empty()
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
-
-    def __len__(self) -> int:
-        return len(self.label)
-
-    def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
-        """The boxes of a mask, of row indices or of a slice."""
-        index: Any = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
-        for name in self.__dataclass_fields__:
-            object.__setattr__(chosen, name, getattr(self, name)[index])
-        return chosen
+        return super().concatenate(parts) if parts else cls.empty()
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The boxes in target coordinates; `target_T_source` is a rigid (4, 4) transform whose tilt is small."""

@@ -9,8 +9,9 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.arrays import FloatArray, checked
 from saga_fg.boxes import MAX_POSITION, MAX_SPEED, Boxes
+from saga_fg.columns import Columns
 from saga_fg.ego_measurements import EgoMeasurements
 from saga_fg.errors import InputError
 from saga_fg.geometry import checked_transform
@@ -43,7 +44,7 @@ class Detection:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections:
+class Detections(Columns):
     """N detections as columns: `boxes`, their `score` (N,) and `range_rate` (N,). Iterating gives `Detection`s.
 
     A range rate (m/s; NaN, as by default: not measured) is what a radar says of motion: the component of the velocity
@@ -90,13 +91,7 @@ class Detections:
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """The rows of all parts, one after the other."""
-        score, rate = (
-            np.concatenate([np.empty(0), *(getattr(p, name) for p in parts)]) for name in ("score", "range_rate")
-        )
-        return cls(Boxes.concatenate([part.boxes for part in parts]), score, rate)
-
-    def __len__(self) -> int:
-        return len(self.boxes)
+        return super().concatenate(parts) if parts else cls.empty()
 
     def __getitem__(self, row: int) -> Detection:
         b = self.boxes
@@ -112,18 +107,6 @@ class Detections:
 
     def __iter__(self) -> Iterator[Detection]:
         return (self[row] for row in range(len(self)))
-
-    def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
-        """The detections of a mask, of row indices or of a slice."""
-        index: Any = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
-        for name, column in (
-            ("boxes", self.boxes.select(index)),
-            ("score", self.score[index]),
-            ("range_rate", self.range_rate[index]),
-        ):
-            object.__setattr__(chosen, name, column)
-        return chosen
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""

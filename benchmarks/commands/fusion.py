@@ -12,6 +12,7 @@ from rich.table import Table
 
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
 
 
 def fusion(
@@ -22,9 +23,7 @@ def fusion(
     simulator: Annotated[
         Path | None, typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
-    ] = None,
+    json_file: JsonFile = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
 
 
 def smoothing(
     samples: Annotated[int, typer.Option("--samples", min=10, help="Independent samples drawn from the model.")] = 2000,
     scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first of them, and of what is drawn.")] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
-    ] = None,
+    json_file: JsonFile = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:

@@ -19,11 +19,12 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, StrArray
 from saga_fg.boxes import Boxes
+from saga_fg.columns import Columns
 from saga_fg.geometry import inverse_transform, wrap_angle
 
 
 @dataclass(frozen=True, eq=False)
-class CameraBoxes:
+class CameraBoxes(Columns):
     """N boxes in the rectified camera frame.
 
     size        (N, 3)  height, width, length, m (KITTI's order)
@@ -34,9 +35,6 @@ class CameraBoxes:
     size: FloatArray
     location: FloatArray
     rotation_y: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.size)
 
     def corners(self) -> FloatArray:
         """Corners (N, 8, 3) in the camera frame: the four of the bottom in turn, then the four above them."""

@@ -9,9 +9,8 @@ of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from data_tools.kitti.camera_boxes import CameraBoxes
 from data_tools.located import unknown
 from data_tools.text_tables import TextTable, read_table
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.columns import Columns
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 
@@ -28,7 +28,7 @@ _NO_BOX = -999.0  # positions below: the object has no 3D box
 
 
 @dataclass(frozen=True, eq=False)
-class KittiObjects:
+class KittiObjects(Columns):
     """Objects of a sequence, N lines as columns, in the order of the file.
 
     frame (N,), track_id (N,), type (N,) as in the file, truncated (N,), occluded (N,), alpha (N,), bbox (N, 4) left,
@@ -44,16 +44,6 @@ class KittiObjects:
     bbox: FloatArray
     boxes: CameraBoxes
     score: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, rows: BoolArray | IntArray) -> Self:
-        """The objects of a mask or of row indices."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "boxes"}
-        b = self.boxes
-        chosen = CameraBoxes(b.size[rows], b.location[rows], b.rotation_y[rows])
-        return type(self)(boxes=chosen, **{name: column[rows] for name, column in columns.items()})
 
 
 def read_kitti_labels(path: str | Path) -> KittiObjects:

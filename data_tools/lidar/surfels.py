@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.voxels import voxel_keys
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.columns import Columns
 
 LEAST_POINTS = 6  # of a surfel that may be called flat
 FLAT = 1 / 9  # largest share of the smallest eigenvalue in the second: a third of the standard deviation
@@ -28,7 +29,7 @@ MEMORY = 200.0  # points after which a surfel forgets the oldest
 
 
 @dataclass(frozen=True, eq=False)
-class Surfels:
+class Surfels(Columns):
     """M Gaussians, sorted by voxel.
 
     voxel    (M,) keys
@@ -50,13 +51,6 @@ class Surfels:
         none = np.empty(0)
         voxel = np.empty(0, dtype=np.int64)
         return cls(voxel, none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
-
-    def __len__(self) -> int:
-        return len(self.voxel)
-
-    def select(self, rows: BoolArray | IntArray) -> Surfels:
-        """The surfels of a mask or of row indices."""
-        return Surfels(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
 def surfels_of(points: FloatArray, size: float) -> Surfels:
@@ -86,8 +80,7 @@ class SurfelMap:
         inside = row < len(old)
         known[inside] = old.voxel[row[inside]] == new.voxel[inside]
         merged = _merged(old.select(row[known]), new.select(known))
-        parts = (old, new.select(~known))
-        both = Surfels(*(np.concatenate([getattr(p, name) for p in parts]) for name in Surfels.__dataclass_fields__))
+        both = old.extended(new.select(~known))
         for name in ("count", "mean", "scatter"):
             getattr(both, name)[row[known]] = getattr(merged, name)
         changed = np.zeros(len(both), dtype=np.bool_)

@@ -1,6 +1,5 @@
 """How good are tracks? Metrics over ground truth and tracks in memory; they know no files."""
 
-from data_tools.metrics.block_bootstrap import Average, relative_change_of_errors
 from data_tools.metrics.bootstrap import (
     Interval,
     difference,
@@ -40,7 +39,6 @@ from data_tools.metrics.scene import SceneMetrics, SceneMetricSettings, scene_me
 from data_tools.metrics.track_table import TrackTable
 
 __all__ = [
-    "Average",
     "Calibration",
     "ErrorFigures",
     "ErrorSample",
@@ -77,7 +75,6 @@ __all__ = [
     "paired_bootstrap",
     "ratio_of_sums",
     "relative_change",
-    "relative_change_of_errors",
     "root_mean_square",
     "scene_metrics",
     "scene_metrics_by_label",

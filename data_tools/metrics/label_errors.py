@@ -14,7 +14,7 @@ and unknown where the object has no label at either. A label is *moving* if its 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -25,6 +25,7 @@ from data_tools.metrics.nearest_pairs import nearest_pairs
 from data_tools.metrics.track_table import TrackTable
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.boxes import Boxes
+from saga_fg.columns import Columns
 from saga_fg.geometry import wrap_angle
 
 GATE = 2.0  # m
@@ -32,7 +33,7 @@ MOVING = 1.0  # m/s
 
 
 @dataclass(frozen=True, eq=False)
-class LabelErrors:
+class LabelErrors(Columns):
     """N labels, each (N,); NaN where there is no track, no detection, or where a quantity is unknown.
 
     label      class
@@ -54,20 +55,14 @@ class LabelErrors:
     heading: FloatArray
     nees: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.label)
-
-    def select(self, rows: BoolArray) -> Self:
-        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
-
     @classmethod
-    def pool(cls, scenes: Iterable[LabelErrors]) -> Self:
+    def pool(cls, scenes: Iterable[Self]) -> Self:
         """The labels of all scenes; objects of different scenes are different ones."""
         parts, first = [], 0
         for scene in scenes:
             parts.append(replace(scene, object=scene.object + first))
             first += int(scene.object.max(initial=-1)) + 1
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+        return cls.concatenate(parts)
 
     @property
     def tracked(self) -> BoolArray:

@@ -10,13 +10,14 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray, checked, checked_labels
 from saga_fg.boxes import Boxes
+from saga_fg.columns import Columns
 from saga_fg.dataset import Annotations
 from saga_fg.errors import InputError
 from saga_fg.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)
-class TrackTable:
+class TrackTable(Columns):
     """N boxes of one scene, in order of time.
 
     moment  (N,) which of the scene's moments, from 0, never decreasing
@@ -54,12 +55,6 @@ class TrackTable:
         covariance = checked("position_covariance", given, (n, 2, 2), "finite-or-nan")
         object.__setattr__(self, "position_covariance", covariance)
 
-    def select(self, rows: IntArray) -> Self:
-        """The boxes of row indices, in order."""
-        return type(self)(
-            self.moment[rows], self.id[rows], self.boxes.select(rows), self.score[rows], self.position_covariance[rows]
-        )
-
     @classmethod
     def of_annotations(cls, moments: Sequence[Annotations], hidden: bool = True) -> Self:
         """Ground truth as a table; without `hidden`, visible objects only."""
@@ -78,6 +73,3 @@ class TrackTable:
         score = np.concatenate([np.empty(0), *(found.score for found in moments)])
         covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in moments)])
         return cls(moment, numbers.astype(np.str_), boxes, score, covariance)
-
-    def __len__(self) -> int:
-        return len(self.boxes)

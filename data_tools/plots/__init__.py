@@ -6,7 +6,6 @@ from data_tools.plots.error_histograms import error_histograms
 from data_tools.plots.from_above import paths_from_above
 from data_tools.plots.recall_sweep import recall_sweep
 from data_tools.plots.running_graph import running_graph_picture
-from data_tools.plots.scaling import scaling_plot
 from data_tools.plots.scan_map import scan_map_from_above
 
 __all__ = [
@@ -18,7 +17,6 @@ __all__ = [
     "png",
     "recall_sweep",
     "running_graph_picture",
-    "scaling_plot",
     "scan_map_from_above",
     "trails",
 ]

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.arrays import FloatArray
+from saga_fg.columns import Columns
 
 HARDEST_BRAKING = 9.0  # m/s^2, what tyres on a dry road can do
 
 
 @dataclass(frozen=True, eq=False)
-class Drivers:
+class Drivers(Columns):
     """The parameters of N drivers, each of shape (N,), or broadcastable."""
 
     desired_speed: FloatArray  # v0, m/s
@@ -27,10 +28,6 @@ class Drivers:
     minimum_gap: FloatArray  # s0, m
     max_acceleration: FloatArray  # a, m/s^2
     comfortable_deceleration: FloatArray  # b, m/s^2
-
-    def select(self, rows: FloatArray | slice | np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Drivers:
-        """The drivers of some rows."""
-        return Drivers(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
 def free_acceleration(speed: FloatArray, drivers: Drivers, speed_limit: FloatArray | float = np.inf) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +12,7 @@ from rich.table import Table
 
 from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
 
 if TYPE_CHECKING:
     from pipelines.bench.estimator_figures import Row
@@ -38,9 +38,7 @@ def estimators(
     ] = 20,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of what is simulated.")] = 0,
     everything: Annotated[bool, typer.Option("--all", help="Measure the hopeless cases too: hours.")] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
-    ] = None,
+    json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
     """What the estimators cost and how exact they are.

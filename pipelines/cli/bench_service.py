@@ -10,6 +10,7 @@ import typer
 
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
 from saga_fg.errors import SagaError
 
 if TYPE_CHECKING:
@@ -33,9 +34,7 @@ def service(
         ),
     ] = 50.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of objects and mishaps.")] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
-    ] = None,
+    json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
     """A service and a client in two processes, with broken messages, late frames and a client that comes back.

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile
 
 if TYPE_CHECKING:
     from pipelines.bench.slam import SlamRow
@@ -25,9 +26,7 @@ def slam(
     kiss: Annotated[
         bool, typer.Option("--kiss/--no-kiss", help="With KISS-ICP, of the extra bench, or ours alone.")
     ] = True,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")
-    ] = None,
+    json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
     """LiDAR odometry against KISS-ICP, on the same scans in turn.

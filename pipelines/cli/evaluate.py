@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol, TypeVar
 
 import typer
 
-from pipelines.cli.options import (
-    Config,
-    SceneNames,
-    Split,
-    Tables,
-    TrackingResult,
-    Verbose,
-    Version,
-    chosen_scenes,
-    names,
-    sensor_files,
-)
+from pipelines.cli import options
 from pipelines.cli.reporting import ReportingGroup, progress_bar, working
 from pipelines.cli.tables import JsonFile, show_tables
 from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, LagOption, MethodOption, configured
@@ -68,11 +57,11 @@ def evaluate() -> None:
 
 @evaluate_app.command()
 def nuscenes(
-    result: TrackingResult,
-    dataroot: Tables,
-    version: Version = "v1.0-mini",
-    split: Split = None,
-    scenes: SceneNames = None,
+    result: options.TrackingResult,
+    dataroot: options.Tables,
+    version: options.Version = "v1.0-mini",
+    split: options.Split = None,
+    scenes: options.SceneNames = None,
     detections: Annotated[
         list[str] | None,
         typer.Option(
@@ -85,7 +74,7 @@ def nuscenes(
     innovations: Innovations = False,
     json_file: JsonFile = None,
     plots: Plots = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Score a nuScenes tracking result, by the official metrics and at its labels.
 
@@ -100,8 +89,8 @@ def nuscenes(
     from data_tools.nuscenes import read_scored_scenes
     from pipelines.evaluation import evaluate_nuscenes
 
-    chosen = chosen_scenes(dataroot, version, split, scenes)
-    files = sensor_files(detections or [])
+    chosen = options.chosen_scenes(dataroot, version, split, scenes)
+    files = options.sensor_files(detections or [])
 
     def run() -> NuScenesEvaluation:
         scored = read_scored_scenes(result, dataroot, version, chosen, files)
@@ -114,9 +103,7 @@ def nuscenes(
 def kitti(
     result: Annotated[Path, typer.Argument(help="Folder of results NNNN.txt, of any tracker.")],
     dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/, label_02/ ...")],
-    sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Sequences with commas between them; all results if left out.")
-    ] = None,
+    sequences: options.ResultSequences = None,
     iou: Annotated[str, typer.Option("--iou", help="Least 3D overlaps of a pair, with commas.")] = "0.25,0.5,0.7",
     classes: Annotated[str, typer.Option("--classes", help="Classes, with commas.")] = "car,pedestrian,cyclist",
     detections: Annotated[
@@ -129,7 +116,7 @@ def kitti(
     innovations: Innovations = False,
     json_file: JsonFile = None,
     plots: Plots = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Score KITTI tracking results by the 3D metrics averaged over recall, and at their labels.
 
@@ -144,8 +131,8 @@ def kitti(
     from data_tools.kitti.scored_sequences import read_scored_sequences
     from pipelines.evaluation import evaluate_kitti
 
-    chosen = names("--sequences", sequences) if sequences is not None else None
-    overlaps, labels = _overlaps(iou), names("--classes", classes)
+    chosen = options.names("--sequences", sequences) if sequences is not None else None
+    overlaps, labels = _overlaps(iou), options.names("--classes", classes)
 
     def run() -> KittiEvaluation:
         scored = read_scored_sequences(result, dataroot, chosen, detections)
@@ -162,14 +149,11 @@ def simulated(
     estimator: EstimatorOption = None,
     lag: LagOption = None,
     association: AssociationOption = None,
-    config: Config = None,
-    simulator: Annotated[
-        Path | None,
-        typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE"),
-    ] = None,
+    config: options.Config = None,
+    simulator: options.Simulator = None,
     json_file: JsonFile = None,
     plots: Plots = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Track simulated traffic and score it against the simulator's truth, hidden objects included.
 
@@ -216,9 +200,9 @@ def labels(
         bool, typer.Option("--without-truth", help="Self-consistency only, as where nobody has labelled.")
     ] = False,
     method: MethodOption = "saga",
-    config: Config = None,
+    config: options.Config = None,
     json_file: JsonFile = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Judge labels beside the online tracks and the detections: recall, errors on the same boxes, calibration.
 
@@ -280,7 +264,7 @@ def _draw(evaluation: Drawn, plots: Path | None) -> None:
 
 def _overlaps(text: str) -> tuple[float, ...]:
     try:
-        overlaps = tuple(float(value) for value in names("--iou", text))
+        overlaps = tuple(float(value) for value in options.names("--iou", text))
     except ValueError:
         raise InputError(f"--iou: expected numbers with commas between them, got {text!r}") from None
     if not all(0 < value <= 1 for value in overlaps):

@@ -7,18 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.options import (
-    Config,
-    SceneNames,
-    Split,
-    Tables,
-    Verbose,
-    Version,
-    apart,
-    chosen_scenes,
-    names,
-    sensor_files,
-)
+from pipelines.cli import options
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.summary import counted
 
@@ -65,7 +54,7 @@ def interactions(
     network: Annotated[
         bool, typer.Option("--network", help="Train networks with JAX (extra [learn]) in place of kernels.")
     ] = False,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Learn who follows whom, how strongly, and what noise is left: edge rules for `saga-fg track --interactions`.
 
@@ -83,9 +72,9 @@ def interactions(
     from pipelines.learning import TrajectorySource, learn_interactions
 
     check_writable(output)
-    chosen = names("--recordings", recordings) if recordings is not None else None
+    chosen = options.names("--recordings", recordings) if recordings is not None else None
     source = TrajectorySource.parsed(data, chosen, detections)
-    apart(output, *source.files)
+    options.apart(output, *source.files)
     found = source.trajectories()
     told = "tracks" if detections is not None or source.kind == "file" else "trajectories"
     origin = f"{told} of {counted(len(found), 'recording')}, {source.kind}: {', '.join(found)}"
@@ -108,18 +97,15 @@ def noise() -> None:
 
 @noise_app.command()
 def nuscenes(
-    dataroot: Tables,
-    detections: Annotated[
-        list[str],
-        typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
-    ],
+    dataroot: options.Tables,
+    detections: options.SensorDetections,
     output: Output,
-    version: Version = "v1.0-mini",
-    split: Split = None,
-    scenes: SceneNames = None,
+    version: options.Version = "v1.0-mini",
+    split: options.Split = None,
+    scenes: options.SceneNames = None,
     without_truth: Blind = False,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Learn from nuScenes detections.
 
@@ -133,9 +119,9 @@ def nuscenes(
     from data_tools.nuscenes import NuScenes
     from pipelines.config import load_config
 
-    chosen = chosen_scenes(dataroot, version, split, scenes)
-    files = sensor_files(detections)
-    apart(output, *files.values())
+    chosen = options.chosen_scenes(dataroot, version, split, scenes)
+    files = options.sensor_files(detections)
+    options.apart(output, *files.values())
     settings = load_config("nuscenes", config)
     dataset = NuScenes(dataroot, version, files, chosen, ground_truth=not without_truth)
     _learn(dataset, chosen, settings, not without_truth, output)
@@ -148,12 +134,10 @@ def kitti(
         Path, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/ and in each NNNN.txt.")
     ],
     output: Output,
-    sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Sequences with commas between them; all if left out.")
-    ] = None,
+    sequences: options.Sequences = None,
     without_truth: Blind = False,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Learn from KITTI detections.
 
@@ -166,7 +150,7 @@ def kitti(
     from pipelines.config import load_config
 
     settings = load_config("kitti", config)
-    chosen = names("--sequences", sequences) if sequences is not None else None
+    chosen = options.names("--sequences", sequences) if sequences is not None else None
     dataset = KittiTracking(dataroot, detections, chosen, ground_truth=not without_truth)
     _learn(dataset, dataset.scenes, settings, not without_truth, output)
 
@@ -176,12 +160,10 @@ def simulated(
     output: Output,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
-    simulator: Annotated[
-        Path | None, typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE")
-    ] = None,
+    simulator: options.Simulator = None,
     without_truth: Blind = False,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Learn from simulated traffic, of which the noise is known.
 
@@ -203,9 +185,9 @@ def simulated(
 def file(
     detections: Annotated[Path, typer.Argument(help="Table of detections: .csv, .ndjson, .jsonl or .npz.")],
     output: Output,
-    scenes: SceneNames = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    scenes: options.SceneNames = None,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Learn from your own detections, without ground truth.
 
@@ -218,9 +200,9 @@ def file(
     from pipelines.config import load_config
 
     settings = load_config("file", config)
-    apart(output, detections)
+    options.apart(output, detections)
     dataset = read_detections(detections)
-    chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
+    chosen = dataset.scenes if scenes is None else options.names("--scenes", scenes)
     _learn(dataset, chosen, settings, False, output)
 
 

@@ -34,6 +34,41 @@ Split = Annotated[
     str | None, typer.Option("--split", help="An official split, or one of splits.json beside the tables.")
 ]
 SceneNames = Annotated[str | None, typer.Option("--scenes", help="Scene names with commas between them.")]
+SensorDetections = Annotated[
+    list[str], typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE")
+]
+
+# of those that read KITTI sequences, simulated traffic, a table
+KittiRoot = Annotated[
+    str, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/; or its URL.")
+]
+KittiDetections = Annotated[
+    str, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.")
+]
+Sequences = Annotated[
+    str | None, typer.Option("--sequences", help="Sequences with commas between them; all if left out.")
+]
+Simulator = Annotated[
+    Path | None, typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE")
+]
+ScenesOfFile = Annotated[
+    str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
+]
+
+# of those that look at results, beside what these were made of
+ResultSequences = Annotated[
+    str | None, typer.Option("--sequences", help="Sequences with commas between them; all results if left out.")
+]
+SeenBySensors = Annotated[
+    list[str] | None,
+    typer.Option("--detections", help="Detections the tracks were made of, to see them too.", metavar="NAME=FILE"),
+]
+SeenFolder = Annotated[
+    Path | None, typer.Option("--detections", help="Folder of the detections the tracks were made of.")
+]
+SeenTable = Annotated[
+    Path | None, typer.Option("--detections", help="Table of the detections the tracks were made of.")
+]
 
 
 def sensor_files(values: Sequence[str]) -> dict[str, Path]:

@@ -8,18 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.options import (
-    SceneNames,
-    Split,
-    Tables,
-    TrackingResult,
-    Verbose,
-    Version,
-    apart,
-    chosen_scenes,
-    names,
-    sensor_files,
-)
+from pipelines.cli import options
 from pipelines.cli.reporting import ReportingGroup, working
 
 if TYPE_CHECKING:
@@ -37,17 +26,14 @@ def report() -> None:
 
 @report_app.command()
 def nuscenes(
-    result: TrackingResult,
-    dataroot: Tables,
+    result: options.TrackingResult,
+    dataroot: options.Tables,
     output: Page,
-    version: Version = "v1.0-mini",
-    split: Split = None,
-    scenes: SceneNames = None,
-    detections: Annotated[
-        list[str] | None,
-        typer.Option("--detections", help="Detections the tracks were made of, to see them too.", metavar="NAME=FILE"),
-    ] = None,
-    verbose: Verbose = False,
+    version: options.Version = "v1.0-mini",
+    split: options.Split = None,
+    scenes: options.SceneNames = None,
+    detections: options.SeenBySensors = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """A page of a nuScenes tracking result, beside the ground truth.
 
@@ -58,8 +44,8 @@ def nuscenes(
     """
     from pipelines.report.sources import nuscenes_report
 
-    chosen, files = chosen_scenes(dataroot, version, split, scenes), sensor_files(detections or [])
-    apart(output, result, *files.values())
+    chosen, files = options.chosen_scenes(dataroot, version, split, scenes), options.sensor_files(detections or [])
+    options.apart(output, result, *files.values())
     _write(output, lambda: nuscenes_report(result, dataroot, version, chosen, files))
 
 
@@ -68,13 +54,9 @@ def kitti(
     result: Annotated[Path, typer.Argument(help="Folder of results NNNN.txt, of any tracker.")],
     dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/, label_02/ ...")],
     output: Page,
-    sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Sequences with commas between them; all results if left out.")
-    ] = None,
-    detections: Annotated[
-        Path | None, typer.Option("--detections", help="Folder of the detections the tracks were made of.")
-    ] = None,
-    verbose: Verbose = False,
+    sequences: options.ResultSequences = None,
+    detections: options.SeenFolder = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """A page of KITTI tracking results, beside the labels.
 
@@ -85,7 +67,7 @@ def kitti(
     """
     from pipelines.report.sources import kitti_report
 
-    chosen = names("--sequences", sequences) if sequences is not None else None
+    chosen = options.names("--sequences", sequences) if sequences is not None else None
     _write(output, lambda: kitti_report(result, dataroot, chosen, detections))
 
 
@@ -93,10 +75,8 @@ def kitti(
 def file(
     result: Annotated[Path, typer.Argument(help="Table of tracks: .csv, .ndjson or .jsonl.")],
     output: Page,
-    detections: Annotated[
-        Path | None, typer.Option("--detections", help="Table of the detections the tracks were made of.")
-    ] = None,
-    verbose: Verbose = False,
+    detections: options.SeenTable = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """A page of a table of tracks, without figures, since there is no ground truth.
 
@@ -106,7 +86,7 @@ def file(
     """
     from pipelines.report.sources import table_report
 
-    apart(output, result, *([detections] if detections is not None else []))
+    options.apart(output, result, *([detections] if detections is not None else []))
     _write(output, lambda: table_report(result, detections))
 
 

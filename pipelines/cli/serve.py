@@ -14,16 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.cli import tracking_options as how
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.termination import TERMINATED
-from pipelines.cli.tracking_options import (
-    AssociationOption,
-    EstimatorOption,
-    InteractionsOption,
-    LagOption,
-    MethodOption,
-    configured,
-)
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,11 +55,11 @@ def serve(
             "--limits", help="YAML file of limits and times to wait; see `saga-fg config --limits`.", metavar="FILE"
         ),
     ] = None,
-    method: MethodOption = "saga",
-    estimator: EstimatorOption = None,
-    lag: LagOption = None,
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
+    method: how.MethodOption = "saga",
+    estimator: how.EstimatorOption = None,
+    lag: how.LagOption = None,
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -92,7 +85,7 @@ def serve(
     if not verbose:
         for handler in logging.getLogger().handlers:
             handler.addFilter(SeldomFilter())
-    settings = configured("file", config, method, estimator, lag, association, interactions)
+    settings = how.configured("file", config, method, estimator, lag, association, interactions)
     bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
     if reorder is not None:
         bounds = replace(bounds, reorder=reorder)

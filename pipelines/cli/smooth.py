@@ -8,17 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import Config, SceneNames, Split, Verbose, Version, chosen_scenes, names, sensor_locations
+from pipelines.cli import options
+from pipelines.cli import tracking_options as how
 from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import counted
-from pipelines.cli.tracking_options import (
-    AssociationOption,
-    InteractionsOption,
-    MethodOption,
-    association_fits,
-    with_interactions,
-)
 
 if TYPE_CHECKING:
     from pipelines.config import Family
@@ -42,22 +36,19 @@ def smooth() -> None:
 @smooth_app.command()
 def nuscenes(
     dataroot: Annotated[str, typer.Option("--dataroot", help="Folder that holds the folder of tables, or its URL.")],
-    detections: Annotated[
-        list[str],
-        typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
-    ],
+    detections: options.SensorDetections,
     output: Output,
-    version: Version = "v1.0-mini",
-    split: Split = None,
-    scenes: SceneNames = None,
-    method: MethodOption = "saga",
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
+    version: options.Version = "v1.0-mini",
+    split: options.Split = None,
+    scenes: options.SceneNames = None,
+    method: how.MethodOption = "saga",
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Label nuScenes recordings: tracking-result JSON, annotation tables, a table of boxes, a summary.
 
@@ -74,8 +65,8 @@ def nuscenes(
     from pipelines.smoothing import smooth_dataset, write_nuscenes_run
 
     settings = _configured("nuscenes", config, method, association, interactions)
-    with local_nuscenes(dataroot, version, sensor_locations(detections)) as (root, files):
-        chosen = chosen_scenes(root, version, split, scenes)
+    with local_nuscenes(dataroot, version, options.sensor_locations(detections)) as (root, files):
+        chosen = options.chosen_scenes(root, version, split, scenes)
         dataset = NuScenes(root, version, files, chosen)
         if at_scale(workers, ray):
             task = SmoothTask(settings, method, "nuscenes", f".{table}", dataset.meta)
@@ -97,24 +88,18 @@ def nuscenes(
 
 @smooth_app.command()
 def kitti(
-    dataroot: Annotated[
-        str, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/; or its URL.")
-    ],
-    detections: Annotated[
-        str, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.")
-    ],
+    dataroot: options.KittiRoot,
+    detections: options.KittiDetections,
     output: Output,
-    sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Sequences with commas between them; all if left out.")
-    ] = None,
-    method: MethodOption = "saga",
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
+    sequences: options.Sequences = None,
+    method: how.MethodOption = "saga",
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Label KITTI sequences: label_02 text, results with scores, a table of boxes, a summary.
 
@@ -128,7 +113,7 @@ def kitti(
     from pipelines.smoothing import smooth_dataset, write_kitti_run
 
     settings = _configured("kitti", config, method, association, interactions)
-    chosen = names("--sequences", sequences) if sequences is not None else None
+    chosen = options.names("--sequences", sequences) if sequences is not None else None
     with local_kitti(dataroot, detections, chosen) as dataset:
         if at_scale(workers, ray):
             inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
@@ -146,18 +131,15 @@ def simulated(
     output: Output,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
-    simulator: Annotated[
-        Path | None,
-        typer.Option("--simulator", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE"),
-    ] = None,
-    method: MethodOption = "saga",
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
+    simulator: options.Simulator = None,
+    method: how.MethodOption = "saga",
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Label simulated traffic, whose truth is known: a table of boxes, a summary.
 
@@ -187,17 +169,15 @@ def simulated(
 def file(
     detections: Detections,
     output: Output,
-    scenes: Annotated[
-        str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
-    ] = None,
-    method: MethodOption = "saga",
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
+    scenes: options.ScenesOfFile = None,
+    method: how.MethodOption = "saga",
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
     table: TableSuffix = "csv",
     workers: Workers = None,
     ray: RayAddress = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Label your own recordings: a table with one detection a row in, one box a row out.
 
@@ -220,7 +200,7 @@ def file(
         task = SmoothTask(settings, method, "table", f".{table}")
         run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray)
         return
-    chosen = None if scenes is None else names("--scenes", scenes)
+    chosen = None if scenes is None else options.names("--scenes", scenes)
     with local_copy(only(detections)) as path, progress_bar() as progress:
         parts = read_scenes_in_parts(path, scenes=chosen)
         done = write_streamed_labels(
@@ -252,7 +232,7 @@ def _configured(
     """The settings of a run: the family's, the file's, then the options'."""
     from pipelines.smoothing import load_smooth_config
 
-    association_fits(method, association)
+    how.association_fits(method, association)
     settings = load_smooth_config(family, config)
-    tracking = with_interactions(settings.tracking, method, interactions)
+    tracking = how.with_interactions(settings.tracking, method, interactions)
     return replace(settings, tracking=tracking.with_association(association))

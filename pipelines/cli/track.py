@@ -7,30 +7,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.options import (
-    Config,
-    SceneNames,
-    Split,
-    Verbose,
-    Version,
-    apart,
-    chosen_scenes,
-    names,
-    sensor_locations,
-)
+from pipelines.cli import options
+from pipelines.cli import tracking_options as how
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.scaling import Detections, RayAddress, Workers, at_scale, only, run_at_scale, several
 from pipelines.cli.summary import Summary
-from pipelines.cli.tracking_options import (
-    AssociationOption,
-    EstimatorOption,
-    ExplainOption,
-    InteractionsOption,
-    LagOption,
-    MethodOption,
-    configured,
-    journal,
-)
 
 track_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -43,24 +24,21 @@ def track() -> None:
 @track_app.command()
 def nuscenes(
     dataroot: Annotated[str, typer.Option("--dataroot", help="Folder that holds the folder of tables, or its URL.")],
-    detections: Annotated[
-        list[str],
-        typer.Option("--detections", help="Detection-result JSON of a sensor; repeatable.", metavar="NAME=FILE"),
-    ],
+    detections: options.SensorDetections,
     output: Annotated[Path, typer.Option("--output", "-o", help="Tracking-result JSON to write.")],
-    version: Version = "v1.0-mini",
-    split: Split = None,
-    scenes: SceneNames = None,
-    method: MethodOption = "saga",
-    estimator: EstimatorOption = None,
-    lag: LagOption = None,
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
-    explain: ExplainOption = False,
+    version: options.Version = "v1.0-mini",
+    split: options.Split = None,
+    scenes: options.SceneNames = None,
+    method: how.MethodOption = "saga",
+    estimator: how.EstimatorOption = None,
+    lag: how.LagOption = None,
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
+    explain: how.ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Track nuScenes detections; writes the official tracking-result JSON.
 
@@ -84,13 +62,13 @@ def nuscenes(
     from pipelines.scale_out import HeldScene, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("nuscenes", config, method, estimator, lag, association, interactions)
-    locations = sensor_locations(detections)
-    apart(output, *(Path(location) for location in locations.values() if not is_url(location)))
+    settings = how.configured("nuscenes", config, method, estimator, lag, association, interactions)
+    locations = options.sensor_locations(detections)
+    options.apart(output, *(Path(location) for location in locations.values() if not is_url(location)))
     with local_nuscenes(dataroot, version, locations) as (root, files):
-        chosen = chosen_scenes(root, version, split, scenes)
+        chosen = options.chosen_scenes(root, version, split, scenes)
         dataset = NuScenes(root, version, files, chosen)
-        kept = journal(explain, output, at_scale(workers, ray))
+        kept = how.journal(explain, output, at_scale(workers, ray))
         if at_scale(workers, ray):
             task = TrackTask(settings, method, "nuscenes", dataset.meta)
             inputs = (HeldScene(dataset.scene(name)) for name in chosen)
@@ -112,26 +90,20 @@ def nuscenes(
 
 @track_app.command()
 def kitti(
-    dataroot: Annotated[
-        str, typer.Option("--dataroot", help="Folder that holds training/, or oxts/ and calib/; or its URL.")
-    ],
-    detections: Annotated[
-        str, typer.Option("--detections", help="Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.")
-    ],
+    dataroot: options.KittiRoot,
+    detections: options.KittiDetections,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write NNNN.txt to.")],
-    sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Sequences with commas between them; all if left out.")
-    ] = None,
-    method: MethodOption = "saga",
-    estimator: EstimatorOption = None,
-    lag: LagOption = None,
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
-    explain: ExplainOption = False,
+    sequences: options.Sequences = None,
+    method: how.MethodOption = "saga",
+    estimator: how.EstimatorOption = None,
+    lag: how.LagOption = None,
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
+    explain: how.ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Track KITTI detections; writes the official result text, one file a sequence.
 
@@ -145,10 +117,10 @@ def kitti(
     from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("kitti", config, method, estimator, lag, association, interactions)
-    chosen = names("--sequences", sequences) if sequences is not None else None
+    settings = how.configured("kitti", config, method, estimator, lag, association, interactions)
+    chosen = options.names("--sequences", sequences) if sequences is not None else None
     with local_kitti(dataroot, detections, chosen) as dataset:
-        kept = journal(explain, output, at_scale(workers, ray))
+        kept = how.journal(explain, output, at_scale(workers, ray))
         if at_scale(workers, ray):
             sequence_inputs = (KittiInput(dataroot, detections, name) for name in dataset.scenes)
             task = TrackTask(settings, method, "kitti")
@@ -169,22 +141,20 @@ def kitti(
 def file(
     detections: Detections,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table of tracks to write: .csv, .ndjson or .jsonl.")],
-    scenes: Annotated[
-        str | None, typer.Option("--scenes", help="Scene names with commas between them; all if left out.")
-    ] = None,
-    method: MethodOption = "saga",
-    estimator: EstimatorOption = None,
-    lag: LagOption = None,
-    association: AssociationOption = None,
-    interactions: InteractionsOption = None,
-    explain: ExplainOption = False,
+    scenes: options.ScenesOfFile = None,
+    method: how.MethodOption = "saga",
+    estimator: how.EstimatorOption = None,
+    lag: how.LagOption = None,
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
+    explain: how.ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
     table: Annotated[
         Literal["csv", "ndjson"], typer.Option("--table", help="Format of the tables, with --workers or --ray.")
     ] = "csv",
-    config: Config = None,
-    verbose: Verbose = False,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Track your own detections: a table with one detection a row.
 
@@ -203,17 +173,17 @@ def file(
     from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset
 
-    settings = configured("file", config, method, estimator, lag, association, interactions)
-    kept = journal(explain, output, at_scale(workers, ray))
+    settings = how.configured("file", config, method, estimator, lag, association, interactions)
+    kept = how.journal(explain, output, at_scale(workers, ray))
     if at_scale(workers, ray):
         urls = several(detections, scenes)
         task = TrackTask(settings, method, ".csv" if table == "csv" else ".ndjson")
         run_at_scale(map(DetectionFileInput, urls), len(urls), task, output, workers, ray)
         return
     with local_copy(only(detections)) as path:
-        apart(output, path)
+        options.apart(output, path)
         dataset = read_detections(path)
-    chosen = dataset.scenes if scenes is None else names("--scenes", scenes)
+    chosen = dataset.scenes if scenes is None else options.names("--scenes", scenes)
     summary = Summary(output)
     with progress_bar(len(chosen)) as progress, trackers(settings, method, chosen, kept) as new_tracker:
         runs = summary.of(track_dataset(dataset, new_tracker, chosen, progress))

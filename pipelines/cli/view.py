@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.options import (
-    SceneNames,
-    Split,
-    Tables,
-    TrackingResult,
-    Verbose,
-    Version,
-    apart,
-    chosen_scenes,
-    names,
-    sensor_files,
-)
+from pipelines.cli import options
 from pipelines.cli.reporting import ReportingGroup, working
 
 if TYPE_CHECKING:
@@ -48,18 +37,15 @@ def view() -> None:
 
 @view_app.command()
 def nuscenes(
-    result: TrackingResult,
-    dataroot: Tables,
-    version: Version = "v1.0-mini",
-    split: Split = None,
-    scenes: SceneNames = None,
-    detections: Annotated[
-        list[str] | None,
-        typer.Option("--detections", help="Detections the tracks were made of, to see them too.", metavar="NAME=FILE"),
-    ] = None,
+    result: options.TrackingResult,
+    dataroot: options.Tables,
+    version: options.Version = "v1.0-mini",
+    split: options.Split = None,
+    scenes: options.SceneNames = None,
+    detections: options.SeenBySensors = None,
     spacing: Spacing = 0.1,
     save: Save = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """See a nuScenes tracking result, with the ground truth and the LiDAR scans where their files are there.
 
@@ -71,9 +57,9 @@ def nuscenes(
     """
     from pipelines.view.sources import nuscenes_view
 
-    chosen, files = chosen_scenes(dataroot, version, split, scenes), sensor_files(detections or [])
+    chosen, files = options.chosen_scenes(dataroot, version, split, scenes), options.sensor_files(detections or [])
     if save is not None:
-        apart(save, result, *files.values(), option="--save")
+        options.apart(save, result, *files.values(), option="--save")
     _show(result, save, lambda: nuscenes_view(result, dataroot, version, chosen, files, spacing))
 
 
@@ -81,18 +67,14 @@ def nuscenes(
 def kitti(
     result: Annotated[Path, typer.Argument(help="Folder of results NNNN.txt, of any tracker.")],
     dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/, label_02/ ...")],
-    sequences: Annotated[
-        str | None, typer.Option("--sequences", help="Sequences with commas between them; all results if left out.")
-    ] = None,
-    detections: Annotated[
-        Path | None, typer.Option("--detections", help="Folder of the detections the tracks were made of.")
-    ] = None,
+    sequences: options.ResultSequences = None,
+    detections: options.SeenFolder = None,
     slam: Annotated[
         Path | None, typer.Option("--slam", help="Folder that `saga-fg slam kitti` wrote, of the only sequence.")
     ] = None,
     spacing: Spacing = 0.1,
     save: Save = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """See KITTI tracking results, with the labels, the scans of velodyne/ if it is there, and a map with landmarks.
 
@@ -102,18 +84,16 @@ def kitti(
     """
     from pipelines.view.sources import kitti_view
 
-    chosen = names("--sequences", sequences) if sequences is not None else None
+    chosen = options.names("--sequences", sequences) if sequences is not None else None
     _show(result, save, lambda: kitti_view(result, dataroot, chosen, detections, spacing), slam)
 
 
 @view_app.command()
 def file(
     result: Annotated[Path, typer.Argument(help="Table of tracks: .csv, .ndjson or .jsonl.")],
-    detections: Annotated[
-        Path | None, typer.Option("--detections", help="Table of the detections the tracks were made of.")
-    ] = None,
+    detections: options.SeenTable = None,
     save: Save = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """See a table of tracks.
 
@@ -124,7 +104,7 @@ def file(
     from pipelines.view.sources import table_view
 
     if save is not None:
-        apart(save, result, *([detections] if detections is not None else []), option="--save")
+        options.apart(save, result, *([detections] if detections is not None else []), option="--save")
     _show(result, save, lambda: table_view(result, detections))
 
 
@@ -132,7 +112,7 @@ def file(
 def slam(
     result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam kitti`, `victoria-park` or `plaza` wrote.")],
     save: Save = None,
-    verbose: Verbose = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """See a run of SLAM: the paths, the map, the landmarks.
 

@@ -7,12 +7,11 @@ from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_engine import RelinearisationSettings
 from saga_fg.estimators.graph_filter import GraphFilter
-from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
+from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.kalman import JointKalmanFilter
-from saga_fg.estimators.motion import NodeMotion
 from saga_fg.estimators.protocol import Estimator, Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
@@ -25,6 +24,7 @@ __all__ = [
     "BatchSolver",
     "Births",
     "BoundedKalmanFilter",
+    "DetectionFactors",
     "Estimator",
     "FixedLagSmoother",
     "GaussNewtonSettings",
@@ -36,9 +36,7 @@ __all__ = [
     "IncrementalSmoother",
     "Interactions",
     "JointKalmanFilter",
-    "LinearDetections",
     "Measurements",
-    "NodeMotion",
     "Observations",
     "RelinearisationSettings",
     "Smoothed",

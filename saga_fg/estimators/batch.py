@@ -21,17 +21,19 @@ from factors import FactorError, Robust, nonlinear_graph
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.elimination import NoSolution, marginal_covariances, solved_tree, tree_covariances
 from saga_fg.estimators.elimination_order import Order, cheapest_order
 from saga_fg.estimators.factor_graph import recording_factors
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
-from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.motion import Motion
+from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
+from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
@@ -49,7 +51,7 @@ class BatchState:
     graduated: bool
 
 
-class BatchSmoother:
+class BatchSmoother(NewestMarginals):
     """The exact smoother over everything. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     settings     of Gauss-Newton, for what is nonlinear or robust
@@ -89,9 +91,8 @@ class BatchSmoother:
         self._recording.add(nodes, means, covariances)
         self._changed()
 
-    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
-        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
-        self._recording.move(Motion(transition, tuple(nonlinear)))
+    def predict(self, transition: Transition) -> None:
+        self._recording.move(Motion(transition))
         self._changed()
 
     def update(
@@ -113,18 +114,6 @@ class BatchSmoother:
 
     def marginalise(self, nodes: ArrayLike) -> None:
         self._recording.leave(nodes)
-
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().mean(nodes)
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().covariance(nodes)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_mean(nodes)
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_covariance(nodes)
 
     @property
     def order(self) -> Order:
@@ -186,9 +175,9 @@ class BatchSmoother:
         self._graduated = state.graduated
         self._changed()
 
-    def _newest(self) -> Newest:
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         self._graduate()
-        return Newest(self._recording.layout, self._recording.newest())
+        return live_rows(self._recording.newest(), self._recording.layout, nodes)
 
     def _graduate(self) -> None:
         """Find the weights of graduated non-convexity, from all ones."""

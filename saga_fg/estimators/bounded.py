@@ -35,6 +35,7 @@ from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.graph_parts import adjacency
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.motion import Motion
+from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.overlapping import gathered, propagated
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
@@ -51,7 +52,7 @@ class BoundedState:
     time: float
 
 
-class BoundedKalmanFilter:
+class BoundedKalmanFilter(NewestMarginals):
     """The filter that keeps correlations within `hops` of clusters of about `core` nodes.
 
     A node whose distance grows beyond `hops` is kept for `patience` further predictions, so that edges which come
@@ -139,24 +140,6 @@ class BoundedKalmanFilter:
             cover, source = self._cover.without(rows)
             self._cover, self._state = cover, gathered(self._state, cover.partition, source)
 
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        cover = self._cover
-        rows = cover.layout.rows(nodes)
-        cover.layout.spans(rows)  # states of equal size, or an error that says so
-        mean: FloatArray = self._state.mean[cover.partition.layout.spans(cover.own[rows])]
-        return mean
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        cover = self._cover
-        rows = cover.layout.rows(nodes)
-        cover.layout.spans(rows)
-        return self._state.covariances(cover.own[rows])
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        cover = self._cover
-        mean: FloatArray = self._state.mean[cover.partition.layout.places(cover.own[cover.layout.rows(nodes)])]
-        return mean
-
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         """Joint covariance of some nodes, in the order given, of any sizes; always positive definite.
 
@@ -185,6 +168,9 @@ class BoundedKalmanFilter:
         """Continue from a snapshot, bit-identically."""
         require_kind("state", state, BoundedState)
         self._cover, self._state, self._time = state.cover, state.x, state.time
+
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+        return self._state, self._cover.own[self._cover.layout.rows(nodes)]
 
     def _joint_copies(self, rows: IntArray) -> tuple[IntArray, IntArray]:
         """The copies that the joint covariance of distinct node rows is made of, and the cluster of each."""

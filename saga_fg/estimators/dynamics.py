@@ -97,6 +97,20 @@ class Dynamics:
         """F (D, D), sparse."""
         return _sparse(self.F, self.layout.offsets[:-1], self.layout.size)
 
+    @property
+    def still(self) -> BoolArray:
+        """(n,) which nodes stay exactly where they are, x' = x without noise, whatever the others do."""
+        n = len(self.layout)
+        same, told = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        for F in self.F:
+            own = F.target == F.source
+            same[F.target[own & (F.values == np.eye(*F.values.shape[1:])).all(axis=(1, 2))]] = True
+            told[F.target[~own & F.values.any(axis=(1, 2))]] = True
+        for Q in self.Q:
+            told[Q.target[Q.values.any(axis=(1, 2))]] = True
+        told[np.repeat(np.arange(n), self.layout.dims)[self.b != 0]] = True
+        return same & ~told
+
     def joined(self, partition: Partition) -> Partition:
         """The components that a prediction leaves of those of `partition`."""
         if not self.F:

@@ -74,9 +74,6 @@ def _heard(motion: Motion) -> list[tuple[IntArray, IntArray]]:
     """Ids of nodes and of those they listen to."""
     nodes = motion.transition.nodes
     pairs = [(nodes[blocks.target], nodes[blocks.source]) for blocks in motion.transition.F]
-    for one in motion.nonlinear:
-        others = np.array(one.neighbours, dtype=np.int64)
-        pairs.append((np.full(len(others), one.node), others))
     for flow in motion.flows:
         pairs += [(nodes[flow.rows[:, 0]], nodes[others]) for others in flow.rows.T[1:]]
     return pairs

@@ -19,7 +19,6 @@ import numpy as np
 
 from factors import (
     FactorError,
-    ResidualFactor,
     ResidualFactors,
     detection_factors,
     gaussian_factors,
@@ -31,10 +30,9 @@ from factors import (
 from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
-from saga_fg.estimators.motion import Motion, NodeMotion, Standstill
+from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.sighting import Sighting
 from saga_fg.graph.keys import node_key, node_kind
@@ -43,7 +41,7 @@ from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Blocks
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
-Factors = list[gtsam.JacobianFactor | ResidualFactor | ResidualFactors]
+Factors = list[gtsam.JacobianFactor | ResidualFactors]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ def recording_factors(
             gone = layout.rows(moment.gone)
             stay = layout.without(gone) if len(gone) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
-            resting = stay.nodes[_resting(moment.motion.dynamics(stay, at))].tolist()
+            resting = stay.nodes[moment.motion.dynamics(stay, at).still].tolist()
             now, keys = keys, {node: keys[node] for node in resting}
             then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
             native, nonlinear = motion_factors(moment.motion, stay, at, now, then)
@@ -154,26 +152,11 @@ def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
     return [H]
 
 
-def _resting(dynamics: Dynamics) -> BoolArray:
-    """(n,) which nodes stay exactly where they are."""
-    layout = dynamics.layout
-    moved = np.zeros(len(layout), dtype=bool)
-    np.logical_or.at(moved, np.repeat(np.arange(len(layout)), layout.dims), dynamics.b != 0)
-    for blocks in dynamics.Q:
-        moved[blocks.target[blocks.values.any(axis=(1, 2))]] = True
-    for blocks in dynamics.F:
-        same = blocks.target == blocks.source
-        moved[blocks.target[~same]] = True
-        moved[blocks.target[same][(blocks.values[same] != np.eye(*blocks.values.shape[1:])).any(axis=(1, 2))]] = True
-    return ~moved
-
-
 def motion_factors(
     motion: Motion | Standstill, layout: Layout, mean: FloatArray, keys: dict[int, int], next_keys: dict[int, int]
-) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactor | ResidualFactors]]:
+) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactors]]:
     """Factors of an interval, native ones and those of nodes that move nonlinearly."""
     dynamics = motion.dynamics(layout, mean)
-    special = {m.node: m for m in motion.nonlinear} if isinstance(motion, Motion) else {}
     now = np.array([keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
     then = np.array([next_keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
     noise: dict[int, FloatArray] = {}
@@ -181,12 +164,11 @@ def motion_factors(
     for blocks in dynamics.Q:
         noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
         regular[blocks.target] = _is_regular(blocks.values)
-    regular[layout.rows(list(special))] = False
     same = now == then  # of who rests
     kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
     for blocks in dynamics.F:
         kinds[np.unique(blocks.target)] += 1
-    nonlinear: list[ResidualFactor | ResidualFactors] = []
+    nonlinear: list[ResidualFactors] = []
     flowing = same.copy()
     for flow, rows in motion.flows_of(layout) if isinstance(motion, Motion) else ():
         flowing[rows[:, 0]] = True
@@ -205,9 +187,6 @@ def motion_factors(
     for row in np.flatnonzero(~together & ~flowing).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
-        if node in special:
-            nonlinear.append(_nonlinear_motion(special[node], keys, next_keys, layout, motion.dt, Q))
-            continue
         heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
         if not _is_regular(Q):
@@ -227,11 +206,3 @@ def _of_row(blocks: Blocks, row: int) -> list[tuple[int, FloatArray]]:
     """Source rows and blocks of one node."""
     mine = np.flatnonzero(blocks.target == row)
     return list(zip(blocks.source[mine].tolist(), blocks.values[mine], strict=True))
-
-
-def _nonlinear_motion(
-    motion: NodeMotion, keys: dict[int, int], next_keys: dict[int, int], layout: Layout, dt: float, Q: FloatArray
-) -> ResidualFactor:
-    dims = layout.dims[layout.rows([motion.node, *motion.neighbours])].tolist()
-    neighbours = [keys[other] for other in motion.neighbours]
-    return motion.interaction.factor(next_keys[motion.node], keys[motion.node], neighbours, dims, dt, Q)

@@ -15,24 +15,24 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
 from factors import Robust
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.motion import Motion
+from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sighting import Observations, along_the_way
-from saga_fg.estimators.smoothed import Newest, Smoothed, smoothed_moments
+from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
 
-class FixedLagSmoother:
+class FixedLagSmoother(NewestMarginals):
     """The exact smoother over the last `lag` seconds. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     lag       s; at 0 it is the filter. The window begins at the last moment that is at least `lag` old, so that every
@@ -75,9 +75,8 @@ class FixedLagSmoother:
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         self._recording.add(nodes, means, covariances)
 
-    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
-        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
-        self._recording.move(Motion(transition, tuple(nonlinear)))
+    def predict(self, transition: Transition) -> None:
+        self._recording.move(Motion(transition))
         self._recording.forget(self.time - self._lag)
 
     def update(
@@ -93,18 +92,6 @@ class FixedLagSmoother:
 
     def marginalise(self, nodes: ArrayLike) -> None:
         self._recording.leave(nodes)
-
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().mean(nodes)
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().covariance(nodes)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_mean(nodes)
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_covariance(nodes)
 
     def smoothed(self, covariances: bool = True) -> tuple[Smoothed, ...]:
         """Every moment in the window, oldest first; without `covariances` means only, which costs much less."""
@@ -126,5 +113,5 @@ class FixedLagSmoother:
         """Continue from a snapshot, bit-identically."""
         self._recording.restore(state)
 
-    def _newest(self) -> Newest:
-        return Newest(self._recording.layout, self._recording.newest())
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+        return live_rows(self.posterior(), self._recording.layout, nodes)

@@ -16,14 +16,14 @@ from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.graph_moments import condense, in_moments, lossy, stays
-from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
+from saga_fg.estimators.graph_moments import condense, in_moments, lossy
+from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.motion import Motion
+from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.estimators.smoothed import Newest
 from saga_fg.frame import Frame
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
@@ -42,7 +42,7 @@ class GraphState:
     beside: tuple[int, ...]
 
 
-class GraphFilter:
+class GraphFilter(NewestMarginals):
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
@@ -125,7 +125,7 @@ class GraphFilter:
         motion.check(self._layout)
         x, nodes = self.posterior(), self._layout.nodes
         dynamics = motion.dynamics(self._layout, x.mean)
-        still = stays(dynamics)
+        still = dynamics.still
         if transition.dt == 0 and still.all():
             return
         standing, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
@@ -151,7 +151,7 @@ class GraphFilter:
             return 0.0
         x = self.posterior()
         likelihood = innovation_likelihood(x, *sighting.linearised(x.layout, x.mean))
-        self._changed().extend([LinearDetections(measurements, self._keys)])
+        self._changed().extend([DetectionFactors(measurements, self._keys)])
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -159,18 +159,6 @@ class GraphFilter:
         self._layout = self._layout.without(self._layout.rows(nodes))
         self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
         self._posterior = None
-
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().mean(nodes)
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().covariance(nodes)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_mean(nodes)
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_covariance(nodes)
 
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian of all nodes."""
@@ -219,8 +207,8 @@ class GraphFilter:
         keys = {**dict.fromkeys(beside), **self._keys}
         return self._smoother.joint_gaussian(layout, [keys[node] or node for node in layout.nodes.tolist()])
 
-    def _newest(self) -> Newest:
-        return Newest(self._layout, self.posterior())
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+        return self.posterior(), self._layout.rows(nodes)
 
     def _changed(self) -> IncrementalSmoother:
         self._posterior = None

@@ -85,20 +85,6 @@ def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
     return dict(zip(row, connected_components(matrix, directed=False)[1].tolist(), strict=True))
 
 
-def stays(dynamics: Dynamics) -> BoolArray:
-    """(n,) whether nodes stay as they are: x' = x, without noise, whatever the others do."""
-    n = len(dynamics.layout)
-    same, told = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    for F in dynamics.F:
-        own = F.target == F.source
-        same[F.target[own & (F.values == np.eye(*F.values.shape[1:])).all(axis=(1, 2))]] = True
-        told[F.target[~own & F.values.any(axis=(1, 2))]] = True
-    for Q in dynamics.Q:
-        told[Q.target[Q.values.any(axis=(1, 2))]] = True
-    told[np.repeat(np.arange(n), dynamics.layout.dims)[dynamics.b != 0]] = True
-    return same & ~told
-
-
 def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) -> BoolArray:
     """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable.
 

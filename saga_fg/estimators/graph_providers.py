@@ -2,7 +2,7 @@
 
 prior        || x_i - m ||_P                             `Births`
 interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}     `Interactions`, one n-ary factor a node and interval
-detection    || z - H x_i ||_R                           `LinearDetections`
+detection    || z - H x_i ||_R                           `DetectionFactors`
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Interactions:
 
 
 @dataclass(frozen=True, eq=False)
-class LinearDetections:
+class DetectionFactors:
     """Measurements of objects; keys: of their variables by id, by default those of this epoch."""
 
     measurements: Measurements | Observations

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import smoothed_means
 from saga_fg.estimators.bayes_tree import BayesTree
@@ -30,11 +30,11 @@ from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.moment import Birth, Moment, passed
 from saga_fg.estimators.motion import Motion, Standstill
+from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting, whitened
-from saga_fg.estimators.smoothed import Newest
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.transition import Transition
 
@@ -79,7 +79,7 @@ class _Held:
         return (*self.moments[:-1], moment)
 
 
-class IncrementalFilter:
+class IncrementalFilter(NewestMarginals):
     """The exact filter, by `gtsam.ISAM2`. See `saga_fg.estimators.protocol.Estimator` for the methods."""
 
     def __init__(self) -> None:
@@ -146,21 +146,10 @@ class IncrementalFilter:
         gone = (*held.newest.gone, *held.live.nodes[rows].tolist())
         self._held = replace(held, live=held.live.without(rows), moments=held.noted(replace(held.newest, gone=gone)))
 
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().mean(nodes)
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().covariance(nodes)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_mean(nodes)
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._newest().joint_covariance(nodes)
-
     def posterior(self) -> BlockGaussian:
         """The filter's, of the nodes that are there now, and perhaps of some that just went."""
-        return self._newest().x
+        self._held, x = _solved(self._held)
+        return x
 
     def graph(self) -> SceneFactorGraph:
         """The last interval: what was known before it as prior, its factors, and everything seen since."""
@@ -183,9 +172,8 @@ class IncrementalFilter:
         require_kind("state", state, IncrementalState)
         self._held = _Held(state.x.layout, None, state.x, state.x, (Moment(state.time),))
 
-    def _newest(self) -> Newest:
-        self._held, x = _solved(self._held)
-        return Newest(self._held.live, x)
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+        return live_rows(self.posterior(), self._held.live, nodes)
 
 
 def _solved(held: _Held) -> tuple[_Held, BlockGaussian]:

@@ -23,6 +23,7 @@ from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.kalman_factors import Beside, asked
 from saga_fg.estimators.layout import checked_prior
+from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting
 from saga_fg.frame import Frame
@@ -46,7 +47,7 @@ class KalmanState:
     beside: Beside | None
 
 
-class JointKalmanFilter:
+class JointKalmanFilter(NewestMarginals):
     """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame, for factors on the newest variables: an extended Kalman filter
@@ -122,25 +123,6 @@ class JointKalmanFilter:
             labels = {node: label for node, label in self._beside.labels.items() if node not in gone}
             self._beside = replace(self._beside, labels=labels)
 
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        layout = self._state.layout
-        mean: FloatArray = self._state.mean[layout.spans(layout.rows(nodes))]
-        return mean
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        layout = self._state.layout
-        rows = layout.rows(nodes)
-        layout.spans(rows)  # states of equal size, or an error that says so
-        return self._state.covariances(rows)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        layout = self._state.layout
-        mean: FloatArray = self._state.mean[layout.places(layout.rows(nodes))]
-        return mean
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self._state.joint(self._state.layout.rows(nodes))
-
     def posterior(self) -> BlockGaussian:
         """All that the filter knows."""
         return self._state
@@ -158,3 +140,6 @@ class JointKalmanFilter:
         require_kind("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
         self._beside = state.beside or Beside()
+
+    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+        return self._state, self._state.layout.rows(nodes)

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.recording import Recording
 
@@ -55,37 +54,6 @@ class Smoothed:
         if self.P is None:
             raise InputError("covariances: only means were smoothed; ask for covariances")
         return self.P
-
-
-@dataclass(frozen=True, eq=False)
-class Newest:
-    """The filter's posterior of the nodes that are there now; the methods are those of `Estimator`.
-
-    layout of those nodes; x of these and of the ones that go after this moment
-    """
-
-    layout: Layout
-    x: BlockGaussian
-
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        mean: FloatArray = self.x.mean[self.x.layout.spans(self._rows(nodes))]
-        return mean
-
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        rows = self._rows(nodes)
-        self.x.layout.spans(rows)
-        return self.x.covariances(rows)
-
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        mean: FloatArray = self.x.mean[self.x.layout.places(self._rows(nodes))]
-        return mean
-
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        return self.x.joint(self._rows(nodes))
-
-    def _rows(self, nodes: ArrayLike) -> IntArray:
-        rows = self.layout.rows(nodes)
-        return rows if len(self.layout) == len(self.x.layout) else self.x.layout.rows(self.layout.nodes[rows])
 
 
 def smoothed_moments(recording: Recording, covariances: bool, joint: bool) -> tuple[Smoothed, ...]:

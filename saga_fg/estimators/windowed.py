@@ -12,7 +12,6 @@ memory of a graph is: an object in view settles in a second or two, a hidden one
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import ArrayLike
 from factors import Robust
 from saga_fg.arrays import IntArray
 from saga_fg.estimators.backward import future_influence
-from saga_fg.estimators.motion import Motion, NodeMotion
+from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording
 from saga_fg.estimators.sighting import Observations, along_the_way
@@ -87,9 +86,9 @@ class WindowedSmoother:
         """Nodes that appear: ids (k,), means (k, d), covariances (k, d, d)."""
         self._recording.add(nodes, means, covariances)
 
-    def predict(self, transition: Transition, nonlinear: Sequence[NodeMotion] = ()) -> None:
-        """Move all nodes; those in `nonlinear` by their own interaction functions, with the transition's noise."""
-        self._recording.move(Motion(transition, tuple(nonlinear)))
+    def predict(self, transition: Transition) -> None:
+        """Move all nodes by a transition over exactly those that are there."""
+        self._recording.move(Motion(transition))
 
     def update(
         self, measurements: Measurements | Observations, time: float | None = None, robust: Robust | None = None

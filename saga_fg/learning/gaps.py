@@ -6,12 +6,13 @@ interactions are learned from and judged by.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.columns import Columns
 from saga_fg.learning.independent_filter import FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
 
@@ -32,7 +33,7 @@ class GapSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class GapSample:
+class GapSample(Columns):
     """W gaps of S steps with at most M neighbours.
 
     moment, row      (W,) where in the recording, and of which object; recording (W,) number, label (W,)
@@ -59,22 +60,11 @@ class GapSample:
     other_seen: FloatArray
     other_label: StrArray
 
-    def __len__(self) -> int:
-        return len(self.moment)
-
-    def select(self, rows: IntArray) -> Self:
-        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
-
     def drawn(self, most: int, seed: int) -> Self:
         """At most so many of them, drawn at random."""
         if len(self) <= most:
             return self
         return self.select(np.sort(np.random.default_rng(seed).choice(len(self), most, replace=False)))
-
-    @classmethod
-    def pool(cls, samples: list[Self]) -> Self:
-        """Samples of equal numbers of steps and neighbours, one after another."""
-        return cls(*(np.concatenate([getattr(s, f.name) for s in samples]) for f in fields(cls)))
 
 
 def gap_moments(trajectories: Trajectories, settings: GapSettings) -> tuple[IntArray, int, int]:

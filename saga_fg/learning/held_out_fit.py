@@ -116,7 +116,7 @@ def coupled_classes(rules: Rules) -> list[set[str]]:
 def _gaps(
     recordings: Sequence[Trajectories], classes: tuple[str, ...], own: OwnMotion, settings: GapSettings
 ) -> GapSample:
-    return GapSample.pool(
+    return GapSample.concatenate(
         [sample_gaps(each, own.filtered(each), classes, settings, k) for k, each in enumerate(recordings)]
     )
 

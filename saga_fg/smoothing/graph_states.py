@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.estimators import BatchSolver, Births, Interactions, LinearDetections, Measurements
+from saga_fg.estimators import BatchSolver, Births, DetectionFactors, Interactions, Measurements
 from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.states import StateTable
@@ -68,7 +68,7 @@ def states_in_graph(
         moved = [] if epoch.transition is None else [_At(Interactions(epoch.transition), states)]
         born = _At(replace(epoch.births, labels=labels), states)
         solver.step(
-            float(evidence.times[epoch.moment]), [*moved, born, *map(LinearDetections, epoch.measurements), *providers]
+            float(evidence.times[epoch.moment]), [*moved, born, *map(DetectionFactors, epoch.measurements), *providers]
         )
     if not solver.solve().converged:
         log.warning("the states with the factors of %s have not settled", ", ".join(one.name for one in providers))

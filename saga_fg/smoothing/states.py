@@ -9,24 +9,18 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.columns import Columns
 
 
 @dataclass(frozen=True, eq=False)
-class Lives:
+class Lives(Columns):
     """n objects: id (n,) unique and ascending, label (n,) classes, first and last (n,) moments, both included."""
 
     id: IntArray
     label: StrArray
     first: IntArray
     last: IntArray
-
-    def __len__(self) -> int:
-        return len(self.id)
-
-    def select(self, rows: IntArray | BoolArray) -> Self:
-        """The objects of a mask or of row indices."""
-        return type(self)(self.id[rows], self.label[rows], self.first[rows], self.last[rows])
 
     def rows_of(self, ids: IntArray) -> IntArray:
         """The rows of some objects that are all there."""
@@ -56,7 +50,7 @@ def lives_of_evidence(object_of: IntArray, label: StrArray, moment: IntArray) ->
 
 
 @dataclass(frozen=True, eq=False)
-class StateTable:
+class StateTable(Columns):
     """Smoothed states, R rows in order of moments and within a moment of ids.
 
     moment, id (R,); mean (R, 4) local position (m) and velocity (m/s); covariance (R, 4, 4)
@@ -67,9 +61,6 @@ class StateTable:
     mean: FloatArray
     covariance: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.id)
-
     @classmethod
     def of_moments(cls, parts: Sequence[tuple[int, IntArray, FloatArray, FloatArray]]) -> Self:
         """From (moment, ids, means, covariances) of each moment in order."""
@@ -79,10 +70,6 @@ class StateTable:
         ids, mean, P = (np.concatenate([part[i] for part in parts]) for i in (1, 2, 3))
         order = np.lexsort((ids, moment))
         return cls(moment[order], ids[order], mean[order], P[order])
-
-    def select(self, rows: BoolArray | IntArray) -> Self:
-        """The states of a mask or of row indices in order."""
-        return type(self)(self.moment[rows], self.id[rows], self.mean[rows], self.covariance[rows])
 
     def within(self, lives: Lives) -> Self:
         """The states of some objects from their first to their last moment."""

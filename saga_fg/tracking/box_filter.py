@@ -9,11 +9,12 @@ heading   scalar Kalman filter on the circle, random walk; a detector's heading 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.columns import Columns
 from saga_fg.geometry import wrap_angle
 
 HEIGHT_DRIFT = 0.1  # standard deviation after one second, m
@@ -22,7 +23,7 @@ MOST_VOTES = 5.0  # that the past has, so that it can be outvoted
 
 
 @dataclass(eq=False)
-class BoxFilter:
+class BoxFilter(Columns):
     """Columns over n tracks: size (n, 3), size_weight, z, z_variance, yaw, yaw_variance, votes (n,); NaN is unknown.
 
     votes: for the front being where yaw points, less those against it; >= 0
@@ -55,12 +56,6 @@ class BoxFilter:
         known = np.isfinite(size).all(axis=1)
         votes = np.where(np.isfinite(yaw), weight, 0.0)
         return cls(size.copy(), np.where(known, weight, 0.0), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2, votes)
-
-    def select(self, rows: IntArray | BoolArray) -> BoxFilter:
-        return BoxFilter(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def extended(self, other: BoxFilter) -> BoxFilter:
-        return BoxFilter(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
     def predict(self, dt: float, yaw_drift: FloatArray) -> None:
         self.z_variance = self.z_variance + HEIGHT_DRIFT**2 * dt

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.columns import Columns
 
 
 @dataclass(eq=False)
-class TrackColumns:
+class TrackColumns(Columns):
     """n tracks, in order of birth. Times in s.
 
     id            (n,)
@@ -82,9 +83,3 @@ class TrackColumns:
     def coasting(self, now: float) -> FloatArray:
         """(n,) how long the tracks have not been detected, s; to the microsecond, as all times are."""
         return np.maximum(np.round(now - self.last_seen, 6), 0.0)
-
-    def select(self, rows: IntArray | BoolArray) -> Self:
-        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def extended(self, other: TrackColumns) -> Self:
-        return type(self)(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))

@@ -8,13 +8,14 @@ filter: a track is where its last detection was.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.arrays import FloatArray, IntArray, StrArray
 from saga_fg.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.by_class import DEFAULT, class_numbers
+from saga_fg.columns import Columns
 from saga_fg.errors import InputError
 from saga_fg.frame import Frame
 from saga_fg.sensor import Sensor, sensor_model
@@ -26,7 +27,7 @@ NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 a
 
 
 @dataclass(frozen=True, eq=False)
-class _Memory:
+class _Memory(Columns):
     """n tracks: where they were last seen, and the place and time from which their velocity is measured."""
 
     id: IntArray
@@ -39,12 +40,6 @@ class _Memory:
     last_seen: FloatArray
     anchor: FloatArray
     anchor_time: FloatArray
-
-    def select(self, rows: IntArray) -> _Memory:
-        return _Memory(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def extended(self, other: _Memory) -> _Memory:
-        return _Memory(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,13 @@ filter.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.association import mahalanobis_of_pairs
+from saga_fg.columns import Columns
 from saga_fg.tracking.joint_state import Kinematics
 from saga_fg.tracking.settings import StandingSettings
 
@@ -34,7 +35,7 @@ _MOST_LOG_ODDS = 12.0  # no belief is beyond being changed by what is seen
 
 
 @dataclass(eq=False)
-class Standing:
+class Standing(Columns):
     """Columns over n tracks: place (n, 2), local, its covariance P (n, 2, 2), belief (n,)."""
 
     place: FloatArray
@@ -49,12 +50,6 @@ class Standing:
     def born(cls, now: Kinematics, belief: FloatArray) -> Standing:
         """Of new tracks: they stand where they are."""
         return cls(now.position.copy(), now.P.copy(), belief)
-
-    def select(self, rows: IntArray | BoolArray) -> Standing:
-        return Standing(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def extended(self, other: Standing) -> Standing:
-        return Standing(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
     def predict(self, dt: float, moving: Kinematics, settings: StandingSettings) -> None:
         """`dt` s pass; `moving` is the joint filter's state before."""

@@ -80,30 +80,18 @@ class Tracker:
         """
         if not isinstance(frame, Frame):
             raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
-        tracks, clock, verdict = self._tracks, self._clock, self.time_verdict
-        self._tracks = tracks.copied()
+        tracks = self._tracks
         try:
-            reported = self._step(frame)
+            reported = self._step(frame, tracks.copied())
         except BaseException as error:
-            self._tracks, self._clock, self.time_verdict = tracks, clock, verdict
             again, self._failed = self._failed, isinstance(error, Exception)
             if not (again and self._failed and len(tracks)):
                 raise
-            reported = self._step_without_tracks(frame, error)
+            bare = tracks.copied()
+            bare.forget()
+            reported = self._step(frame, bare)  # unless it is the frame that can't be used
+            log.warning("tracks %s are deleted, they can't go on: %s", tracks.ids, error)
         self._failed = False
-        return reported
-
-    def _step_without_tracks(self, frame: Frame, error: BaseException) -> Tracks:
-        """Two frames in a row have failed. Go on without the tracks, unless it is the frame that can't be used."""
-        tracks, clock, verdict = self._tracks, self._clock, self.time_verdict
-        self._tracks = tracks.copied()
-        self._tracks.forget()
-        try:
-            reported = self._step(frame)
-        except BaseException:
-            self._tracks, self._clock, self.time_verdict = tracks, clock, verdict
-            raise
-        log.warning("tracks %s are deleted, they can't go on: %s", tracks.ids, error)
         return reported
 
     def tracks(self, timestamp: float) -> Tracks:
@@ -172,14 +160,19 @@ class Tracker:
         whole = settings.estimator == "fixed-lag" and not self.providers
         return max(settings.max_delay, settings.lag) if whole else settings.max_delay
 
-    def _step(self, frame: Frame) -> Tracks:
-        sensor = self.sensor(frame.sensor)
-        timestamp = frame.timestamp + sensor.time_offset
-        if self._keep_time(timestamp, frame.sensor):
-            self.assignment = self._tracks.take_in(frame, sensor, timestamp)
-        else:
-            self.assignment = Assignment.empty()
-        return self._tracks.report(self._clock.newest)
+    def _step(self, frame: Frame, tracks: TrackSet) -> Tracks:
+        """Take a frame in, into these tracks, or leave everything as it was."""
+        unchanged = self._tracks, self._clock, self.time_verdict
+        self._tracks = tracks
+        try:
+            sensor = self.sensor(frame.sensor)
+            timestamp = frame.timestamp + sensor.time_offset
+            used = self._keep_time(timestamp, frame.sensor)
+            self.assignment = tracks.take_in(frame, sensor, timestamp) if used else Assignment.empty()
+            return tracks.report(self._clock.newest)
+        except BaseException:
+            self._tracks, self._clock, self.time_verdict = unchanged
+            raise
 
     def _keep_time(self, timestamp: float, sensor: str) -> bool:
         """Whether a frame is to be used; where the clock was set, the tracks are prepared for it."""

@@ -20,12 +20,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.columns import Columns
 from saga_fg.geometry import wrap_angle
 from saga_fg.tracking.settings import FlowSettings
 
 
-class Passages(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Passages(Columns):
     """n places where tracks were: track id, class, position (n, 2), heading, speed along it if it moves, its variance,
     the belief that it stands, time."""
 
@@ -37,12 +39,6 @@ class Passages(NamedTuple):
     variance: FloatArray
     standing: FloatArray
     time: FloatArray
-
-    def select(self, rows: BoolArray) -> Passages:
-        return Passages._make(column[rows] for column in self)
-
-    def extended(self, other: Passages) -> Passages:
-        return Passages._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
 
 
 class Expected(NamedTuple):

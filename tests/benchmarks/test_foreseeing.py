@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.foreseeing import Foreseeing
+from benchmarks.foresight import foreseen
 from benchmarks.predictions import prediction_errors
-from data_tools.simulator.foresight import foreseen
 from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import build_world

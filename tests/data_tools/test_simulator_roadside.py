@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.affected import affected
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.affected import affected
 from data_tools.simulator.scenarios import SCENARIOS, ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.settings import (

@@ -3,7 +3,7 @@
 import numpy as np
 
 from saga_fg.estimators import IncrementalSmoother
-from saga_fg.estimators.graph_providers import Births, Interactions, LinearDetections
+from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.graph import OBJECT, key_of
 
 
@@ -23,7 +23,7 @@ class GraphEstimator:
         self.smoother.step(self.smoother.time + transition.dt, [Interactions(transition)])
 
     def update(self, measurements):
-        self.smoother.extend([LinearDetections(measurements)])
+        self.smoother.extend([DetectionFactors(measurements)])
 
     def marginalise(self, nodes):
         """Who goes has no variable at the next epoch; the last one leaves with the lag."""

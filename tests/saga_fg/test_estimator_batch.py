@@ -9,7 +9,7 @@ from estimator_scenario import EXACT, Textbook, covariance_error, mean_error, pa
 from graph_keys import keys_of
 from random_graphs import BUS, CAR, CONE, POLE
 
-from factors import NonlinearInteraction, RangeBearing, Robust
+from factors import RangeBearing, Robust
 from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.discretisation import discretise
 from saga_fg.estimators import (
@@ -17,9 +17,10 @@ from saga_fg.estimators import (
     FixedLagSmoother,
     GraduatedNonConvexity,
     Measurements,
-    NodeMotion,
     Observations,
 )
+from saga_fg.nonlinear_interactions import SocialForce
+from saga_fg.scene_graph import NonlinearEdges
 
 
 def punctual(scenario):
@@ -191,8 +192,12 @@ def test_a_snapshot_can_be_stored():
 def test_functions_that_fail_are_refused_at_once(likelihoods):
     """Also by a smoother that waits: found later, there would be no way to get rid of them."""
 
-    def refuse(x, others, dt):
-        raise ZeroDivisionError("no idea")
+    class Refusal(SocialForce):
+        def accelerations(self, own, other, given):
+            raise ZeroDivisionError("no idea")
+
+    edges = NonlinearEdges(Refusal(), [0], [1], [1.0], np.zeros((1, 1, 4)))
+    refusing = SceneGraph(np.array([1, 2]), (CAR, CAR), nonlinear=(edges,))
 
     def told(wrong):
         smoother = BatchSmoother(likelihoods=likelihoods)
@@ -200,8 +205,8 @@ def test_functions_that_fail_are_refused_at_once(likelihoods):
         apart = discretise(SceneGraph.of([1, 2], CAR), 0.1)
         smoother.predict(apart)
         if wrong:
-            with pytest.raises(InputError, match=r"interaction of node 1: ZeroDivisionError\('no idea'\)"):
-                smoother.predict(apart, [NodeMotion(1, (2,), NonlinearInteraction(refuse))])
+            with pytest.raises(InputError, match=r"law Refusal: ZeroDivisionError\('no idea'\)"):
+                smoother.predict(discretise(refusing, 0.1))
             with pytest.raises(InputError, match="the object is at the sensor itself"):
                 smoother.update(Observations([1], [[1.0, 0.0]], RangeBearing(state_dim=4), np.eye(2)))
         smoother.update(Measurements([1], [[1.0, 0.0]], np.eye(2, 4), np.eye(2)))

@@ -20,11 +20,13 @@ from estimator_scenario import (
 from graph_keys import keys_of
 from random_graphs import BUS, CAR, CONE, POLE
 
-from factors import NonlinearInteraction, RangeBearing, Robust
+from factors import RangeBearing, Robust
 from saga_fg import InputError, SceneGraph, UnknownNodeError
 from saga_fg.discretisation import discretise
-from saga_fg.estimators import FixedLagSmoother, GraduatedNonConvexity, Measurements, NodeMotion, Observations
+from saga_fg.estimators import FixedLagSmoother, GraduatedNonConvexity, Measurements, Observations
 from saga_fg.graph import OBJECT, key_of
+from saga_fg.nonlinear_interactions import SocialForce
+from saga_fg.scene_graph import NonlinearEdges
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.6, 100.0])
@@ -202,21 +204,16 @@ def test_linear_measurements_may_be_robust():
     assert abs(smoother.mean([1])[0, 0] - 0.5) < 0.3
 
 
-def repel(x, others, dt):
-    """Constant velocity, pushed away from the neighbours."""
-    force = sum((x[:2] - y[:2]) / (1 + (x[:2] - y[:2]) @ (x[:2] - y[:2])) for y in others)
-    return np.concatenate([x[:2] + dt * x[2:], x[2:] + dt * force])
-
-
 def test_a_nonlinear_interaction_is_linearised_at_the_smoothed_states():
     smoother = FixedLagSmoother(10.0)
     rng = np.random.default_rng(2)
     smoother.add([1, 2], [[0.0, 0, 1, 0], [3.0, 0.5, -1, 0]], np.tile(np.eye(4), (2, 1, 1)))
-    away = [NodeMotion(1, (2,), NonlinearInteraction(repel)), NodeMotion(2, (1,), NonlinearInteraction(repel))]
+    away = NonlinearEdges(SocialForce(falloff=2.0), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
     for _ in range(6):
-        smoother.predict(discretise(SceneGraph.of([1, 2], CAR), 0.2), nonlinear=away)
-        smoother.update(Measurements([1, 2], rng.normal(size=(2, 2)), np.eye(2, 4), 0.1 * np.eye(2)))
-    smoother.update(Measurements([1], rng.normal(size=(1, 2)), np.eye(2, 4), 0.1 * np.eye(2)), time=0.5)
+        smoother.predict(discretise(SceneGraph(np.array([1, 2]), (CAR, CAR), nonlinear=(away,)), 0.2))
+        seen = rng.normal([[0.0, 0.0], [2.0, 0.5]], 0.3)
+        smoother.update(Measurements([1, 2], seen, np.eye(2, 4), 0.1 * np.eye(2)))
+    smoother.update(Measurements([1], rng.normal(0.0, 0.3, (1, 2)), np.eye(2, 4), 0.1 * np.eye(2)), time=0.5)
     assert_minimum(smoother)
 
 
@@ -233,14 +230,6 @@ def test_a_snapshot_can_be_stored_and_continued_to_the_bit():
     assert resumed.nodes.tolist() == straight.nodes.tolist()
     np.testing.assert_array_equal(resumed.joint_mean(straight.nodes), straight.joint_mean(straight.nodes))
     np.testing.assert_array_equal(resumed.joint_covariance(straight.nodes), straight.joint_covariance(straight.nodes))
-
-
-def refuse(x, others, dt):
-    raise ZeroDivisionError("no idea")
-
-
-def two_apart():
-    return discretise(SceneGraph.of([1, 2], CAR), 0.1)
 
 
 def two_cars():
@@ -263,12 +252,6 @@ def two_cars():
         (lambda s: s.predict(discretise(SceneGraph.of([1], CAR), 0.1)), InputError),
         (lambda s: s.predict(discretise(SceneGraph.of([1, 2], BUS), 0.1)), InputError),
         (lambda s: s.predict(discretise(SceneGraph.of([1, 3], CAR), 0.1)), UnknownNodeError),
-        (
-            lambda s: s.predict(two_apart(), [NodeMotion(1, (1,), NonlinearInteraction(repel))]),
-            InputError,
-        ),
-        (lambda s: s.predict(two_apart(), [NodeMotion(1, (2,), NonlinearInteraction(refuse))]), InputError),
-        (lambda s: s.predict(two_apart(), [NonlinearInteraction(repel)]), InputError),
         (lambda s: s.update(Measurements([1], [[0.0]], np.eye(1, 4), [[1.0]]), time="now"), InputError),
         (lambda s: s.update(Measurements([1], [[0.0]], np.eye(1, 4), [[1.0]]), robust="huber"), InputError),
         (

@@ -167,7 +167,7 @@ def test_learning_from_nothing_is_an_error():
     trajectories = following_pairs(pairs=2, moments=2)
     _, sample = gaps_of(trajectories)
     with pytest.raises(InputError, match="at least one object that is followed"):
-        fit_interactions(GapSample.pool([sample]), 0.005, {"default": 0.3})
+        fit_interactions(GapSample.concatenate([sample]), 0.005, {"default": 0.3})
 
 
 def test_objects_in_view_are_likeliest_by_the_rate_at_which_they_follow():

@@ -19,12 +19,11 @@ from saga_fg.estimators import (
     IncrementalFilter,
     JointKalmanFilter,
     Measurements,
-    NodeMotion,
 )
 from saga_fg.estimators.flow import flows
 from saga_fg.interactions import SharedVelocity
 from saga_fg.node import RandomWalk
-from saga_fg.nonlinear_interactions import SmoothDriver, SocialForce, interaction
+from saga_fg.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.scene_graph import NonlinearEdges
 from saga_fg.turning import Bicycle, CoordinatedTurn
 
@@ -199,11 +198,3 @@ def test_bad_edges_are_refused(change, message):
     good = {"target": [0], "source": [1], "rate": [1.0], "given": [4.0]}
     with pytest.raises(InputError, match=message):
         SceneGraph(np.arange(2), (WALKER,) * 2, nonlinear=(NonlinearEdges(SmoothDriver(), **{**good, **change}),))
-
-
-def test_functions_by_hand_go_with_linear_graphs_only():
-    smoother = BatchSmoother()
-    smoother.add([10], [START[0]], [np.eye(5)])
-    graph = SceneGraph.of([10], CAR)
-    with pytest.raises(InputError, match="expected linear motion and edges"):
-        smoother.predict(discretise(graph, 0.1), [NodeMotion(10, (), interaction(SocialForce()))])

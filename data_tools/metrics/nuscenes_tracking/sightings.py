@@ -18,19 +18,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from data_tools.metrics.track_table import TrackTable
 from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.boxes import Boxes
+from saga_fg.columns import Columns
 
 RACKED = ("bicycle", "motorcycle")
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(Columns):
     """N scored boxes of one scene, in order of time.
 
     moment    (N,)   which moment, from 0
@@ -45,9 +45,6 @@ class Sightings:
     label: IntArray
     xy: FloatArray
     score: FloatArray
-
-    def select(self, rows: IntArray | BoolArray) -> Self:
-        return type(self)(self.moment[rows], self.identity[rows], self.label[rows], self.xy[rows], self.score[rows])
 
 
 def sightings(
@@ -122,7 +119,5 @@ def _filled(rows: Sightings, micros: IntArray) -> Sightings:
     xy = (1.0 - ratio[:, None]) * a.xy + ratio[:, None] * b.xy
     score = (1.0 - ratio) * a.score + ratio * b.score
     added = Sightings(moment, b.identity, b.label, xy, score)
-    both = Sightings(
-        *(np.concatenate([getattr(rows, name), getattr(added, name)]) for name in Sightings.__dataclass_fields__)
-    )
+    both = rows.extended(added)
     return both.select(np.argsort(both.moment, kind="stable"))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_tools.metrics.block_bootstrap import relative_change_of_errors
+from benchmarks.block_bootstrap import relative_change_of_errors
 from saga_fg.errors import InputError
 
 
