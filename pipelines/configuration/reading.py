@@ -148,7 +148,7 @@ def _read_imported(data: Any, where: str) -> Any:
     except InputError as error:
         raise InputError(f"{where}.kind: {error}") from error
     except TypeError as error:
-        raise InputError(f"{where}.kind: {kind}: expected a dataclass of settings: {error}") from error
+        raise InputError(f"{where}.kind: {kind}: expected a dataclass, whose fields are its settings") from error
     return _read_section(Section((cls,)), values, None, where)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -34,6 +35,7 @@ class Births:
     covariances: FloatArray
     labels: Mapping[int, str] = field(default_factory=dict)
     name: str = "births"
+    internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:
         ids = np.asarray(self.nodes).tolist()
@@ -58,6 +60,7 @@ class Interactions:
     earlier: Mapping[int, int] | None = None
     standing: Collection[int] = ()
     name: str = "interactions"
+    internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:
         transition = self.transition
@@ -89,6 +92,7 @@ class DetectionFactors:
     measurements: Measurements | Observations
     keys: Mapping[int, int] | None = None
     name: str = "detections"
+    internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:
         m = self.measurements

@@ -1,6 +1,6 @@
 """The running graph: one factor graph of objects, the vehicle and landmarks, fed by factor providers."""
 
-from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.errors import GraphError, ProviderError, UndeterminedError
 from saga_fg.graph.keys import (
     EGO_BIAS,
     EGO_ERROR,
@@ -36,6 +36,7 @@ __all__ = [
     "KeyId",
     "Kind",
     "NewVariable",
+    "ProviderError",
     "SceneFactorGraph",
     "UndeterminedError",
     "ask_all",

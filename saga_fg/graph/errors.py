@@ -9,6 +9,10 @@ class GraphError(InputError):
     """A variable or factor that the graph does not take; the graph is as it was before."""
 
 
+class ProviderError(GraphError):
+    """A provider of a user's raised, or gave what the graph does not take."""
+
+
 class UndeterminedError(GraphError):
     """The factors leave variables undetermined; `keys` are these variables, as far as they could be found."""
 

@@ -32,6 +32,7 @@ from saga_fg.graph.factor_groups import (
     members,
 )
 from saga_fg.graph.keys import described
+from saga_fg.graph.point import LARGEST
 from saga_fg.graph.variables import GraphVariable
 
 Factor = gtsam.JacobianFactor | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph | Linearisable
@@ -132,8 +133,8 @@ def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) ->
             return f"expected {total} columns, as the variables have dimensions, got {factor.cols() - 1}"
         if factor.isConstrained():
             return "expected noise with variances, no hard constraint"
-        if not np.isfinite(factor.augmentedJacobian()).all():
-            return "expected finite numbers"
+        if not (np.abs(factor.augmentedJacobian()) <= LARGEST).all():
+            return f"expected finite numbers, at most {LARGEST:g} standard deviations"
     elif isinstance(group, StackedGroup):
         expected = [Vector(dim) if isinstance(dim, int | np.integer) else dim for dim in group.factors.dims]
         plain = [

@@ -18,7 +18,7 @@ from factors import FactorError, Linearisable, ResidualFactor, ResidualFactors, 
 from factors.differences import central_differences
 from factors.gaussian import gaussian_graph, native_factor, whitened_factors
 from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.graph.point import Point
+from saga_fg.graph.point import LARGEST, Point
 
 Rows = tuple[tuple[int, ...], ...]
 
@@ -137,6 +137,9 @@ class StackedGroup:
                 J = np.stack([a if d is None else a @ d for a, d in zip(J, D, strict=True)])
             rhs = rhs + (J @ delta[:, :, None])[:, :, 0]
             blocks.append(J)
+        largest = np.abs(W).max(initial=0.0) * max(np.abs(numbers).max(initial=0.0) for numbers in (rhs, *blocks))
+        if not largest <= LARGEST:
+            raise FactorError(f"expected a residual and Jacobians of at most {LARGEST:g} standard deviations")
         return whitened_factors(keys, W, blocks, rhs)
 
     def error(self, chosen: IntArray, point: Point) -> float:

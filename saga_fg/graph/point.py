@@ -21,6 +21,8 @@ from factors.gaussian import native_factor
 from saga_fg.arrays import FloatArray
 from saga_fg.graph.variables import GraphVariable, transport
 
+LARGEST = 1e30  # of whitened numbers, whose squares numbers can hold
+
 
 class Point:
     """values: where; base: of the variables of the graph. Both are read, never changed."""
@@ -66,8 +68,10 @@ class Point:
         dims = self.dims(keys)
         if result.shape[1] != sum(dims) + 1:
             raise FactorError(f"expected Jacobians of {sum(dims)} columns together, got {result.shape[1] - 1}")
-        if not np.isfinite(result).all():
-            raise FactorError("expected a residual and Jacobians of finite numbers")
+        if not (np.abs(result) <= LARGEST).all():
+            raise FactorError(
+                f"expected a residual and Jacobians of finite numbers, at most {LARGEST:g} standard deviations"
+            )
         column = 0
         for key in keys:
             columns = slice(column, column + self.variables[key].dim)

@@ -25,7 +25,7 @@ import numpy as np
 
 from saga_fg.arrays import FloatArray
 from saga_fg.frame import Frame
-from saga_fg.graph.errors import GraphError
+from saga_fg.graph.errors import GraphError, ProviderError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import Kind, key_of
 from saga_fg.graph.parts import NewVariable
@@ -74,7 +74,8 @@ class GraphView:
         origin: FloatArray,
         frame: Frame | None = None,
     ) -> None:
-        self._graph, self._covariance, self.origin, self.frame = graph, covariance, origin, frame
+        self._graph, self._covariance, self.origin, self.frame = graph, covariance, origin.copy(), frame
+        self.origin.setflags(write=False)
 
     @property
     def epoch(self) -> int:
@@ -119,6 +120,7 @@ class GraphView:
 
     def covariance(self, key: int) -> FloatArray:
         """Marginal covariance (d, d) of a variable, as known before this frame."""
+        self._graph.variable(key)
         return self._covariance(key)
 
 
@@ -157,12 +159,16 @@ def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> N
     """Add what a provider gives. Raises `GraphError` that names it, and may then have added some of it."""
     name = _name(provider)
     try:
-        additions = provider.factors(view)
-    except GraphError:
-        raise
+        _ask(name, provider, graph, view)
     except Exception as error:
-        said = " ".join((str(error) if isinstance(error, ValueError) else repr(error)).split())
-        raise GraphError(f"provider {name}: {said[:500]}") from error
+        expected = isinstance(error, GraphError | ValueError)
+        said = " ".join((str(error) if expected else repr(error)).split()).removeprefix(f"provider {name}: ")
+        kind = GraphError if getattr(provider, "internal", False) else ProviderError
+        raise kind(f"provider {name}: {graph.worded(said, graph.variables)[:500]}") from error
+
+
+def _ask(name: str, provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:
+    additions = provider.factors(view)
     if not isinstance(additions, Additions):
         raise GraphError(f"provider {name}: expected Additions, got {type(additions).__name__}")
     _checked(name, "variables", additions.variables)

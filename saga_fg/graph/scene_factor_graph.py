@@ -82,7 +82,7 @@ class SceneFactorGraph:
     def variable(self, key: int) -> GraphVariable:
         """The variable of a key."""
         if key not in self._variables:
-            raise GraphError(f"{described(key)} is not in the graph")
+            raise GraphError(f"{described(key) if isinstance(key, int) else repr(key)} is not in the graph")
         return self._variables[key]
 
     def factors(self) -> Iterator[FactorEntry]:
@@ -110,6 +110,8 @@ class SceneFactorGraph:
                 raise GraphError(f"provider {provider}: expected NewVariable, got {type(new).__name__}")
             if self.epoch < 0:
                 raise GraphError(f"provider {provider}: expected an epoch before variables: advance(time)")
+            if not isinstance(new.kind, Kind):
+                raise GraphError(f"provider {provider}: expected a Kind of variable, got {type(new.kind).__name__}")
             epoch, time = (None, None) if new.static else (self.epoch, self.time)
             key = key_of(new.kind, new.id, epoch)
             kind = new.type or variable_type(f"provider {provider}: {new.kind.name} {new.id}", new.state)

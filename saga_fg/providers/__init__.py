@@ -3,7 +3,7 @@
 Each reads what a frame brings (`Frame.ego`) and works in the running graph wherever that is: an
 `IncrementalSmoother` in Python, the tracker, and by name in a configuration with its fields as settings,
 
-    providers: [{name: "saga_fg.providers:Odometry"}, {name: "saga_fg.providers:Gps", deviation: 0.5}]
+    providers: [{kind: "saga_fg.providers:Odometry"}, {kind: "saga_fg.providers:Gps", deviation: 0.5}]
 """
 
 from saga_fg.providers.gps import Gps

@@ -13,6 +13,7 @@ from saga_fg.chi_square import chi_square_quantile
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import require_between, require_positive, setting
 
 
@@ -39,8 +40,10 @@ class Gps:
     def factors(self, view: GraphView) -> Additions:
         fix = None if view.frame is None or view.frame.ego is None else view.frame.ego.gps
         pose = view.now(EGO_POSE).get(0)
-        if fix is None or pose is None:
+        if fix is None:
             return Additions()
+        if pose is None:
+            raise InputError(NO_POSE)
         dim = 2 if pose.dim == 3 else 3
         if len(fix.position) < dim:
             raise InputError("gps: expected a place of 3 coordinates, as poses are in space, got 2")

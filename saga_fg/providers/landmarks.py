@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import EGO_POSE, LANDMARK
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.landmarks.point import PointLandmark
 from saga_fg.landmarks.protocol import Observation
+from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import require_positive, setting
 
 
@@ -35,8 +37,10 @@ class Landmarks:
 
     def factors(self, view: GraphView) -> Additions:
         pose = view.now(EGO_POSE).get(0)
-        if pose is None or view.frame is None:
+        if view.frame is None:
             return Additions()
+        if pose is None:
+            raise InputError(NO_POSE)
         known, world_T_pose = view.static(LANDMARK), view.state(pose.key).matrix()
         new: dict[int, NewVariable] = {}
         factors: list[Factor] = []

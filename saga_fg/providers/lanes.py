@@ -13,6 +13,7 @@ import numpy as np
 from factors import Robust, lane_keeping_factors, prior_factor
 from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.edge_rules import VEHICLES
+from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import MAP_NODE, OBJECT
 from saga_fg.graph.parts import NewVariable
@@ -41,6 +42,8 @@ class Lanes:
         require_between(self, 0, np.inf, "min_speed")
 
     def factors(self, view: GraphView) -> Additions:
+        if not self.lanes:
+            raise InputError("lanes: expected one at least")
         objects = [one for one in view.now(OBJECT).values() if one.label in self.classes and one.dim >= 4]
         if not objects or view.dt == 0:
             return Additions()

@@ -11,6 +11,7 @@ from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE, OBJECT
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.providers.start import NO_POSE
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +34,7 @@ class RelativeDetections:
             return Additions()
         pose = view.now(EGO_POSE).get(0)
         if pose is None:
-            raise InputError("expected a provider that adds the vehicle's pose, such as saga_fg.providers:Odometry")
+            raise InputError(NO_POSE)
         rows = np.array([[pose.key, view.key(OBJECT, node)] for node in self.nodes.tolist()], dtype=np.uint64)
         z = self.z[:, : 2 if pose.dim == 3 else 3]
         return Additions(factors=[relative_detection_factors(rows, z, self.R, self.dim, self.position)])

@@ -18,6 +18,8 @@ from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.settings import require_positive, setting
 
+NO_POSE = "expected a provider that adds the vehicle's pose before it, such as saga_fg.providers:Odometry"
+
 
 @dataclass(frozen=True)
 class StartSettings:

@@ -21,7 +21,7 @@ from saga_fg.by_class import class_values
 from saga_fg.chi_square import chi_square_quantile
 from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.frame import Frame
-from saga_fg.graph import FactorProvider
+from saga_fg.graph import FactorProvider, SceneFactorGraph
 from saga_fg.interactions import NodeTable
 from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.scene_graph import SceneGraph
@@ -75,6 +75,11 @@ class TrackSet:
 
     def __len__(self) -> int:
         return len(self._columns.id)
+
+    @property
+    def running_graph(self) -> SceneFactorGraph:
+        """The estimator's graph."""
+        return self._state.running_graph()
 
     @property
     def roadside(self) -> Roadside:
@@ -427,7 +432,7 @@ class TrackSet:
             matching,
             born,
             self._boxes(now.position, now.velocity),
-            self._state.running_graph() if self.providers else None,
+            self.running_graph if self.providers else None,
         )
 
     def _boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:

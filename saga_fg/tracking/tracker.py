@@ -19,7 +19,7 @@ from saga_fg.by_class import class_settings
 from saga_fg.edge_rules import EdgeRule
 from saga_fg.errors import InputError
 from saga_fg.frame import LATEST, Frame, finite_seconds
-from saga_fg.graph import FactorProvider
+from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
 from saga_fg.scene_graph import SceneGraph
 from saga_fg.sensor import Sensor, sensor_model
 from saga_fg.track import Tracks
@@ -76,7 +76,8 @@ class Tracker:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far.
 
         Raises `InputError` for a frame that can't be used. Whatever is raised, the tracker is as it was before. Where
-        the next frame fails as well, and would not without the tracks, these are deleted and it is taken in.
+        the next frame fails as well, and would not without the tracks, these are deleted and it is taken in; what a
+        provider does wrong is raised every time.
         """
         if not isinstance(frame, Frame):
             raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
@@ -84,6 +85,8 @@ class Tracker:
         try:
             reported = self._step(frame, tracks.copied())
         except BaseException as error:
+            if self.providers and isinstance(error, ProviderError | UndeterminedError):  # tracks are not to blame
+                raise
             again, self._failed = self._failed, isinstance(error, Exception)
             if not (again and self._failed and len(tracks)):
                 raise
@@ -139,6 +142,11 @@ class Tracker:
     def world_T_ego(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) as factor providers and the objects have it; None where it is not estimated."""
         return self._tracks.world_T_ego
+
+    @property
+    def running_graph(self) -> SceneFactorGraph:
+        """The factor graph of the estimator: variables, factors, values; with `providers` the one that runs."""
+        return self._tracks.running_graph
 
     @property
     def roadside(self) -> Roadside:
