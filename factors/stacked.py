@@ -97,7 +97,7 @@ class ResidualFactors:
                 keys=tuple(keys),
                 variables=self._variables,
                 residual=partial(self._single_residual, k),
-                covariance=self.covariances[k],
+                covariance=self.covariances[min(k, len(self.covariances) - 1)],  # one may serve all
                 jacobians=partial(self._single_jacobians, k),
                 robust=self.robust,
                 angles=self.angles,

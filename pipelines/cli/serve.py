@@ -111,6 +111,11 @@ def _restored(
 
     if settings.tracker.providers:
         raise InputError("--snapshot: expected no tracker.providers, whose factors cannot be kept in a file")
+    tracker = settings.tracker
+    if tracker.estimator != "kalman" and tracker.nonlinear(tracker.edges):
+        raise InputError(
+            f"--snapshot: expected estimator: kalman where objects move nonlinearly, got {tracker.estimator}"
+        )
     configuration = write_settings(settings, comments=False)
     header = {"version": version("saga-fg"), "method": method, "configuration": configuration}
     keeper = StateKeeper(stream, snapshot, every, header)

@@ -72,6 +72,8 @@ class Engine:
         graph.moved_to(start)
         anew = Engine(graph.elimination)
         anew.converged = graph.solve(SolverSettings(tolerance=settings.threshold / 10)).converged
+        if not anew.converged:
+            log.warning("at %.3f s the graph has not settled: its factors may contradict each other", graph.time)
         anew._synchronised(graph)
         return anew
 

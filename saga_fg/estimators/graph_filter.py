@@ -47,13 +47,16 @@ class GraphFilter(NewestMarginals):
 
     providers  asked by `ask`, once a frame
     lag        s; how long epochs stay in the graph, at least until all providers have been asked at the next one
+    relinearised  keep the epoch before until the next one in any case, so that nonlinear motion is linearised anew
+               where measurements put it; else it is linearised at the prediction, as by the extended Kalman filter
 
     What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
     stands still; where noise is so small that factors would lose digits, it is predicted in moments.
     """
 
-    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
+    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, relinearised: bool = False) -> None:
         self.providers, self._lag = tuple(providers), lag
+        self._relinearised = relinearised or bool(providers)
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
         self._layout = Layout()
@@ -62,7 +65,7 @@ class GraphFilter(NewestMarginals):
         self._posterior: BlockGaussian | None = None  # until the graph changes
 
     def __copy__(self) -> GraphFilter:
-        twin = GraphFilter(self.providers, self._lag)
+        twin = GraphFilter(self.providers, self._lag, self._relinearised)
         twin.__dict__ |= self.__dict__
         twin._smoother = self._smoother.handed_over()
         return twin
@@ -140,7 +143,7 @@ class GraphFilter(NewestMarginals):
         smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in standing], change)
         self._keys = keys
         self._beside += self._beside_now()
-        if not self.providers:  # nobody is to be asked for factors on the epoch before
+        if not self._relinearised:  # nobody is to be asked for factors on the epoch before
             smoother.forget(keys.values())
 
     def update(self, measurements: Measurements | Observations) -> float:

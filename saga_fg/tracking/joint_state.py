@@ -43,12 +43,17 @@ class Kinematics(NamedTuple):
 TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | GraphFilter
 
 
-def new_estimator(name: EstimatorName, lag: float, providers: Sequence[FactorProvider] = ()) -> TrackEstimator:
-    """A fresh estimator; `lag` (s) is the fixed-lag smoother's; with `providers`, iSAM2 and it are a running graph."""
+def new_estimator(
+    name: EstimatorName, lag: float, providers: Sequence[FactorProvider] = (), nonlinear: bool = False
+) -> TrackEstimator:
+    """A fresh estimator; `lag` (s) is the fixed-lag smoother's.
+
+    With `providers`, or where objects move nonlinearly, iSAM2 and the smoother are a running graph.
+    """
     if name == "kalman":
         return JointKalmanFilter(providers)
-    if providers:
-        return GraphFilter(providers, lag if name == "fixed-lag" else 0.0)
+    if providers or nonlinear:
+        return GraphFilter(providers, lag if name == "fixed-lag" else 0.0, relinearised=True)
     return FixedLagSmoother(lag) if name == "fixed-lag" else IncrementalFilter()
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import get_args
 
 from saga_fg.by_class import DEFAULT, class_settings
 from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_rules import Following, Neighbours, Repulsion
+from saga_fg.edge_rules import EdgeRule, Following, Neighbours, Repulsion
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.modes import Mixture
-from saga_fg.node import ConstantAcceleration, ConstantVelocity, RandomWalk
+from saga_fg.node import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
+from saga_fg.nonlinear_interactions import AccelerationLaw
 from saga_fg.rigid_coupling import Attached
 from saga_fg.road import RoadMap, SignalSettings
 from saga_fg.road.cones import ConeEdge
@@ -231,6 +232,11 @@ class TrackerSettings:
     max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
     max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
     report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
+
+    def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
+        """Whether any class moves nonlinearly, or any of the edge rules acts so."""
+        moving = any(isinstance(one.motion, NonlinearMotion) for one in self.classes.values())
+        return moving or any(isinstance(rule.interaction, AccelerationLaw) for rule in rules)
 
     def __post_init__(self) -> None:
         require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting", "score_memory")

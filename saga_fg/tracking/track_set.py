@@ -360,7 +360,9 @@ class TrackSet:
     def forget(self) -> None:
         """Begin without tracks and road; ids go on."""
         self._state = JointTrackState(
-            new_estimator(self.settings.estimator, self.settings.lag, self.providers),
+            new_estimator(
+                self.settings.estimator, self.settings.lag, self.providers, self.settings.nonlinear(self.rules)
+            ),
             lambda label: motion_of(self.settings, label),
         )
         self._tables = TrackTables.empty(self.settings, len(self._groups))

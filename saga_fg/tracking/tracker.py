@@ -44,9 +44,9 @@ class Tracker:
     providers add factors of your own to the running graph of the tracks, once a frame (`saga_fg.graph`)
 
     A frame older than the newest one by up to `max_delay` is used: the fixed-lag estimator puts its measurements where
-    they belong, a filter, and with `providers` any estimator, moves them to the present along the objects' own motion.
-    An older one is left out and counted
-    in `late_frames`; so is, uncounted, one from another time until a second one confirms that the clock was set.
+    they belong, a filter moves them to the present along the objects' own motion, and so does any estimator with
+    `providers` or where objects move nonlinearly. An older one is left out and counted in `late_frames`; so is,
+    uncounted, one from another time until a second one confirms that the clock was set.
     `time_verdict` tells of the latest frame (see `saga_fg.tracking.clock`).
 
     A tracker can be pickled and copied; its copies have no observer.
@@ -165,7 +165,7 @@ class Tracker:
         settings = self.settings
         if settings.ego is not None and settings.ego.estimated:
             return 0.0  # nobody knows where the vehicle was
-        whole = settings.estimator == "fixed-lag" and not self.providers
+        whole = settings.estimator == "fixed-lag" and not (self.providers or settings.nonlinear(self.rules))
         return max(settings.max_delay, settings.lag) if whole else settings.max_delay
 
     def _step(self, frame: Frame, tracks: TrackSet) -> Tracks:

@@ -45,6 +45,17 @@ def test_a_hidden_car_goes_on_turning(estimator, motion):
     assert errors[0] > 2.0
 
 
+@pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
+def test_nonlinear_motion_is_linearised_again_where_measurements_put_it(estimator):
+    angle = 0.8 * np.arange(40) * 0.1
+    path = 12.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    for motion, again in (("coordinated_turn", True), ("constant_velocity", False)):
+        one, other = (tracked(tracker(n, motion=motion), "car", path, 40)[0].position for n in ("kalman", estimator))
+        apart = np.abs(np.subtract(one, other)).max()
+        assert apart < 0.1
+        assert (apart > 1e-6) == again
+
+
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_a_hidden_pedestrian_does_not_walk_through_a_wall(estimator):
     wall = "road_map: {walls: [{name: house, points: [[-9, 4], [9, 4]]}], deviation: 0.05}\n"
