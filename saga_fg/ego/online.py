@@ -130,7 +130,7 @@ class OnlineEstimator:
 
     def _judged(self, moments: list[EgoMoment], path: FloatArray) -> list[FloatArray]:
         """For each moment the probabilities that its objects stand, along a path (n, 4, 4)."""
-        return standing_probabilities(moments, path, self._slow, self._settings)
+        return standing_probabilities(moments, path, self._slow, self._settings, online=True)
 
     def _slide(self, solution: GraphSolution) -> JointEstimate | None:
         """Let moments leave that are older than the lag; returns their estimate."""

@@ -37,6 +37,9 @@ class JointSettings:
     odometry: OdometryNoise = settings_group(OdometryNoise, "how good the odometry is")
     start_noise: float = setting(1e-3, "standard deviation of the first pose, m and rad")
     standing_window: float = setting(3.0, "time over which an object is judged to stand or to move, s")
+    online_standing_share: float = setting(
+        0.1, "share of objects expected to stand, online, where queues that creep look parked for a while"
+    )
     moving_speed: Mapping[str, float] = field(
         default_factory=lambda: {DEFAULT: 5.0, "pedestrian": 1.0},
         metadata={"comment": "deviation of a velocity component of objects that move, by class, m/s"},
@@ -63,6 +66,7 @@ class JointSettings:
             )
         require_positive(self, "outlier_scale", infinite=True)
         require_between(self, 0, math.inf, "keyframe_period")
+        require_between(self, 1e-6, 1 - 1e-6, "online_standing_share")
         for name in ("rounds", "max_iterations"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected a whole number of at least 1, got {getattr(self, name)!r}")

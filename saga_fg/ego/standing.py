@@ -8,12 +8,15 @@ has D ~ N(0, S): noise of the detections and of the odometry over the T seconds 
 
 where shift and turn are the variances that the increments in between add up to in translation and in heading; scale,
 bias and course the odometry's deviations as known so far. One that moves has D ~ N(0, S + (u T)^2), with the speed u
-usual for its class (`moving_speed`). By Bayes, with even odds before,
+usual for its class (`moving_speed`). By Bayes, with a share q of objects that stand, one half in a whole recording,
 
-    P(stands | D) = N(D; 0, S) / (N(D; 0, S) + N(D; 0, S + (u T)^2))
+    P(stands | D) = q N(D; 0, S) / (q N(D; 0, S) + (1 - q) N(D; 0, S + (u T)^2))
 
 The odds weigh the time by themselves: where T is short, S and S + (u T)^2 are nearly the same, and P about one half. So
 they do the speed: who walks far away is not taken for a car that stands.
+
+Online the window ends now, T is short, and queues that creep look parked: q is `online_standing_share`, and the last
+term of S, errors of the heading, counts across the line of sight only.
 """
 
 from __future__ import annotations
@@ -47,6 +50,7 @@ class SlowErrors:
 class _Sightings:
     """All detections, by object and time: object, moment, time (N,), place (N, 2), variance, range, speed u (N,).
 
+    sight (N, 2): the place less the vehicle's, m
     drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first moment on
     """
 
@@ -54,6 +58,7 @@ class _Sightings:
     moment: IntArray
     time: FloatArray
     place: FloatArray
+    sight: FloatArray
     variance: FloatArray
     range: FloatArray
     speed: FloatArray
@@ -61,14 +66,14 @@ class _Sightings:
 
 
 def standing_probabilities(
-    record: list[EgoMoment], path: FloatArray, slow: SlowErrors, settings: JointSettings
+    record: list[EgoMoment], path: FloatArray, slow: SlowErrors, settings: JointSettings, online: bool = False
 ) -> list[FloatArray]:
     """For each moment the probabilities (n,) that its objects stand; path (K, 4, 4) assumed so far.
 
     0 where too little was seen to tell. Between two detections it is the smaller one of theirs.
     """
     seen = _sightings(record, path, settings)
-    p = _probabilities(seen, slow, settings)
+    p = _probabilities(seen, slow, settings, online)
     result = [np.zeros(len(moment.objects.id)) for moment in record]
     if not len(p):
         return result
@@ -84,7 +89,7 @@ def standing_probabilities(
     return result
 
 
-def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings) -> FloatArray:
+def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings, online: bool) -> FloatArray:
     """P(stands) (N,) of the object of each detection, around it."""
     n = len(seen.object)
     if n == 0:
@@ -112,15 +117,15 @@ def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings) 
     between = half(columns, middle, high) - half(columns, low, middle)
     D, (T, s, shift, turn) = between[:, :2], between[:, 2:].T
     S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
-    S = (
-        S
-        + shift
-        + (slow.scale**2 + slow.course**2) * s**2
-        + half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
-    )
+    S = S + shift + (slow.scale**2 + slow.course**2) * s**2
+    turned = half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
+    sight = half(seen.sight, low, high)
+    along = (D * sight).sum(axis=1) ** 2 / np.maximum((sight**2).sum(axis=1), 1e-9)
+    d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across
+    S = np.stack([S if online else S + turned, S + turned])
     M = S + (seen.speed * T) ** 2
-    d2 = (D**2).sum(axis=1)
-    odds = np.log(M / S) - d2 / 2 * (1 / S - 1 / M)  # log, two dimensions
+    q = settings.online_standing_share if online else 0.5
+    odds = np.log(q / (1 - q)) + (np.log(M / S) - d2 * (1 / S - 1 / M)).sum(axis=0) / 2  # log
     p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
     return np.where(n1 > 0, p, 0.0)
 
@@ -130,6 +135,7 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
     names = np.concatenate([moment.seen.id for moment in record])
     order = np.lexsort((moments, names))
     place = [transform_points(pose, moment.seen.z)[:, :2] for moment, pose in zip(record, path, strict=True)]
+    sight = [one - pose[:2, 3] for one, pose in zip(place, path, strict=True)]
     variance = np.concatenate([np.trace(moment.seen.R, axis1=1, axis2=2) / 2 for moment in record])
     distance = np.concatenate([np.hypot(moment.seen.z[:, 0], moment.seen.z[:, 1]) for moment in record])
     label = np.concatenate(
@@ -147,6 +153,7 @@ def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSetting
         moments[order],
         time[order],
         np.concatenate(place)[order],
+        np.concatenate(sight)[order],
         variance[order],
         distance[order],
         class_numbers(settings.moving_speed, float, label)[order],

@@ -109,6 +109,26 @@ def test_who_walks_far_away_does_not_stand():
     assert says["pedestrian"] < 0.6
 
 
+def test_a_queue_that_creeps_does_not_pass_for_parked_online():
+    """Ahead, far off, seen for less than a second: a turn of the vehicle explains no motion along the line of sight."""
+    t = 0.2 * np.arange(5)
+    poses = np.stack([yaw_transform(5.0 * s) for s in t])
+    frames = []
+    for time, pose in zip(t, poses, strict=True):
+        ahead = Boxes.of(["car", "car"], [[45.0 + 1.2 * time, 0.0, 1.0], [8.0, 6.0, 1.0]])
+        detections = Detections(ahead.transformed(inverse_transform(pose)), np.full(2, 0.9))
+        frames.append(Frame(time, "lidar", detections, np.eye(4), "ego"))
+    record, settings = register(frames, poses, Odometry.of(t, poses), new_tracker()), JointSettings(POOR)
+    slow = SlowErrors.at_start(settings)
+    batch, online = (standing_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
+    creeps, parked = [int(np.argmin(abs(record[-1].seen.z[:, 1] - y))) for y in (0.0, 6.0)]
+    assert batch[creeps] > 0.9
+    assert online[creeps] < 0.5
+    assert online[parked] > 0.8
+    with pytest.raises(InputError, match="online_standing_share: expected a number from"):
+        JointSettings(online_standing_share=1.0)
+
+
 def test_nothing_is_said_of_an_object_seen_once():
     frames, odometry, poses, _ = drive(n=1)
     record = register(frames, poses, odometry, new_tracker())
