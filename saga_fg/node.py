@@ -40,11 +40,10 @@ class Motion(Protocol):
 
 @runtime_checkable
 class NonlinearMotion(Motion, Protocol):
-    """Own motion x(t + dt) = flow(x(t), dt) + q; both functions take stacks of states (..., d)."""
+    """Own motion x(t + dt) = flow(x(t), dt) + q; both functions take stacks of states (..., d).
 
-    @property
-    def initial_deviation(self) -> FloatArray:
-        """(d,) standard deviations of components that nothing is known of."""
+    Any motion may have an `initial_deviation` (d,) as well: of components that nothing is known of, 1 by default.
+    """
 
     def flow(self, x: FloatArray, dt: float) -> FloatArray: ...
 
