@@ -81,7 +81,7 @@ def test_providers_have_settings_of_their_own() -> None:
         ('{kind: "saga_fg.providers:Gps", deviation: far}', r"providers\[0\].deviation: expected a number, got"),
         ('{kind: "saga_fg.providers:Odometry", start: {place: [0, 0]}}', r"start.place: expected a list of 3"),
         ("{deviation: 1}", r"providers\[0\].kind: expected MODULE:NAME, got nothing"),
-        ('{kind: "math:sqrt"}', r"providers\[0\].kind: math:sqrt: expected a dataclass of settings"),
+        ('{kind: "math:sqrt"}', r"providers\[0\].kind: math:sqrt: expected a dataclass"),
         ('{kind: "no_such_module:X"}', r"providers\[0\].kind: .*expected a module that can be imported"),
         ("3", r"providers\[0\]: expected a section \(key: value\), got 3"),
     ],
