@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import typer
-
 from benchmarks.commands.association import association
 from benchmarks.commands.bounded import bounded
 from benchmarks.commands.coasting import coasting
@@ -18,16 +16,9 @@ from benchmarks.commands.scaling import scaling
 from benchmarks.commands.smoothing import smoothing
 from benchmarks.commands.streaming import streaming
 from benchmarks.commands.synthetic import synthetic
-from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.reporting import new_command
 
-app = typer.Typer(
-    cls=ReportingGroup,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = new_command()
 
 for command in (
     association,

@@ -32,7 +32,7 @@ Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 
 
 class RobustLoss(Protocol):
-    """What factors ask of a loss: `Robust` is one."""
+    """A robust loss as factors use it; `Robust` is one."""
 
     def cost(self, distance: ArrayLike) -> FloatArray: ...
     def weight(self, distance: ArrayLike) -> FloatArray: ...

@@ -13,14 +13,14 @@ from saga_fg.ego_measurements import EgoMeasurements, GpsFix, OdometryIncrement
 
 @dataclass(frozen=True, eq=False)
 class EgoColumns:
-    """Of N rows: odometry (N, 4) x, y, yaw and the time they took, gps (N, 3), NaN where nothing was measured."""
+    """Odometry (N, 4), x, y, yaw and the time they took, and gps (N, 3) of N rows; NaN where nothing was measured."""
 
     odometry: FloatArray
     gps: FloatArray
 
     @classmethod
     def of(cls, raw: RawTable) -> EgoColumns | None:
-        """Those of a table, None where it has none. Raises `InputError` for a row with a part of them."""
+        """Read those of a table, None where it has none. Raises `InputError` for a row with a part of them."""
         columns = []
         for names, least in ((ODOMETRY, 4), (GPS, 2)):
             values = np.stack([raw.numbers(name) for name in names], axis=-1)
@@ -40,7 +40,7 @@ class EgoColumns:
         return cls(*columns) if any(np.isfinite(values).any() for values in columns) else None
 
     def measured(self, rows: IntArray) -> EgoMeasurements:
-        """What a frame's rows say; the first of them that does counts."""
+        """Return what the rows of a frame measured, by the first of them that did."""
         odometry, gps = (_first(column[rows]) for column in (self.odometry, self.gps))
         fix = None if gps is None else GpsFix(gps[np.isfinite(gps)])
         return EgoMeasurements(None if odometry is None else _increment(*odometry.tolist()), fix)

@@ -13,7 +13,7 @@ from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.explain import explain
 from pipelines.cli.learn import learn_app
 from pipelines.cli.report import report_app
-from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.reporting import new_command
 from pipelines.cli.serve import serve, status
 from pipelines.cli.simulate import simulate
 from pipelines.cli.slam import slam_app
@@ -22,14 +22,7 @@ from pipelines.cli.track import track_app
 from pipelines.cli.view import view_app
 from saga_fg import __version__
 
-app = typer.Typer(
-    cls=ReportingGroup,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = new_command()
 app.add_typer(track_app, name="track")
 app.add_typer(smooth_app, name="smooth")
 app.add_typer(evaluate_app, name="evaluate")

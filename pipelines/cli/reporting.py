@@ -56,6 +56,18 @@ class ReportingGroup(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
 
 
+def new_command() -> typer.Typer:
+    """A command of its own, whose sub-commands are to be added."""
+    return typer.Typer(
+        cls=ReportingGroup,
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+
 class _ConsoleHandler(logging.Handler):
     """Log lines above the progress bar, as they are: neither wrapped nor coloured."""
 

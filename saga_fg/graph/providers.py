@@ -156,7 +156,11 @@ def beginnings(providers: Iterable[FactorProvider]) -> list[FactorProvider]:
 
 
 def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:
-    """Add what a provider gives. Raises `GraphError` that names it, and may then have added some of it."""
+    """Add what a provider gives.
+
+    Raises `ProviderError` that names it, `GraphError` for one of an estimator's own (`internal`); some of it may have
+    been added then.
+    """
     name = _name(provider)
     try:
         _ask(name, provider, graph, view)

@@ -18,7 +18,7 @@ from saga_fg.frame import Frame
 from saga_fg.geometry import yaw_of
 from saga_fg.interactions import NodeTable
 from saga_fg.tracking.box_filter import MOVING
-from saga_fg.tracking.ego_pose import Sightings
+from saga_fg.tracking.ego_pose import RelativePositions
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
@@ -59,11 +59,11 @@ class EgoNode:
             raise InputError("ego.estimated: expected a provider that adds the vehicle's pose (saga_fg.providers)")
         return replace(frame, world_T_ego=world_T_ego)
 
-    def sightings(self, frame: Frame, observed: Observed) -> Sightings | None:
+    def sightings(self, frame: Frame, observed: Observed) -> RelativePositions | None:
         """What was observed, in the frame of the vehicle whose pose is estimated; None for what is not seen from it."""
         if not self._estimated or frame.coordinates == "world" or frame.world_T_ego is None:
             return None
-        return Sightings.of(frame.world_T_ego, observed.boxes.position, observed.R[:, :2, :2])
+        return RelativePositions.of(frame.world_T_ego, observed.boxes.position, observed.R[:, :2, :2])
 
     def place(self, frame: Frame, time: float, origin: FloatArray, state: JointTrackState) -> None:
         """Take in where a frame of `time`, s, has the vehicle; `origin` (2,) of local positions."""
@@ -72,7 +72,7 @@ class EgoNode:
         pose, R, label = frame.world_T_ego, np.zeros((1, 4, 4)), np.array([self.settings.label])
         R[0, :2, :2] = self.settings.deviation**2 * np.eye(2)
         z = np.concatenate([pose[:2, 3] - origin, np.zeros(2)])[None]
-        seen = Sightings(np.zeros((1, 3)), R[:, :2, :2]) if self.settings.estimated else None
+        seen = RelativePositions(np.zeros((1, 3)), R[:, :2, :2]) if self.settings.estimated else None
         if self.present:
             state.update(_ID, label, z, R, np.zeros(1, dtype=bool), 0.0, seen)
         else:

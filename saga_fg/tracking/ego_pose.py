@@ -8,13 +8,14 @@ detection is compared with the covariance of r, and not with that of p.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from factors import relative_detection_factors
 from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.columns import Columns
 from saga_fg.estimators import GraphFilter
 from saga_fg.geometry import inverse_transform, transform_points, yaw_transform
 from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
@@ -22,19 +23,16 @@ from saga_fg.interactions import POSITION
 from saga_fg.node import NodeType
 
 
-class Sightings(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class RelativePositions(Columns):
     """m places (m, 3) in the vehicle's frame, m, with covariances (m, 2, 2) in its axes, m^2."""
 
     z: FloatArray
     R: FloatArray
 
-    def select(self, rows: IntArray) -> Sightings:
-        """Some of them."""
-        return Sightings(self.z[rows], self.R[rows])
-
     @classmethod
-    def of(cls, world_T_ego: FloatArray, position: FloatArray, R: FloatArray) -> Sightings:
-        """Of places (m, 3) and covariances (m, 2, 2) in the world, where a pose has put them."""
+    def of(cls, world_T_ego: FloatArray, position: FloatArray, R: FloatArray) -> RelativePositions:
+        """Return places (m, 3) and covariances (m, 2, 2) in the world as they are in the frame of a pose."""
         turn = world_T_ego[:2, :2]
         return cls(transform_points(inverse_transform(world_T_ego), position), turn.T @ R @ turn)
 

@@ -24,7 +24,7 @@ from saga_fg.node import Motion, NodeType
 from saga_fg.pairwise_costs import CrossCovariances
 from saga_fg.providers import RelativeDetections
 from saga_fg.scene_graph import SceneGraph
-from saga_fg.tracking.ego_pose import Sightings, local_pose, relative_covariances
+from saga_fg.tracking.ego_pose import RelativePositions, local_pose, relative_covariances
 from saga_fg.tracking.names import EstimatorName
 
 _ANYWHERE = 1e5  # m
@@ -87,7 +87,7 @@ class JointTrackState:
         label: StrArray,
         now: Kinematics,
         delay: float = 0.0,
-        seen: Sightings | None = None,
+        seen: RelativePositions | None = None,
     ) -> None:
         """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0.
 
@@ -146,7 +146,7 @@ class JointTrackState:
         R: FloatArray,
         with_velocity: BoolArray,
         delay: float,
-        seen: Sightings | None = None,
+        seen: RelativePositions | None = None,
     ) -> None:
         """Take in one measurement each of some tracks, made `delay` s ago; of positions by `seen`, where it is given.
 
@@ -166,7 +166,7 @@ class JointTrackState:
                 H = np.broadcast_to(node_type.selector(names), (len(rows), len(names), node_type.dim))
                 self._measure(node_type, ids[rows], z[rows, k], H, R[rows, k, k], delay)
 
-    def _see(self, ids: IntArray, label: StrArray, seen: Sightings) -> None:
+    def _see(self, ids: IntArray, label: StrArray, seen: RelativePositions) -> None:
         """Take in sightings from the vehicle."""
         estimator = self._changed()
         assert isinstance(estimator, GraphFilter)
@@ -295,6 +295,11 @@ class JointTrackState:
         """Continue from a snapshot."""
         state, self._born, self._modes = snapshot
         self._changed().restore(state)
+
+    @property
+    def window(self) -> float:
+        """How far back a late measurement is put where it belongs, s; 0 where it is moved to the present."""
+        return self._estimator.lag if isinstance(self._estimator, FixedLagSmoother) else 0.0
 
     def copied(self) -> JointTrackState:
         """A state that goes its own way from here."""

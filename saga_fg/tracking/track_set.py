@@ -31,7 +31,7 @@ from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.class_belief import ClassEvidence, ClassGroups
 from saga_fg.tracking.columns import TrackColumns
-from saga_fg.tracking.ego_pose import Sightings
+from saga_fg.tracking.ego_pose import RelativePositions
 from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics, new_estimator
 from saga_fg.tracking.limits import trackable
@@ -75,6 +75,11 @@ class TrackSet:
 
     def __len__(self) -> int:
         return len(self._columns.id)
+
+    @property
+    def window(self) -> float:
+        """How far back a late measurement is put where it belongs, s."""
+        return self._state.window
 
     @property
     def running_graph(self) -> SceneFactorGraph:
@@ -178,7 +183,7 @@ class TrackSet:
         return np.concatenate([self._tables.standing.noise_scale(settings), np.ones(others)])
 
     def _associate(
-        self, observed: Observed, sensor: Sensor, delay: float, said: FloatArray, seen: Sightings | None
+        self, observed: Observed, sensor: Sensor, delay: float, said: FloatArray, seen: RelativePositions | None
     ) -> Matching:
         """Register what was observed to the prediction, as of `delay` s ago; said (m, C) of classes."""
         columns = self._columns
@@ -208,7 +213,7 @@ class TrackSet:
             self._tables.belief[t] = self._groups.updated(self._tables.belief[t], said[matching.detection])
             self._columns.label = self._groups.labels(self._tables.belief, self._columns.label)
 
-    def _update(self, observed: Observed, matching: Matching, delay: float, seen: Sightings | None) -> None:
+    def _update(self, observed: Observed, matching: Matching, delay: float, seen: RelativePositions | None) -> None:
         columns, boxes = self._columns, observed.boxes
         t, d = matching.track, matching.detection
         z = np.concatenate([boxes.position[d, :2] - self._origin, boxes.velocity[d]], axis=1)
@@ -296,7 +301,7 @@ class TrackSet:
         accepted: bool,
         delay: float,
         said: FloatArray,
-        sightings: Sightings | None,
+        sightings: RelativePositions | None,
     ) -> IntArray:
         """New tracks, at the end, from the detections returned, which no track explains.
 

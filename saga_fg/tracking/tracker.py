@@ -165,8 +165,7 @@ class Tracker:
         settings = self.settings
         if settings.ego is not None and settings.ego.estimated:
             return 0.0  # nobody knows where the vehicle was
-        whole = settings.estimator == "fixed-lag" and not (self.providers or settings.nonlinear(self.rules))
-        return max(settings.max_delay, settings.lag) if whole else settings.max_delay
+        return max(settings.max_delay, self._tracks.window)
 
     def _step(self, frame: Frame, tracks: TrackSet) -> Tracks:
         """Take a frame in, into these tracks, or leave everything as it was."""
