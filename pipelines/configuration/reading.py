@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import yaml
 
-from data_tools.input_files import read_text
+from data_tools.files.input_files import read_text
 from pipelines.configuration.schema import (
     Choice,
     Imported,

@@ -15,8 +15,8 @@ import numpy as np
 
 from pipelines.view.drawing import Arrows, Cubes, Drawing, Ellipses, Lines, Marks, Points, Pose
 from pipelines.view.foxglove_schemas import FRAME_TRANSFORMS, POINT_CLOUD, SCENE_UPDATE
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.geometry import rotation_quaternion, yaw_quaternion
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import rotation_quaternion, yaw_quaternion
 
 FLAT = 0.04  # height of an ellipse, m
 SEE_THROUGH = 0.4  # opacity of what has an inside

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 
-from data_tools.atomic_files import atomic_file
+from data_tools.files.atomic_files import atomic_file
 from pipelines.view.drawing import Drawing
 from pipelines.view.foxglove_messages import foxglove_message, nanoseconds
 from pipelines.view.foxglove_schemas import SCHEMAS

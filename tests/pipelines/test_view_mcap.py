@@ -24,8 +24,8 @@ from pipelines.tracking import track_scene
 from pipelines.view import Drawing, SceneView, draw_scene, in_order, write_view
 from pipelines.view.foxglove_schemas import SCHEMAS
 from saga_fg import InputError
-from saga_fg.arrays import FloatArray
-from saga_fg.geometry import yaw_transform
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_transform
 
 ROOT = "/scene-0001"
 
