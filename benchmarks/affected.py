@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_tools.simulator.world import World
-from saga_fg.arrays import BoolArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, StrArray
 
 MOVING = 0.5  # m/s
 REACH = 100.0  # m before a stop line

@@ -14,8 +14,8 @@ from data_tools.metrics import scene_metrics
 from pipelines.observers import StageClock
 from pipelines.process import one_thread
 from pipelines.tracking import Progress
-from saga_fg.track import Tracks
 from saga_fg.tracking import AssociationName
+from saga_fg.types.track import Tracks
 
 METHODS: tuple[AssociationName, ...] = ("hungarian", "greedy", "graph")
 BASELINE = METHODS[0]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_tools.metrics.bootstrap import Interval
-from saga_fg.arrays import FloatArray, IntArray, checked, checked_rows
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_rows
 
 Average = Literal["median", "mean"]
 

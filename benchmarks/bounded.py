@@ -12,8 +12,8 @@ import numpy as np
 from pipelines.bench.flocks import NEIGHBOURS, Flock, Frame, flock
 from pipelines.bench.measuring import timed
 from pipelines.process import one_thread
-from saga_fg.arrays import FloatArray
 from saga_fg.estimators import BoundedKalmanFilter, Estimator, JointKalmanFilter
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import require_between, setting
 
 

@@ -27,8 +27,6 @@ from benchmarks.block_bootstrap import Average, relative_change_of_errors
 from data_tools.metrics import Interval
 from pipelines.figures import FigureTable, cell
 from pipelines.tracking import Progress
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.edge_rules import EdgeRule
 from saga_fg.errors import InputError
 from saga_fg.learning import (
     FittedInteractions,
@@ -45,6 +43,8 @@ from saga_fg.learning import (
     gap_ends,
     sample_gaps,
 )
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 
 CLASSES = {
     "kitti": ("car",),

@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscenes_tracking_metrics
-from data_tools.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
 from pipelines.config import load_config
 from pipelines.process import one_thread

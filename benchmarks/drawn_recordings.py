@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import BatchSmoother, Measurements
-from saga_fg.node import ConstantVelocity, NodeType
-from saga_fg.scene_graph import Edges, SceneGraph
-from saga_fg.transition import Transition
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.scene_graph import Edges, SceneGraph
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray
 
 GROUP = 3  # objects that act on each other
 GROUPS_AT_A_TIME = 50

@@ -13,19 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.config import TrackConfig
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.by_class import DEFAULT
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.discretisation import discretise
-from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_rules import Following, Neighbours, build_graph
-from saga_fg.frame import Detections, Frame
-from saga_fg.interactions import NodeTable, SharedVelocity
-from saga_fg.node import ConstantVelocity, NodeType
-from saga_fg.sensor import NoiseModel, Sensor
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_network import EdgeNetwork
+from saga_fg.model.edge_rules import Following, Neighbours, build_graph
+from saga_fg.model.interactions import NodeTable, SharedVelocity
+from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, TrackerSettings
-from saga_fg.transition import Transition
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.sensor import NoiseModel, Sensor
 
 LABEL = "car"
 SIZE = (4.5, 1.9, 1.6)

@@ -16,10 +16,10 @@ from benchmarks.predictions import own_tracks
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import World
 from pipelines.tracking import OnlineTracker
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Frame
-from saga_fg.interactions import unit
-from saga_fg.track import Tracks
+from saga_fg.model.interactions import unit
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Frame
+from saga_fg.types.track import Tracks
 
 PRESENT = 0.5  # s after the latest frame, up to which tracks are of the present and not predictions
 

@@ -16,7 +16,7 @@ from data_tools.simulator.fleet import KINDS, Fleet
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.traffic import Traffic
 from data_tools.simulator.world import World
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 def foreseen(

@@ -26,11 +26,11 @@ from data_tools.simulator import SensorSettings, SimulatorSettings, simulate_sce
 from pipelines.bench.drawn_differences import FiguresOf, drawn_differences
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.arrays import BoolArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.dataset import Scene
-from saga_fg.sensor import NoiseModel, ScoreCalibration, Sensor, sensor_model
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import BoolArray
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.dataset import Scene
+from saga_fg.types.sensor import NoiseModel, ScoreCalibration, Sensor, sensor_model
+from saga_fg.types.track import Tracks
 
 DRAWS = 100  # of scenes, for the intervals
 BOTH, WITH_POOR, POOR = "both", "both and a poor one", "poor"

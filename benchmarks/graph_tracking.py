@@ -25,7 +25,7 @@ import scipy.sparse
 
 from pipelines.bench.contenders import dense
 from pipelines.bench.flocks import Flock, Frame
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 D = 4  # size of a node's state, and of an edge's
 

@@ -36,8 +36,8 @@ from data_tools.simulator.world import build_world
 from pipelines.config import TrackConfig, load_config
 from pipelines.figures import FigureTable, cell
 from pipelines.tracking import OnlineTracker, Progress
-from saga_fg.arrays import FloatArray
-from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.numerics.arrays import FloatArray
 
 HORIZON = 2.0  # s
 FIRST, EVERY = 2.0, 0.5  # s: the first question, and from one to the next

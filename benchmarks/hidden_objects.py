@@ -17,9 +17,9 @@ from data_tools.simulator import SimulatedTraffic
 from pipelines.process import one_thread
 from pipelines.smoothing import SmoothConfig, smooth_known_objects
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.dataset import Scene
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import Evidence, StateTable, attribute, gather_evidence
+from saga_fg.types.dataset import Scene
 
 NEAR = 2.0  # largest distance between a detection and its true object, m
 SPREAD = 0.3  # of a detection about its true object, besides the sensor's noise, m

@@ -17,9 +17,9 @@ from benchmarks.predictions import FOLLOWED, Asked, fed, in_view, moving, own_tr
 from data_tools.simulator.world import World
 from pipelines.process import one_thread
 from pipelines.tracking import OnlineTracker
-from saga_fg.arrays import StrArray
-from saga_fg.dataset import Scene
-from saga_fg.frame import Frame
+from saga_fg.numerics.arrays import StrArray
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
 
 HIDDEN = 2.0  # s
 EVERY = 3.5  # s from one time of hiding to the next

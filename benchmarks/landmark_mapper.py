@@ -12,7 +12,9 @@ import time
 import gtsam
 import numpy as np
 
-from saga_fg.landmarks import LandmarkMapper, Observation, PoleLandmark
+from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.slam.mapping import LandmarkMapper
+from saga_fg.types.landmark import Observation
 
 REACH, GAP = 25.0, 3.3  # m; between poles
 Q = np.diag([0.0005, 0.0005, 0.001, 0.02, 0.01, 0.01]) ** 2

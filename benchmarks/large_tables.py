@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_tools.atomic_files import atomic_directory, atomic_file
-from data_tools.nuscenes import CATEGORY_TO_TRACKING_CLASS
+from data_tools.datasets.nuscenes import CATEGORY_TO_TRACKING_CLASS
+from data_tools.files.atomic_files import atomic_directory, atomic_file
 from saga_fg.settings import require_between, setting
 
 VERSION = "v1.0-trainval"

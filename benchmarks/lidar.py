@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from data_tools.kitti import KittiObjects, KittiScans, KittiTracking, read_kitti_labels
+from data_tools.datasets.kitti import KittiObjects, KittiScans, KittiTracking, read_kitti_labels
 from data_tools.lidar import (
     Ground,
     Plane,
@@ -34,9 +34,9 @@ from pipelines.config import load_config
 from pipelines.detector_free import cluster_scene
 from pipelines.process import one_thread
 from pipelines.tracking import Progress, track_scene
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.types.boxes import Boxes
 
 CARS = ("car", "van")
 MATCHED = 2.0  # m

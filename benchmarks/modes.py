@@ -2,9 +2,9 @@
 
 Up to three nodes that stand or go straight share their velocities; positions are measured. Drawn from the model, and
 filtered by full enumeration (a Kalman filter for every sequence of modes of all nodes, which is exact) and by
-`saga_fg.modes`. Printed, over all frames and scenes: root mean square of the difference between the two means in units
-of the exact standard deviation, mean difference of the probabilities that a node stands, and errors of the velocity
-against the truth of both and of constant velocity alone, as a ratio to enumeration.
+`saga_fg.model.modes`. Printed, over all frames and scenes: root mean square of the difference between the two means in
+units of the exact standard deviation, mean difference of the probabilities that a node stands, and errors of the
+velocity against the truth of both and of constant velocity alone, as a ratio to enumeration.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
-from saga_fg.arrays import FloatArray
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import JointKalmanFilter, Measurements
-from saga_fg.modes import Mixture, ModeTable, Stationary, mode_dynamics
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.modes import Mixture, ModeTable, Stationary, mode_dynamics
+from saga_fg.numerics.arrays import FloatArray
 
 FRAMES = {1: 10, 2: 6, 3: 4}  # by number of nodes: 1024 to 4096 sequences
 DT, NOISE = 0.5, 0.3

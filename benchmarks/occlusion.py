@@ -19,8 +19,8 @@ from data_tools.sightings import sightings
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.dataset import Annotations
 from saga_fg.learning import Sightings, fit_acceleration_noise_by_class
+from saga_fg.types.dataset import Annotations
 
 METHODS: tuple[Method, Method] = ("kf", "saga")
 

@@ -12,12 +12,12 @@ import numpy as np
 
 from pipelines.process import one_thread
 from pipelines.tracking import OnlineTracker
-from saga_fg.arrays import IntArray, StrArray
-from saga_fg.association import assign
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.frame import Frame
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import IntArray, StrArray
+from saga_fg.numerics.assignment import assign
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Frame
+from saga_fg.types.track import Tracks
 
 MOVING = 0.5  # m/s
 FOLLOWED = 1.5  # s in view before a question: sooner, nobody knows a velocity

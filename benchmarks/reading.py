@@ -11,7 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks.large_tables import VERSION
-from data_tools.nuscenes import NuScenes
+from data_tools.datasets.nuscenes import NuScenes
 
 
 @dataclass(frozen=True)

@@ -16,17 +16,17 @@ import numpy as np
 
 from benchmarks.graph_tracking import JointGraphTracking, SeparateGraphTracking
 from benchmarks.scaling_plot import scaling_plot
-from data_tools.atomic_files import write_bytes
+from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import png
 from pipelines.bench.contenders import Filter, Ours
 from pipelines.bench.flocks import DT, Flock, Frame, flock
 from pipelines.bench.measuring import timed
 from pipelines.process import one_thread
 from pipelines.tracking import Progress
-from saga_fg.arrays import BoolArray
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import JointKalmanFilter, Measurements
-from saga_fg.scene_graph import SceneGraph
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray
 
 NODES, JOINT, SEPARATE, APART = "nodes", "nodes and edges", "nodes and edges, each apart", "independent"
 CONTENDERS: Mapping[str, Callable[[Flock], Filter]] = {

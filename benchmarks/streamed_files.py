@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.streaming import PLATOON, StreamingBenchSettings, traffic
-from data_tools.detection_files import read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
 from pipelines.process import one_thread, resident_memory
 from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
 from saga_fg.smoothing import Labels

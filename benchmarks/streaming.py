@@ -17,11 +17,11 @@ import numpy as np
 
 from pipelines.process import one_thread, resident_memory
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import BatchSmoother, Measurements, Smoothed, WindowedSmoother, WindowSettings
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import require_between, require_positive, setting
-from saga_fg.transition import Transition
 
 PLATOON = 5
 CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.0))

@@ -23,11 +23,11 @@ from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootst
 from data_tools.sightings import sightings
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.arrays import FloatArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.dataset import Scene
-from saga_fg.edge_rules import Neighbours
 from saga_fg.learning import Sightings, Trajectories, fit_acceleration_noise_by_class, fit_interactions_in_view
+from saga_fg.model.edge_rules import Neighbours
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.dataset import Scene
 
 BASE = DrawnSettings()
 OCCLUDED = replace(BASE, spacing=2.5, hidden=0.4, hidden_for=3.0)

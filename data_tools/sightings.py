@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.dataset import Scene
 from saga_fg.learning import Sightings, match_to_truth
-from saga_fg.sensor import Sensor, sensor_model
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.dataset import Scene
+from saga_fg.types.sensor import Sensor, sensor_model
 
 
 def sightings(

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
 
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
-from saga_fg.arrays import FloatArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.edge_rules import EdgeRule, Following
-from saga_fg.interactions import SharedVelocity
+from saga_fg.model.edge_rules import EdgeRule, Following
+from saga_fg.model.interactions import SharedVelocity
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import ClassSettings
+from saga_fg.types.by_class import DEFAULT
 
 CARS, PERIOD, HIDDEN_FROM, BRAKING_FROM, END = 4, 0.1, 4.0, 4.2, 6.0  # s
 HIDDEN = 2  # this car, counted from the leader

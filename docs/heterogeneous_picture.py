@@ -17,11 +17,11 @@ from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import World, build_world
 from pipelines.config import TrackConfig, load_config
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
-from saga_fg.geometry import inverse_transform
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.track import Tracks
 
 HORIZON, MOMENT = 2.0, 5.0  # s: of the prediction, and when it is made
 KIND, SEED, TITLE = "red-light", 500, "before a red light"

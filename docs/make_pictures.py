@@ -21,7 +21,7 @@ from pipelines.slam.joint import run_joint
 from pipelines.slam.kitti import write_lidar_slam
 from pipelines.slam.lidar_slam import lidar_slam
 from pipelines.slam.simulated import street, write_joint
-from saga_fg.ego import JointSettings
+from saga_fg.slam.joint import JointSettings
 
 HERE = Path(__file__).parent
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from data_tools.metrics import SceneMetrics, SceneMetricSettings, scene_metrics
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, TrackedScene, track_scene
-from saga_fg.dataset import Dataset
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from pipelines.configuration import load_settings, read_settings
-from saga_fg.by_class import DEFAULT, class_settings
-from saga_fg.learned_interactions import LearnedInteractions
-from saga_fg.node import ConstantVelocity
-from saga_fg.sensor import Sensor
+from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.node import ConstantVelocity
 from saga_fg.settings import settings_group
 from saga_fg.tracking import (
     AssociationName,
@@ -24,6 +22,8 @@ from saga_fg.tracking import (
     Tracker,
     TrackerSettings,
 )
+from saga_fg.types.by_class import DEFAULT, class_settings
+from saga_fg.types.sensor import Sensor
 
 Method = Literal["saga", "kf", "centerpoint"]
 Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]

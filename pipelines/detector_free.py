@@ -7,9 +7,9 @@ import numpy as np
 from data_tools.lidar import ClusterSettings, detect_clusters
 from pipelines.scan_sequence import ScanSequence
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.frame import Frame
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Frame
 
 
 def cluster_scene(

@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from data_tools.atomic_files import atomic_file
-from data_tools.input_files import open_bytes
-from data_tools.json_stream import parsed_json
+from data_tools.files.atomic_files import atomic_file
+from data_tools.files.input_files import open_bytes
+from data_tools.files.json_stream import parsed_json
 from data_tools.plots import running_graph_picture
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker

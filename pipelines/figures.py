@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.atomic_files import write_text
+from data_tools.files.atomic_files import write_text
 
 
 @dataclass(frozen=True)

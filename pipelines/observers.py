@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import Stage, TrackerView
 
 

@@ -1,11 +1,11 @@
-"""What pipelines ask of recorded LiDAR scans; `data_tools.kitti.KittiScans` is one."""
+"""What pipelines ask of recorded LiDAR scans; `data_tools.datasets.kitti.KittiScans` is one."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 from data_tools.lidar import Scan
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 class ScanSequence(Protocol):

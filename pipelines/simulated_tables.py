@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from data_tools.atomic_files import atomic_directory, write_text
+from data_tools.files.atomic_files import atomic_directory, write_text
 from data_tools.simulator import SimulatedTraffic
 from data_tools.simulator.table_export import write_tables
 from pipelines.config import load_config

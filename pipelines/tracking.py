@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pipelines.process import one_thread
-from saga_fg.dataset import Dataset, Scene
-from saga_fg.frame import Frame
-from saga_fg.track import Tracks
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.frame import Frame
+from saga_fg.types.track import Tracks
 
 Progress = Callable[[str, int, int], None]
 """Called with the scene's name, the number of its frames done, and the number of all its frames."""

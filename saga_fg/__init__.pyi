@@ -1,12 +1,12 @@
-from .boxes import Boxes
-from .dataset import Annotations, Dataset, Scene
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
-from .frame import Detection, Detections, Frame
-from .node import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
-from .scene_graph import Edges, SceneGraph
-from .sensor import Sensor
-from .track import Track, Tracks
+from .model.node import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
+from .model.scene_graph import Edges, SceneGraph
 from .tracking import GreedyTracker, Tracker, TrackerSettings
+from .types.boxes import Boxes
+from .types.dataset import Annotations, Dataset, Scene
+from .types.frame import Detection, Detections, Frame
+from .types.sensor import Sensor
+from .types.track import Track, Tracks
 
 __version__: str
 

@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parent / "data_tools"))
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the folders beside this script are named as the packages are
 from damage import Target, damaged, targets
 
-from data_tools.atomic_files import write_text
+from data_tools.files.atomic_files import write_text
 from saga_fg import InputError
 
 PART = 1000  # inputs

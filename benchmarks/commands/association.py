@@ -27,7 +27,7 @@ def association(
       python -m benchmarks association --objects 200 --seconds 4 --json figures.json
     """
     from benchmarks.association import bench_association
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import FigureTable, cell, write_figures
 
     sizes = counts("--objects", objects)

@@ -54,7 +54,7 @@ def coasting(
         coasting_figures,
         coasting_table,
     )
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
     from pipelines.figures import write_figures
     from pipelines.learning import TrajectorySource

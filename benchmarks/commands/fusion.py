@@ -35,7 +35,7 @@ def fusion(
       python -m benchmarks fusion --scenes 4 --method kf --json figures.json
     """
     from benchmarks.fusion import fusion as run
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from data_tools.simulator import SimulatorSettings
     from pipelines.config import load_config
     from pipelines.configuration import load_settings

@@ -38,7 +38,7 @@ def heterogeneous(
     """
     from benchmarks.heterogeneous import heterogeneous as run
     from benchmarks.heterogeneous import tables
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.files.atomic_files import check_writable, write_text
     from data_tools.simulator.scenarios import SCENARIOS, ScenarioName
     from pipelines.config import load_config
     from pipelines.figures import write_figures

@@ -40,7 +40,7 @@ def metrics(
       python -m benchmarks metrics --result tracks.json --dataroot data/nuscenes --split mini_train
     """
     from benchmarks.devkit import PYTHON_VARIABLE, parity, tracked_simulation
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import write_figures
 
     python = os.environ.get(PYTHON_VARIABLE)

@@ -34,7 +34,7 @@ def occlusion(
       python -m benchmarks occlusion --scenes 20 --seed 100 --json figures.json
     """
     from benchmarks.occlusion import occlusion as run
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
     from pipelines.figures import write_figures
     from saga_fg.errors import InputError

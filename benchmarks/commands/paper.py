@@ -32,7 +32,7 @@ def paper(
           --camera simulated/detections/camera.json --lidar simulated/detections/lidar.json
     """
     from benchmarks.paper import PUBLISHED, paper_table, shown
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
     from pipelines.figures import write_figures
 

@@ -35,7 +35,7 @@ def reading(
     """
     from benchmarks.large_tables import TableSize, write_large_tables
     from benchmarks.reading import bench_reading
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import write_figures
 
     size = TableSize(scenes=scenes, detections=detections)

@@ -36,7 +36,7 @@ def scaling(
       python -m benchmarks scaling --objects 5,10,15 --frames 60 --json figures.json --output scaling.png
     """
     from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import FigureTable, cell, write_figures
 
     sizes = counts("--objects", objects, least=2)  # one has no neighbours

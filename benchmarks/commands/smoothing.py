@@ -30,7 +30,7 @@ def smoothing(
     """
     from benchmarks.drawn_recordings import drawn_fit
     from benchmarks.hidden_objects import hidden_objects
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import write_figures
     from pipelines.smoothing import load_smooth_config
 

@@ -46,7 +46,7 @@ def streaming(
       python -m benchmarks streaming --file --seconds 120 --compared 60
     """
     from benchmarks.streaming import StreamingBenchSettings, bench_streaming
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import write_figures
 
     settings = StreamingBenchSettings(objects, seconds, rate, compared=compared, seed=seed)

@@ -35,7 +35,7 @@ def synthetic(
       python -m benchmarks synthetic --seeds 2 --cells 'base,no coupling' --json figures.json
     """
     from benchmarks.synthetic import CELLS, synthetic
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 

@@ -21,10 +21,10 @@ import numpy as np
 
 from data_tools.lidar.components import connected_from_above
 from data_tools.lidar.ground import segment_ground
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Detections
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Detections
 
 _HEADINGS = np.radians(np.arange(0.0, 90.0, 2.0))
 _CLOSE = 0.1  # m, d0

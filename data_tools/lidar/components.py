@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))  # half of the eight: links go both ways
 

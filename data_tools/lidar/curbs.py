@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import require_positive, setting
 
 

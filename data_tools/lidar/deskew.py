@@ -20,8 +20,8 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar.scan import Scan
-from saga_fg.arrays import FloatArray, checked
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, checked
 
 Turning = Literal["clockwise", "counter-clockwise"]
 

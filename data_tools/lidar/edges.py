@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.settings import require_between, require_positive, setting
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.settings import require_positive, setting
 
 

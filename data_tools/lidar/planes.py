@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.surfels import surfels_of
 from data_tools.lidar.voxels import voxel_downsample
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import require_positive, setting
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.atomic_files import write_bytes
-from saga_fg.arrays import FloatArray, checked
+from data_tools.files.atomic_files import write_bytes
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, checked
 
 
 def write_ply(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:

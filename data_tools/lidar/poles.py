@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.components import connected_from_above
 from data_tools.lidar.planes import Plane, near_walls
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import require_positive, setting
 
 

@@ -25,9 +25,9 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar.surfels import SurfelMap, Surfels
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import SagaError
-from saga_fg.geometry import transform_points
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import transform_points
 from saga_fg.settings import require_positive, setting
 
 LEAST_PAIRS = 12  # twice the unknowns

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,14 +20,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from data_tools.input_files import open_bytes
+from data_tools.files.input_files import open_bytes
+from data_tools.files.located import located
+from data_tools.files.numpy_files import load_archive, load_array
 from data_tools.lidar.cloud_headers import check_pcd, check_ply
 from data_tools.lidar.scan import Scan
-from data_tools.located import located
-from data_tools.numpy_files import load_archive, load_array
 from data_tools.open3d_loader import load_open3d
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
 
 
 def read_scan(path: str | Path) -> Scan:

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.lidar.voxels import voxel_keys
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.columns import Columns
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
 
 LEAST_POINTS = 6  # of a surfel that may be called flat
 FLAT = 1 / 9  # largest share of the smallest eigenvalue in the second: a third of the standard deviation

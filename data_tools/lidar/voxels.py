@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)

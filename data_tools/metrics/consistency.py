@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.chi_square import chi_square_quantile
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.chi_square import chi_square_quantile
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, checked
+from saga_fg.numerics.arrays import FloatArray, checked
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import IntArray, checked_rows
+from saga_fg.numerics.arrays import IntArray, checked_rows
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.overlap import bev_iou, iou_3d
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.overlap import bev_iou, iou_3d
 
 Similarity = Literal["centre", "bev_iou", "iou_3d"]
 

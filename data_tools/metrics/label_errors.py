@@ -23,10 +23,10 @@ from data_tools.metrics.consistency import nees
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.nearest_pairs import nearest_pairs
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.boxes import Boxes
-from saga_fg.columns import Columns
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.boxes import Boxes
 
 GATE = 2.0  # m
 MOVING = 1.0  # m/s

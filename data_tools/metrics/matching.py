@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.dataset import Annotations
 from saga_fg.errors import InputError
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.dataset import Annotations
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)

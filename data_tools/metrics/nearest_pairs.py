@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.metrics.assignment import Candidates, optimal_pairs
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.boxes import Boxes
 
 
 def nearest_pairs(

@@ -28,11 +28,11 @@ import numpy as np
 from data_tools.metrics.consistency import nees
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.matching import Matching, match_scene
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.dataset import Annotations
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import setting
-from saga_fg.track import Tracks
+from saga_fg.types.dataset import Annotations
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray, checked, checked_labels
-from saga_fg.boxes import Boxes
-from saga_fg.columns import Columns
-from saga_fg.dataset import Annotations
 from saga_fg.errors import InputError
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked, checked_labels
+from saga_fg.numerics.columns import Columns
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)

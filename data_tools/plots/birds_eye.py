@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Annotations
-from saga_fg.frame import Detections
-from saga_fg.geometry import inverse_transform, transform_points, yaw_of
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_of
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations
+from saga_fg.types.frame import Detections
+from saga_fg.types.track import Tracks
 
 COASTING = 0.15  # s without detection from which a track is drawn as coasting
 ELLIPSE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degrees of freedom

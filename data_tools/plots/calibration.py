@@ -12,7 +12,7 @@ import numpy as np
 
 from data_tools.metrics.error_figures import BANDS, calibration, errors_by_class
 from data_tools.metrics.label_errors import LabelErrors
-from saga_fg.chi_square import chi_square_quantile
+from saga_fg.numerics.chi_square import chi_square_quantile
 
 
 def calibration_plot(errors: LabelErrors) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_tools.metrics.error_figures import errors_by_class
 from data_tools.metrics.label_errors import LabelErrors
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 _PANELS = {
     "position": ("position, m", 1.5, 1.0),

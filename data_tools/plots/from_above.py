@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from data_tools.plots.birds_eye import COLOURS
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 def paths_from_above(paths: Mapping[str, FloatArray], points: Mapping[str, FloatArray] | None = None) -> Any:

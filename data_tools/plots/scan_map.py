@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 MOST_POINTS = 60_000  # that are drawn, evenly chosen
 MARGIN = 30.0  # m around the paths

@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.atomic_files import write_text
-from data_tools.text_tables import LARGEST, TextTable, read_lines
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import MAX_POSITION
+from data_tools.files.atomic_files import write_text
+from data_tools.files.text_tables import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
-from saga_fg.geometry import quaternion_norms, quaternion_rotation, rotation_quaternion
-from saga_fg.pose_graph import PoseGraph
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation, rotation_quaternion
+from saga_fg.slam.pose_graph import PoseGraph
+from saga_fg.types.boxes import MAX_POSITION
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
 

@@ -17,9 +17,9 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
-from saga_fg.pose_graph import PoseGraph
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.slam.pose_graph import PoseGraph
 
 _NEAR = 1.5  # m, between poses of a city that see the same place
 _APART = 10  # poses, at least, between the two of a loop closure

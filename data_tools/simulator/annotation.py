@@ -12,8 +12,8 @@ import numpy as np
 from data_tools.simulator.sensors import in_view, viewpoint
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import World
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.dataset import Annotations
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.types.dataset import Annotations
 
 
 def annotate(

@@ -12,7 +12,7 @@ from data_tools.simulator.pedestrians import BODY
 from data_tools.simulator.road import Road
 from data_tools.simulator.settings import CyclistSettings
 from data_tools.simulator.trajectories import Trajectories, together
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 BICYCLE = (1.75, 0.6, 1.1)  # length, width, height, m
 SLOWEST = 1.0  # m/s

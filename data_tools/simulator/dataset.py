@@ -6,8 +6,8 @@ import numpy as np
 
 from data_tools.simulator.scene import simulate_scene
 from data_tools.simulator.settings import SimulatorSettings
-from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Scene
 
 
 class SimulatedTraffic:

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_tools.simulator.idm import Drivers
 from data_tools.simulator.settings import DriverSettings, TrafficSettings
-from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.columns import Columns
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.columns import Columns
 
 HARDEST_BRAKING = 9.0  # m/s^2, what tyres on a dry road can do
 

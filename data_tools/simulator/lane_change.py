@@ -17,7 +17,7 @@ from data_tools.simulator.fleet import Fleet
 from data_tools.simulator.idm import following_acceleration, free_acceleration
 from data_tools.simulator.neighbours import LaneOrder
 from data_tools.simulator.settings import DriverSettings
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 def advantage(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.simulator.road import Road
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 def smooth_step(share: FloatArray) -> FloatArray:

@@ -14,11 +14,12 @@ from data_tools.simulator.disturbances import StopLine
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.sensors import viewpoint
 from data_tools.simulator.settings import LightSettings, SensorSettings
-from saga_fg import road
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Detections
-from saga_fg.geometry import wrap_angle, yaw_of
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import wrap_angle, yaw_of
+from saga_fg.types import road_map
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Detections
+from saga_fg.types.signal import COLOURS
 
 BEYOND = 12.0  # m from a stop line to its light
 HEIGHT = 5.0  # m of a light over the ground
@@ -67,16 +68,16 @@ def map_of(
     signals: tuple[Signal, ...],
     settings: LightSettings,
     rng: np.random.Generator,
-) -> road.RoadMap:
+) -> road_map.RoadMap:
     """The map: lights, their stop lines and all lanes around `focus` (m along the road), each a little off."""
 
-    def point(place: FloatArray) -> road.road_map.Point:
+    def point(place: FloatArray) -> road_map.Point:
         return float(place[0]), float(place[1])
 
     def off() -> FloatArray:
         return np.asarray(settings.map_noise * rng.standard_normal(2))
 
-    lights = tuple(road.TrafficLight(signal.name, point(signal.place + off())) for signal in signals)
+    lights = tuple(road_map.TrafficLight(signal.name, point(signal.place + off())) for signal in signals)
     half = abs(lanes.offset[1] - lanes.offset[0]) / 2
     mapped = []
     for number, line in enumerate(lines):
@@ -87,7 +88,7 @@ def map_of(
         borders = lanes.offset[line.lanes].max() + half, lanes.offset[line.lanes].min() - half
         ends, _ = lanes.pose(np.repeat(line.lanes[:1], 2), np.full(2, line.s), np.array(borders[::sign]), np.zeros(2))
         left, right = ends + off()
-        mapped.append(road.StopLine(f"line-{number}", point(left), point(right), name))
+        mapped.append(road_map.StopLine(f"line-{number}", point(left), point(right), name))
     before = replace(lanes, taper=0.0)  # no map knows of cones
     found = []
     for lane in range(len(lanes.offset)):
@@ -97,8 +98,8 @@ def map_of(
         d, slope = before.lateral(same, s)
         centre, _ = lanes.pose(same, s, d, slope)
         moved = centre + off()
-        found.append(road.Lane(f"lane-{lane}", tuple(point(place) for place in moved), 2 * float(half)))
-    return road.RoadMap(lights, tuple(mapped), tuple(found), max(settings.map_noise, 1e-3))
+        found.append(road_map.Lane(f"lane-{lane}", tuple(point(place) for place in moved), 2 * float(half)))
+    return road_map.RoadMap(lights, tuple(mapped), tuple(found), max(settings.map_noise, 1e-3))
 
 
 def see_lights(
@@ -124,7 +125,7 @@ def see_lights(
     labels = []
     for row in seen.tolist():
         true = signals[row].colour(time)
-        wrong = [colour for colour in road.COLOURS if colour != true]
+        wrong = [colour for colour in COLOURS if colour != true]
         right = rng.random() < sensor.colour_accuracy
         labels.append(f"traffic_light_{true if right else wrong[int(rng.integers(2))]}")
     n, r = len(seen), distance[seen, None]

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory
+from data_tools.files.atomic_files import atomic_directory
 from data_tools.simulator.dataset import SimulatedTraffic
 from data_tools.simulator.nuscenes_tables import (
     Tables,
@@ -29,10 +29,10 @@ from data_tools.simulator.nuscenes_tables import (
     scene_tables,
     shared_tables,
 )
-from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
-from saga_fg.frame import Frame
-from saga_fg.geometry import yaw_quaternion
+from saga_fg.numerics.geometry import yaw_quaternion
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
 
 ATTRIBUTE_OF_DETECTIONS = ""  # not estimated
 

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from data_tools.simulator.settings import SensorSettings
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.frame import Frame
-from saga_fg.geometry import yaw_of, yaw_quaternion
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import yaw_of, yaw_quaternion
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Frame
 
 Record = dict[str, Any]
 Tables = dict[str, list[Record]]

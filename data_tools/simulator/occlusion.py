@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.boxes import Boxes
 
 RAYS = 12
 

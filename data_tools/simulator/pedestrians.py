@@ -15,7 +15,7 @@ import numpy as np
 from data_tools.simulator.road import Road
 from data_tools.simulator.settings import PedestrianSettings
 from data_tools.simulator.trajectories import Trajectories
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 RELAXATION = 0.6  # tau, s
 SWAY = 1.0  # omega, 1/s

@@ -6,7 +6,7 @@ import numpy as np
 
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.settings import RoadworkSettings
-from saga_fg.boxes import Boxes
+from saga_fg.types.boxes import Boxes
 
 CONE = (0.45, 0.45, 0.75)  # length, width, height, m
 SCATTER = 0.1  # standard deviation of a cone's place, m

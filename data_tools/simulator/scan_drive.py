@@ -7,7 +7,7 @@ import numpy as np
 from data_tools.lidar import Scan
 from data_tools.simulator.scanner import ScannerSettings
 from data_tools.simulator.street import SMALL, drive, scans, street
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 class SimulatedScans:

@@ -18,9 +18,9 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan
-from saga_fg.arrays import FloatArray, checked
-from saga_fg.boxes import Boxes
+from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.settings import require_positive, setting
+from saga_fg.types.boxes import Boxes
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import curved_road
 from data_tools.simulator.settings import RoadSettings, RoadworkSettings, SimulatorSettings, TrafficSettings
 from data_tools.simulator.towing import hitched
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 JUNCTION = 10.0  # m between the stop lines of the two directions
 FOCUS = 0.55  # share of the road's length at which things happen

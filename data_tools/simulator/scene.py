@@ -11,10 +11,10 @@ from data_tools.simulator.lights import see_lights
 from data_tools.simulator.sensors import observe, viewpoint
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import World, build_world
-from saga_fg.arrays import FloatArray
-from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
-from saga_fg.frame import Detections, Frame
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Detections, Frame
 
 EPOCH = 1_600_000_000.0  # s, when the scene of seed 0 takes place
 

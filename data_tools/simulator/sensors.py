@@ -17,10 +17,10 @@ import numpy as np
 from data_tools.simulator.fleet import KINDS
 from data_tools.simulator.pedestrians import BODY
 from data_tools.simulator.settings import SensorSettings
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Detections
-from saga_fg.geometry import transform_points, wrap_angle, yaw_of
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.geometry import transform_points, wrap_angle, yaw_of
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Detections
 
 CLUTTER = (("pedestrian", BODY), *((kind.label, kind.size) for kind in KINDS))
 CLUTTER_SHARES = (0.4, 0.4, 0.1, 0.07, 0.03)

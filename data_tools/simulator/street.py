@@ -6,9 +6,9 @@ import numpy as np
 
 from data_tools.lidar import Scan, constant_velocity
 from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.geometry import inverse_transform, yaw_transform
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg.types.boxes import Boxes
 
 SENSOR_HEIGHT = 1.8  # m above the ground
 KERB = 6.4  # m, from the middle of the road to its edge

@@ -9,8 +9,8 @@ import numpy as np
 from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, draw_sizes
 from data_tools.simulator.road import Road
 from data_tools.simulator.settings import Range, SurroundingSettings
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.boxes import Boxes
 
 PARKING_WIDTH = 2.4  # m
 PAVEMENT_WIDTH = 3.5  # m

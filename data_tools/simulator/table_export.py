@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.detection_files import write_rows
-from saga_fg.dataset import Scene
-from saga_fg.frame import Frame
-from saga_fg.geometry import yaw_of
+from data_tools.datasets.detection_files import write_rows
+from saga_fg.numerics.geometry import yaw_of
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
 
 BOX = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
 DETECTIONS = (

@@ -14,7 +14,7 @@ from data_tools.simulator.fleet import TRUCK, Fleet
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.traffic import TrafficHistory
 from data_tools.simulator.trajectories import Trajectories
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 HITCH = 0.9  # m between truck and trailer
 TRAILER_LENGTH = (6.0, 11.0)  # m

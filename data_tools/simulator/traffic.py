@@ -24,7 +24,7 @@ from data_tools.simulator.lane_change import advantage, choose
 from data_tools.simulator.lanes import Lanes, smooth_step, smooth_step_slope
 from data_tools.simulator.neighbours import LaneOrder
 from data_tools.simulator.settings import DriverSettings
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 CHANGE_INTERVAL = 0.5  # s between two looks into the mirror
 SLOWEST_CHANGE = 2.0  # m/s below which nobody starts to change lanes

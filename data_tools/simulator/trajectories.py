@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.boxes import Boxes
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.types.boxes import Boxes
 
 
 @dataclass(frozen=True, eq=False)

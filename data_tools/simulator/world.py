@@ -18,10 +18,10 @@ from data_tools.simulator.surroundings import draw_surroundings
 from data_tools.simulator.towing import parted
 from data_tools.simulator.traffic import Traffic, TrafficHistory, drive
 from data_tools.simulator.trajectories import Trajectories, standing, together
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.boxes import Boxes
-from saga_fg.geometry import yaw_transform
-from saga_fg.road import RoadMap
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.road_map import RoadMap
 
 FURNISHED = (-300.0, 400.0)  # m around the place where traffic is disturbed
 WALKED = (-150.0, 100.0)

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_tools.trajectories.trajectory import Trajectory
-from saga_fg.arrays import FloatArray, checked
 from saga_fg.errors import InputError
-from saga_fg.geometry import inverse_transform
+from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.geometry import inverse_transform
 
 Alignment = Literal["rigid", "start", "none"]
 

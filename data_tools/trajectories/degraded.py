@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from saga_fg.arrays import FloatArray
-from saga_fg.ego import Odometry, OdometryNoise
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.joint import Odometry, OdometryNoise
 
 
 def degraded_odometry(odometry: Odometry, noise: OdometryNoise, rng: np.random.Generator) -> Odometry:

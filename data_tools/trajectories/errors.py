@@ -19,9 +19,9 @@ import numpy as np
 
 from data_tools.trajectories.alignment import Alignment, aligned
 from data_tools.trajectories.trajectory import Trajectory, matched
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
-from saga_fg.geometry import inverse_transform
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
 
 
 @dataclass(frozen=True)

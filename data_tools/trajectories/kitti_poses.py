@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.atomic_files import write_text
-from data_tools.located import located
-from data_tools.text_tables import read_table
+from data_tools.files.atomic_files import write_text
+from data_tools.files.located import located
+from data_tools.files.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
 
 _COLUMNS = ("r11", "r12", "r13", "tx", "r21", "r22", "r23", "ty", "r31", "r32", "r33", "tz")
 

@@ -8,11 +8,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.errors import InputError
-from saga_fg.geometry import is_rotation
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.numerics.geometry import is_rotation
 
-_ORTHONORMAL = 1e-4  # the largest entry of R R^T - 1 that is let pass, as in `saga_fg.geometry.checked_transform`
+_ORTHONORMAL = 1e-4  # the largest entry of R R^T - 1 that is let pass, as in `checked_transform`
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_tools.atomic_files import write_text
-from data_tools.located import located
-from data_tools.text_tables import read_table
+from data_tools.files.atomic_files import write_text
+from data_tools.files.located import located
+from data_tools.files.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
 from saga_fg.errors import InputError
-from saga_fg.geometry import quaternion_norms, quaternion_rotation
+from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation
 
 _COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # how far a quaternion's norm may be off 1, for files of few digits

@@ -19,9 +19,9 @@ from data_tools.metrics import ErrorSample, SceneMetricSettings, scene_metrics
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
 from pipelines.tracking import track_scene
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.frame import Frame
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Frame
 
 HIDDEN, FOLLOWED = 2.0, 1.5  # s: for so long hidden, after so long in view
 ROUNDS = 2

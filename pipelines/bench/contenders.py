@@ -10,8 +10,8 @@ import scipy.linalg
 
 from factors import interaction_factors, linear_detection_factors, nonlinear_graph, position, prior_factors
 from pipelines.bench.flocks import DT, Flock, Frame
-from saga_fg.arrays import FloatArray
 from saga_fg.estimators import Estimator, FixedLagSmoother, Gaussian, kalman_predict, kalman_update
+from saga_fg.numerics.arrays import FloatArray
 
 
 class Contender(Protocol):

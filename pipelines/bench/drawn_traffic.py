@@ -22,9 +22,9 @@ from factors import (
     prior_factors,
     relative_range_bearing_factors,
 )
-from saga_fg.arrays import FloatArray
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView, NewVariable
-from saga_fg.nonlinear_interactions import SmoothDriver, SocialForce, interaction
+from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction
+from saga_fg.numerics.arrays import FloatArray
 
 START = np.diag([0.05, 0.05, 0.01]) ** 2
 ODOMETRY = np.diag([0.05, 0.03, 0.01]) ** 2

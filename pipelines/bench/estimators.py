@@ -20,7 +20,6 @@ from pipelines.bench.measuring import environment, size_of, timed
 from pipelines.bench.running_graph import drivers, endless_drivers, windows
 from pipelines.process import one_thread, resident_memory
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators import (
     BatchSmoother,
@@ -32,6 +31,7 @@ from saga_fg.estimators import (
     kalman_update,
     rts_smooth,
 )
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import setting
 
 KINDS: tuple[Kind, ...] = ("connected", "components")

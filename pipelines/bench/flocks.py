@@ -16,10 +16,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import Measurements
-from saga_fg.transition import Transition
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 Kind = Literal["connected", "components"]
 

@@ -18,8 +18,8 @@ from pipelines.config import TrackConfig
 from pipelines.slam.joint import JointRun, run_joint
 from pipelines.slam.roadside import poles_at
 from pipelines.tracking import Progress
-from saga_fg.dataset import Scene
-from saga_fg.ego import JointSettings, LaneSettings
+from saga_fg.slam.joint import JointSettings, LaneSettings
+from saga_fg.types.dataset import Scene
 
 
 @dataclass(frozen=True)

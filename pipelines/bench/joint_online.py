@@ -1,9 +1,10 @@
 """The vehicle and the objects around it online, in one running graph, against one after the other.
 
-Decoupled: the odometry's path, and the tracker along it. Joint: `saga_fg.ego.OnlineEstimator`, which knows the same
-frames and odometry. Both are asked at every frame for what they know then. Errors of objects are those of position and
-velocity in the world, of the pairs (object, moment) that the tracker reports and that both have detected, within 2 m of
-the truth along the true path, in at least `SETTLED` frames before: earlier, velocities are the priors of new tracks.
+Decoupled: the odometry's path, and the tracker along it. Joint: `saga_fg.slam.joint.OnlineEstimator`, which knows the
+same frames and odometry. Both are asked at every frame for what they know then. Errors of objects are those of position
+and velocity in the world, of the pairs (object, moment) that the tracker reports and that both have detected, within 2
+m of the truth along the true path, in at least `SETTLED` frames before: earlier, velocities are the priors of new
+tracks.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import TrackConfig
 from pipelines.slam.joint import degraded_drive
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.association import Assignment, assign
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.ego import JointSettings, OnlineEstimator
-from saga_fg.ego.record import in_ego
 from saga_fg.errors import InputError
-from saga_fg.frame import Detections, Frame
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Assignment, assign
+from saga_fg.slam.joint import JointSettings, OnlineEstimator
+from saga_fg.slam.joint.record import in_ego
 from saga_fg.tracking import Tracker
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Detections, Frame
 
 NEAR, SETTLED = 2.0, 3  # m, of a detection from the object that it is of; frames
 Pair = tuple[int, str]  # frame, object

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pipelines.learning import learn_interactions
 from pipelines.tracking import Progress
-from saga_fg.dataset import Dataset
 from saga_fg.errors import InputError
-from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.learning import Trajectories
+from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.types.dataset import Dataset
 
 FOLDS = 2
 

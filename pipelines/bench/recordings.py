@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from data_tools.kitti import KittiTracking, write_kitti_results
-from data_tools.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.kitti import KittiTracking, write_kitti_results
+from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
@@ -20,7 +21,6 @@ from data_tools.metrics import (
     nuscenes_tracking_metrics,
     scene_metrics,
 )
-from data_tools.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
 from pipelines.evaluation.hota import HotaRow, kitti_hota
@@ -28,8 +28,8 @@ from pipelines.evaluation.kitti import CLASSES, kitti_label_errors
 from pipelines.evaluation.nuscenes import nuscenes_hota, nuscenes_label_errors
 from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.tracking import TrackedScene
-from saga_fg.dataset import Dataset
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset
 
 VERSION = "v1.0-mini"
 Runs = Mapping[str, TrackedScene]

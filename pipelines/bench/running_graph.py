@@ -18,11 +18,11 @@ from pipelines.bench.drawn_traffic import Moment, draw_traffic, process_noise, p
 from pipelines.bench.estimator_figures import Row
 from pipelines.bench.flocks import Kind
 from pipelines.bench.measuring import timed
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphView, NewVariable
 from saga_fg.graph.factor_checks import Factor
-from saga_fg.nonlinear_interactions import SmoothDriver, interaction
+from saga_fg.model.nonlinear_interactions import SmoothDriver, interaction
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 KeyArray = NDArray[np.uint64]
 

@@ -29,9 +29,9 @@ from pipelines.process import one_thread
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import MissingExtraError
-from saga_fg.geometry import inverse_transform
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
 
 OURS, KISS = "saga-fg", "kiss-icp"
 

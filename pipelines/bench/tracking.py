@@ -21,9 +21,9 @@ from pipelines.config import TrackConfig
 from pipelines.evaluation.hota import HotaRow
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
-from saga_fg.frame import Frame
-from saga_fg.learned_interactions import LearnedInteractions
-from saga_fg.track import Tracks
+from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.types.frame import Frame
+from saga_fg.types.track import Tracks
 
 SAGA, KF, BASELINE = "saga", "kf", "centerpoint"
 LEARNED = Variant("learned interactions")

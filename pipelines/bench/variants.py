@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any
 
 from pipelines.config import Method, TrackConfig
-from saga_fg.edge_rules import EdgeRule, Following, Neighbours
 from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from data_tools.metrics import Interval
     from pipelines.bench.joint import JointBench
     from pipelines.config import TrackConfig
-    from saga_fg.dataset import Scene
+    from saga_fg.types.dataset import Scene
 
 
 def joint(
@@ -58,8 +58,8 @@ def joint(
       saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
       saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
-    from data_tools.atomic_files import check_writable
-    from data_tools.kitti import KittiTracking
+    from data_tools.datasets.kitti import KittiTracking
+    from data_tools.files.atomic_files import check_writable
     from data_tools.simulator import simulate_scene
     from pipelines.bench.joint import bench_joint
     from pipelines.config import load_config

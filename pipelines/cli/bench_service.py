@@ -53,7 +53,7 @@ def service(
       saga-fg bench service --frames 2000 --objects 10 --json figures.json
       saga-fg bench service --hostile
     """
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
 
     if json_file is not None:
         check_writable(json_file)

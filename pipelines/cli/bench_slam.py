@@ -38,8 +38,8 @@ def slam(
     Example:
       saga-fg bench slam --dataroot data/kitti --sequence 0000
     """
-    from data_tools.atomic_files import check_writable
-    from data_tools.kitti import KittiScans
+    from data_tools.datasets.kitti import KittiScans
+    from data_tools.files.atomic_files import check_writable
     from pipelines.bench.slam import bench_slam
     from pipelines.figures import write_figures
 

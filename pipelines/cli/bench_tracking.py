@@ -52,7 +52,7 @@ def tracking(
       saga-fg bench tracking --data data --sets kitti --no-components --no-coasting
       saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components --no-coasting
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.bench.recordings import SETS, recording_set
     from pipelines.bench.tracking import TrackingBenchSettings, bench_set
     from pipelines.bench.tracking_tables import figures, tables

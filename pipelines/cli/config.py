@@ -1,4 +1,4 @@
-"""`saga-fg config`: every setting with its default and its meaning."""
+"""`saga-fg config`: the settings with their defaults and meanings."""
 
 from __future__ import annotations
 
@@ -10,12 +10,49 @@ import typer
 from pipelines.cli.options import Verbose
 from saga_fg.errors import InputError
 
+# Of each kind of settings, those one changes first.
+FIRST = {
+    "tracking": (
+        "tracker.estimator",
+        "tracker.existence.report",
+        "tracker.classes.*.motion",
+        "tracker.classes.*.max_coasting",
+        "sensors.*.noise.*.position",
+    ),
+    "smoothing": (
+        "smoothing.classes.*.acceleration_noise",
+        "smoothing.joining.max_gap",
+        "smoothing.loss",
+        "smoothing.min_score",
+        "sensors.*.noise.*.position",
+    ),
+    "slam": (
+        "slam.joint.odometry.distance_noise",
+        "slam.lidar.odometry.surfel",
+        "slam.lidar.loops.distance",
+        "slam.lidar.landmarks",
+        "slam.lidar.loop_closures",
+    ),
+    "simulator": (
+        "duration",
+        "keyframe_rate",
+        "traffic.signal_probability",
+        "sensors.*.detection_probability",
+        "sensors.*.clutter_rate",
+    ),
+    "limits": ("reorder", "max_detections", "max_clients", "client_timeout", "idle_timeout"),
+}
+POINTER = """\
+# The five settings one changes first. `saga-fg config --full` prints all of them, the page Configuration lists them.
+"""
+
 
 def config(
     kind: Annotated[
         Literal["file", "nuscenes", "kitti", "simulated", "heterogeneous"],
         typer.Option("--for", help="The kind of data whose shipped defaults to print."),
     ] = "file",
+    full: Annotated[bool, typer.Option("--full", help="All settings, not only the five one changes first.")] = False,
     simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,
     smoothing: Annotated[bool, typer.Option("--smoothing", help="Those of `saga-fg smooth` instead.")] = False,
     slam: Annotated[bool, typer.Option("--slam", help="Those of `saga-fg slam` instead.")] = False,
@@ -23,40 +60,45 @@ def config(
     file: Annotated[
         Path | None, typer.Option("--config", help="Print the settings this YAML file leads to.", metavar="FILE")
     ] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="The reference in Markdown instead of YAML.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="All settings as tables in Markdown.")] = False,
     verbose: Verbose = False,
 ) -> None:
-    """Print every setting, its default and what it means, as YAML to edit and pass to `--config`.
+    """Print settings, their defaults and what they mean, as YAML to edit and pass to `--config`.
 
     A file needs to hold only what it changes.
 
     \b
     Examples:
-      saga-fg config > mine.yaml                      # everything, to edit
-      saga-fg config --for kitti --config mine.yaml   # what mine.yaml makes of the defaults for KITTI
-      saga-fg config --smoothing --for nuscenes       # settings of `saga-fg smooth`
-      saga-fg config --simulator                      # settings of `saga-fg simulate`
-      saga-fg config --slam --for kitti               # settings of `saga-fg slam`
-      saga-fg config --limits                         # limits of `saga-fg serve`
+      saga-fg config > mine.yaml                             # the five settings one changes first
+      saga-fg config --full > mine.yaml                      # everything
+      saga-fg config --for kitti --config mine.yaml --full   # what mine.yaml makes of the defaults for KITTI
+      saga-fg config --smoothing --for nuscenes              # settings of `saga-fg smooth`
+      saga-fg config --simulator                             # settings of `saga-fg simulate`
+      saga-fg config --slam --for kitti                      # settings of `saga-fg slam`
+      saga-fg config --limits                                # limits of `saga-fg serve`
     """
     from data_tools.simulator import SimulatorSettings
-    from pipelines.config import TrackConfig, load_config
+    from pipelines.config import load_config
     from pipelines.configuration import load_settings, settings_reference, write_settings
     from pipelines.serving import StreamSettings
-    from pipelines.slam.configuration import SlamConfig, load_slam_config
-    from pipelines.smoothing import SmoothConfig, load_smooth_config
+    from pipelines.slam.configuration import load_slam_config
+    from pipelines.smoothing import load_smooth_config
 
-    if simulator + smoothing + slam + limits > 1:
+    chosen = {"simulator": simulator, "smoothing": smoothing, "slam": slam, "limits": limits}
+    if sum(chosen.values()) > 1:
         raise InputError("expected one of --simulator, --smoothing, --slam and --limits")
-    plain: type[Any] | None = SimulatorSettings if simulator else StreamSettings if limits else None
-    if markdown:
-        text = settings_reference(plain or (SmoothConfig if smoothing else SlamConfig if slam else TrackConfig))
-    elif smoothing:
-        text = write_settings(load_smooth_config(kind, file))
-    elif slam:
-        text = write_settings(load_slam_config(kind, file))
-    elif plain is not None:
-        text = write_settings(load_settings(plain, file) if file else plain())
+    name = next((name for name, wanted in chosen.items() if wanted), "tracking")
+    settings: Any
+    if name in ("simulator", "limits"):
+        cls: type[Any] = SimulatorSettings if simulator else StreamSettings
+        settings = load_settings(cls, file) if file else cls()
     else:
-        text = write_settings(load_config(kind, file))
+        load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
+        settings = load(kind, file)
+    if markdown:
+        text = settings_reference(type(settings))
+    elif full:
+        text = write_settings(settings)
+    else:
+        text = POINTER + write_settings(settings, selection=FIRST[name])
     typer.echo(text, nl=False)

@@ -18,7 +18,7 @@ from saga_fg.errors import InputError
 if TYPE_CHECKING:
     from pipelines.evaluation import KittiEvaluation, NuScenesEvaluation
     from pipelines.figures import FigureTable
-    from saga_fg.arrays import FloatArray
+    from saga_fg.numerics.arrays import FloatArray
 
 evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
@@ -86,7 +86,7 @@ def nuscenes(
       saga-fg evaluate nuscenes tracks.json --dataroot data/nuscenes --split mini_train \\
           --detections lidar=megvii.json --hota --json figures.json
     """
-    from data_tools.nuscenes import read_scored_scenes
+    from data_tools.datasets.nuscenes import read_scored_scenes
     from pipelines.evaluation import evaluate_nuscenes
 
     chosen = options.chosen_scenes(dataroot, version, split, scenes)
@@ -128,7 +128,7 @@ def kitti(
       saga-fg evaluate kitti results --dataroot data/kitti --sequences 0000,0011 --iou 0.5 \\
           --detections data/kitti/detections/pointrcnn --hota --json figures.json
     """
-    from data_tools.kitti.scored_sequences import read_scored_sequences
+    from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
     from pipelines.evaluation import evaluate_kitti
 
     chosen = options.names("--sequences", sequences) if sequences is not None else None
@@ -230,7 +230,7 @@ def labels(
 
 def _report(run: Callable[[], AnyEvaluation], json_file: Path | None, doing: str = "scoring") -> AnyEvaluation:
     """Run an evaluation, show its tables, write its figures."""
-    from data_tools.atomic_files import check_writable
+    from data_tools.files.atomic_files import check_writable
     from pipelines.figures import write_figures
 
     if json_file is not None:
@@ -253,7 +253,7 @@ def _innovations_of(result: Path) -> dict[str, FloatArray]:
 
 def _draw(evaluation: Drawn, plots: Path | None) -> None:
     """Write the pictures of an evaluation, if they are wanted."""
-    from data_tools.atomic_files import atomic_directory
+    from data_tools.files.atomic_files import atomic_directory
     from data_tools.plots import png
 
     if plots is not None:

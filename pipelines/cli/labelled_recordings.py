@@ -13,7 +13,7 @@ from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.config import Family
-    from saga_fg.dataset import Dataset
+    from saga_fg.types.dataset import Dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ def labelled_recordings(
     """
     import numpy as np
 
-    from data_tools.label_files import read_label_table
+    from data_tools.export.labels import read_label_table
 
     given = [value is not None for value in (nuscenes, kitti, file, seed)]
     if sum(given) != 1:
@@ -50,18 +50,18 @@ def labelled_recordings(
     table = _table(result)
     scenes = tuple(np.unique(read_label_table(table).tracks.scene).tolist())
     if nuscenes is not None:
-        from data_tools.nuscenes import NuScenes
+        from data_tools.datasets.nuscenes import NuScenes
 
         files = sensor_files(detections)
         return LabelledRecordings(table, "nuscenes", NuScenes(nuscenes, version, files, scenes, with_truth))
     if kitti is not None:
-        from data_tools.kitti import KittiTracking
+        from data_tools.datasets.kitti import KittiTracking
 
         if len(detections) != 1:
             raise InputError("--detections: expected the folder of a detector")
         return LabelledRecordings(table, "kitti", KittiTracking(kitti, Path(detections[0]), scenes, with_truth))
     if file is not None:
-        from data_tools.detection_files import read_detections
+        from data_tools.datasets.detection_files import read_detections
 
         return LabelledRecordings(table, "file", read_detections(file))
     from data_tools.simulator import SimulatedTraffic, SimulatorSettings

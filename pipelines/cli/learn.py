@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipelines.config import TrackConfig
-    from saga_fg.dataset import Dataset
+    from saga_fg.types.dataset import Dataset
 
 learn_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 noise_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -67,7 +67,7 @@ def interactions(
       saga-fg learn interactions --data file=detections.csv --output interactions.yaml
       saga-fg track file detections.csv --interactions interactions.yaml --output tracks.csv
     """
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.configuration import write_settings
     from pipelines.learning import TrajectorySource, learn_interactions
 
@@ -116,7 +116,7 @@ def nuscenes(
       saga-fg track nuscenes --dataroot data/nuscenes --scenes scene-0103 --config noise.yaml \\
           --detections lidar=a.json --detections camera=b.json --output tracks.json
     """
-    from data_tools.nuscenes import NuScenes
+    from data_tools.datasets.nuscenes import NuScenes
     from pipelines.config import load_config
 
     chosen = options.chosen_scenes(dataroot, version, split, scenes)
@@ -146,7 +146,7 @@ def kitti(
       saga-fg learn noise kitti --dataroot data/kitti --detections data/kitti/detections/pointrcnn \\
           --sequences 0000,0002 --output noise.yaml
     """
-    from data_tools.kitti import KittiTracking
+    from data_tools.datasets.kitti import KittiTracking
     from pipelines.config import load_config
 
     settings = load_config("kitti", config)
@@ -196,7 +196,7 @@ def file(
       saga-fg learn noise file detections.csv --output noise.yaml
       saga-fg track file detections.csv --config noise.yaml --output tracks.csv
     """
-    from data_tools.detection_files import read_detections
+    from data_tools.datasets.detection_files import read_detections
     from pipelines.config import load_config
 
     settings = load_config("file", config)
@@ -207,7 +207,7 @@ def file(
 
 
 def _learn(dataset: Dataset, scenes: Sequence[str], config: TrackConfig, with_truth: bool, output: Path) -> None:
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.learning import learn_noise, learned_fragment
 
     check_writable(output)

@@ -102,7 +102,7 @@ def online_window(online: bool, lag: float | None) -> float | None:
 
 def chosen_scenes(dataroot: Path, version: str, split: str | None, scenes: str | None) -> tuple[str, ...]:
     """The nuScenes scenes that --split or --scenes, of which one must be given, stand for."""
-    from data_tools.nuscenes import split_scenes
+    from data_tools.datasets.nuscenes import split_scenes
 
     if (split is None) == (scenes is None):
         raise InputError("expected either --split NAME or --scenes A,B")

@@ -91,7 +91,7 @@ def file(
 
 
 def _write(output: Path, make: Callable[[], Report]) -> None:
-    from data_tools.atomic_files import check_writable, write_text
+    from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.report import report_page
     from saga_fg.errors import InputError
 

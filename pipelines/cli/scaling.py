@@ -53,7 +53,7 @@ def at_scale(workers: int | None, ray: str | None) -> bool:
 
 def several(detections: Sequence[str], scenes: str | None) -> list[str]:
     """The files of detections to do in parallel; raises `InputError` where --scenes would choose among their scenes."""
-    from data_tools.remote_files import expanded
+    from data_tools.files.remote_files import expanded
 
     if scenes is not None:
         raise InputError("--scenes: all scenes of a file are done with --workers or --ray")

@@ -43,14 +43,14 @@ def g2o(
       saga-fg slam g2o MIT.g2o --output MIT --compare
       saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
     """
-    from data_tools.atomic_files import check_writable_folder
-    from data_tools.located import located
+    from data_tools.files.atomic_files import check_writable_folder
+    from data_tools.files.located import located
     from data_tools.pose_graphs import read_g2o
     from factors import Robust
     from pipelines.slam.pose_graph import write_pose_graph
     from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
     from saga_fg.errors import InputError
-    from saga_fg.pose_graph import factor_graph, optimise_poses, pose_values
+    from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
 
     if robust is not None and compare:
         raise InputError("--compare: expected without --robust, GTSAM's optimisers are run without a loss")

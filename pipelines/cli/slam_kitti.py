@@ -56,8 +56,8 @@ def kitti(
     """
     from dataclasses import replace
 
-    from data_tools.atomic_files import check_writable_folder
-    from data_tools.kitti import KittiScans, KittiTracking
+    from data_tools.datasets.kitti import KittiScans, KittiTracking
+    from data_tools.files.atomic_files import check_writable_folder
     from pipelines.slam.configuration import load_slam_config
     from pipelines.slam.kitti import write_lidar_slam
     from pipelines.slam.lidar_slam import lidar_slam

@@ -25,8 +25,8 @@ def plaza(
     Example:
       saga-fg slam plaza Plaza2_DR.txt --output plaza2
     """
-    from data_tools.atomic_files import check_writable_folder
-    from data_tools.plaza import read_plaza
+    from data_tools.datasets.plaza import read_plaza
+    from data_tools.files.atomic_files import check_writable_folder
     from pipelines.slam.landmark_results import LandmarkRecord, planar_trajectory, write_landmark_results
     from pipelines.slam.plaza import compared, map_beacons
 

@@ -12,8 +12,8 @@ from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.cli.reporting import working
 
 if TYPE_CHECKING:
-    from saga_fg.ego import Observations
-    from saga_fg.frame import Frame
+    from saga_fg.slam.joint import Observations
+    from saga_fg.types.frame import Frame
 
 
 def simulated(
@@ -39,7 +39,7 @@ def simulated(
     """
     from dataclasses import replace
 
-    from data_tools.atomic_files import check_writable_folder
+    from data_tools.files.atomic_files import check_writable_folder
     from data_tools.simulator import simulate_scene
     from data_tools.trajectories import trajectory_errors
     from pipelines.slam.configuration import load_slam_config

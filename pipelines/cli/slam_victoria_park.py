@@ -34,9 +34,9 @@ def victoria_park(
     """
     import numpy as np
 
-    from data_tools.atomic_files import check_writable_folder
+    from data_tools.datasets.victoria_park import read_victoria_park
+    from data_tools.files.atomic_files import check_writable_folder
     from data_tools.metrics.grouping import pairwise_agreement
-    from data_tools.victoria_park import read_victoria_park
     from pipelines.slam.landmark_results import planar_trajectory, records, write_landmark_results
     from pipelines.slam.victoria_park import ParkSettings, map_park
 

@@ -59,8 +59,8 @@ def nuscenes(
       saga-fg smooth nuscenes --dataroot data/nuscenes --version v1.0-trainval --split train \\
           --detections lidar=megvii.json --workers 0 --output labels   # all cores
     """
-    from data_tools.label_files import merge_label_parts
-    from data_tools.nuscenes import NuScenes, local_nuscenes, merge_tracking_results
+    from data_tools.datasets.nuscenes import NuScenes, local_nuscenes, merge_tracking_results
+    from data_tools.export.labels import merge_label_parts
     from pipelines.scale_out import HeldScene, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_nuscenes_run
 
@@ -108,7 +108,7 @@ def kitti(
       saga-fg smooth kitti --dataroot data/kitti --detections data/kitti/detections/pointrcnn \\
           --sequences 0000,0011 --output labels
     """
-    from data_tools.kitti import local_kitti
+    from data_tools.datasets.kitti import local_kitti
     from pipelines.scale_out import KittiInput, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_kitti_run
 
@@ -189,8 +189,8 @@ def file(
       saga-fg smooth file detections.csv --output labels
       saga-fg smooth file 's3://fleet/2026-11/*.csv' --workers 0 --output labels
     """
-    from data_tools.detection_files import read_scenes_in_parts
-    from data_tools.remote_files import local_copy
+    from data_tools.datasets.detection_files import read_scenes_in_parts
+    from data_tools.files.remote_files import local_copy
     from pipelines.scale_out import DetectionFileInput, SmoothTask
     from pipelines.smoothing import smooth_stream, write_streamed_labels
 

@@ -56,8 +56,8 @@ def nuscenes(
       saga-fg track nuscenes --dataroot data/nuscenes --version v1.0-trainval --split val \\
           --detections lidar=a.json --workers 0 --output run   # all cores; writes run/tracks.json
     """
-    from data_tools.nuscenes import NuScenes, local_nuscenes, merge_tracking_results, write_tracking_results
-    from data_tools.remote_files import is_url
+    from data_tools.datasets.nuscenes import NuScenes, local_nuscenes, merge_tracking_results, write_tracking_results
+    from data_tools.files.remote_files import is_url
     from pipelines.explaining import trackers
     from pipelines.scale_out import HeldScene, TrackTask
     from pipelines.tracking import track_dataset
@@ -112,7 +112,7 @@ def kitti(
       saga-fg track kitti --dataroot data/kitti --detections data/kitti/detections/pointrcnn \\
           --sequences 0000,0011 --output results
     """
-    from data_tools.kitti import local_kitti, write_kitti_results
+    from data_tools.datasets.kitti import local_kitti, write_kitti_results
     from pipelines.explaining import trackers
     from pipelines.scale_out import KittiInput, TrackTask
     from pipelines.tracking import track_dataset
@@ -167,8 +167,8 @@ def file(
       saga-fg track file detections.ndjson --method kf --config mine.yaml --output tracks.ndjson
       saga-fg track file 's3://fleet/2026-11/*.csv' --workers 0 --output run   # writes run/tracks/NAME.csv
     """
-    from data_tools.detection_files import read_detections, write_tracks
-    from data_tools.remote_files import local_copy
+    from data_tools.datasets.detection_files import read_detections, write_tracks
+    from data_tools.files.remote_files import local_copy
     from pipelines.explaining import trackers
     from pipelines.scale_out import DetectionFileInput, TrackTask
     from pipelines.tracking import track_dataset

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import yaml
 
-from data_tools.input_files import read_text
+from data_tools.files.input_files import read_text
 from pipelines.configuration.schema import (
     Choice,
     Imported,
@@ -45,8 +45,7 @@ def load_settings(cls: type[T], path: Path, base: T | None = None) -> T:
 def read_settings(cls: type[T], text: str, source: str = "configuration", base: T | None = None) -> T:
     """The settings of a YAML text; `source` is the name that errors give to it."""
     try:
-        _refuse_repeated_keys(yaml.compose(text, Loader=yaml.SafeLoader))
-        data = yaml.safe_load(text)
+        data = yaml.load(text, Loader=_Loader)
         return cast(T, _read(Section((cls,)), {} if data is None else data, cls() if base is None else base, ""))
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
@@ -190,22 +189,15 @@ def _join(where: str, key: str) -> str:
     return f"{where}.{key}" if where else key
 
 
-def _refuse_repeated_keys(root: yaml.Node | None) -> None:
-    """PyYAML keeps the last of two equal keys in silence; a configuration that says two things is a mistake."""
-    todo, done = [root], set()
-    while todo:
-        node = todo.pop()
-        if node is None or id(node) in done:  # anchors and aliases may lead to the same node again
-            continue
-        done.add(id(node))
-        if isinstance(node, yaml.MappingNode):
-            names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-            twice = next((key for key, _ in reversed(node.value) if names.count(key.value) > 1), None)
-            if twice is not None:
-                raise InputError(f"line {twice.start_mark.line + 1}: the key {twice.value!r} occurs twice in a section")
-            todo += [value for _, value in node.value]
-        elif isinstance(node, yaml.SequenceNode):
-            todo += node.value
+class _Loader(yaml.SafeLoader):
+    """Refuses equal keys, of which PyYAML keeps the last: a configuration that says two things is a mistake."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = next((key for key, _ in reversed(node.value) if names.count(key.value) > 1), None)
+        if twice is not None:
+            raise InputError(f"line {twice.start_mark.line + 1}: the key {twice.value!r} occurs twice in a section")
+        return super().construct_mapping(node, deep)
 
 
 def _one_line(error: Exception) -> str:

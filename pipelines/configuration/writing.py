@@ -2,13 +2,15 @@
 
 A table's second and later entries repeat the keys but not the comments. Entries that the defaults hold and the
 settings do not are written as `null`, which takes them away when the text is read over the defaults.
+
+A selection names settings by dotted keys, `*` for every entry of a table: `tracker.classes.*.max_coasting`.
 """
 
 from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -28,13 +30,17 @@ from pipelines.configuration.schema import (
 )
 
 WIDTH = 110
+EVERYTHING = ("",)  # the selection of a whole section
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./ -]*(?<! )")
 
 
-def write_settings(settings: Any, comments: bool = True) -> str:
-    """The YAML text of a settings dataclass; `read_settings(type(settings), text)` gives back an equal one."""
+def write_settings(settings: Any, comments: bool = True, selection: Sequence[str] = EVERYTHING) -> str:
+    """The YAML text of a settings dataclass; `read_settings(type(settings), text)` gives back an equal one.
+
+    Of a `selection` of dotted keys, only these are written, to be read over the same settings.
+    """
     cls = type(settings)
-    lines = _section_lines(Section((cls,)), settings, cls(), comments)
+    lines = _section_lines(Section((cls,)), settings, cls(), comments, selection)
     starts = [k for k, line in enumerate(lines) if line.endswith(":") and not line.startswith((" ", "#"))]
     for start in reversed(starts):  # air between the sections of the top level
         while start > 0 and lines[start - 1].startswith("#"):
@@ -46,41 +52,35 @@ def write_settings(settings: Any, comments: bool = True) -> str:
 
 def scalar_text(value: Any) -> str:
     """A number or a word as YAML: floats keep all digits and stay floats for every YAML reader."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return _float_text(value)
-    if isinstance(value, str):
-        if _PLAIN.fullmatch(value) and yaml.safe_load(value) == value:
-            return value
-        return yaml.safe_dump(value, default_style='"', width=2**31, allow_unicode=True).rstrip("\n")
-    return str(value)
+    if isinstance(value, str) and _PLAIN.fullmatch(value) and yaml.safe_load(value) == value:
+        return value
+    style = '"' if isinstance(value, str) else None
+    text: str = yaml.safe_dump(value, default_style=style, width=2**31, allow_unicode=True)
+    return text.removesuffix("...\n").rstrip("\n")
 
 
-def _float_text(value: float) -> str:
-    if value != value:
-        return ".nan"
-    if value in (float("inf"), float("-inf")):
-        return ".inf" if value > 0 else "-.inf"
-    mantissa, _, exponent = repr(value).partition("e")
-    if not exponent:
-        return mantissa
-    return f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent if exponent[0] in '+-' else '+' + exponent}"
+def _below(selection: Sequence[str], key: str) -> Sequence[str]:
+    """The part of a selection that lies below a key; empty: the key is not selected."""
+    if "" in selection:
+        return EVERYTHING
+    parts = (name.partition(".") for name in selection)
+    return [rest for head, _, rest in parts if head in (key, "*")]
 
 
-def _section_lines(schema: Section, settings: Any, base: Any, comments: bool) -> list[str]:
+def _section_lines(
+    schema: Section, settings: Any, base: Any, comments: bool, selection: Sequence[str] = EVERYTHING
+) -> list[str]:
     entries: list[tuple[list[str], str]] = []
     if len(schema.classes) > 1:
         comment = "one of " + ", ".join(kind_of(cls) for cls in schema.classes) if comments else ""
         entries.append(([f"kind: {scalar_text(kind_of(type(settings)))}"], comment))
     same = type(base) is type(settings)
     for item in settings_of(type(settings)):
-        if len(schema.classes) > 1 and item.name == "kind":
+        below = _below(selection, item.name)
+        if not below or (len(schema.classes) > 1 and item.name == "kind"):
             continue
         before = getattr(base, item.name) if same else None if item.required else item.default()
-        lines = _entry_lines(item.name, _form(item.schema, getattr(settings, item.name), before, comments))
+        lines = _entry_lines(item.name, _form(item.schema, getattr(settings, item.name), before, comments, below))
         entries.append((lines, _comment(item) if comments else ""))
     return _with_comments(entries)
 
@@ -92,19 +92,21 @@ def _comment(item: Setting) -> str:
     return f"{item.comment} ({' | '.join(scalar_text(option) for option in schema.options)})"
 
 
-def _form(schema: Schema, value: Any, base: Any, comments: bool) -> str | list[str]:
+def _form(
+    schema: Schema, value: Any, base: Any, comments: bool, selection: Sequence[str] = EVERYTHING
+) -> str | list[str]:
     """How a value is written: on the line of its key (text), or in lines below it."""
     while isinstance(schema, Nullable) and value is not None:
         schema = schema.value
     match schema:
         case Section():
-            return _section_lines(schema, value, base, comments) or "{}"
+            return _section_lines(schema, value, base, comments, selection) or "{}"
         case Imported() if not isinstance(value, str):
             cls = type(value)
             kind = scalar_text(f"{cls.__module__}:{cls.__qualname__}")
             return [f"kind: {kind}", *_section_lines(Section((cls,)), value, None, comments)]
         case Table(value=inner):
-            return _table_lines(inner, value, base, comments) or "{}"
+            return _table_lines(inner, value, base, comments, selection) or "{}"
         case Listing():
             items = schema.items * len(value) if schema.any_length else schema.items
             forms = [
@@ -117,12 +119,16 @@ def _form(schema: Schema, value: Any, base: Any, comments: bool) -> str | list[s
     return scalar_text(value)
 
 
-def _table_lines(inner: Schema, value: Mapping[str, Any], base: Mapping[str, Any] | None, comments: bool) -> list[str]:
+def _table_lines(
+    inner: Schema, value: Mapping[str, Any], base: Mapping[str, Any] | None, comments: bool, selection: Sequence[str]
+) -> list[str]:
     base = base or {}
     lines: list[str] = []
     for k, (key, entry) in enumerate(value.items()):
         before = base.get(key, None if key == DEFAULT_ENTRY else value.get(DEFAULT_ENTRY))
-        lines += _entry_lines(key, _form(inner, entry, before, comments and k == 0))
+        below = _below(selection, key)
+        if below:
+            lines += _entry_lines(key, _form(inner, entry, before, comments and k == 0, below))
     return lines + [f"{scalar_text(key)}: null" for key in base if key not in value]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory
+from data_tools.files.atomic_files import atomic_directory
 from data_tools.plots import Panel, birds_eye_view, png, trails
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.comparison import COLUMNS, Comparison, compare, table_rows
@@ -17,10 +17,10 @@ from pipelines.configuration import write_settings
 from pipelines.figures import FigureTable
 from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress
-from saga_fg.arrays import IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
-from saga_fg.frame import Detections
+from saga_fg.numerics.arrays import IntArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Detections
 
 METHODS: tuple[Method, ...] = ("centerpoint", "kf", "saga")
 TITLES: dict[Method, str] = {

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.kitti.labels import KittiObjects
+from data_tools.datasets.kitti.labels import KittiObjects
 from data_tools.metrics import (
     HotaFigures,
     KittiSimilarity,
@@ -26,7 +26,7 @@ from data_tools.metrics import (
 )
 from data_tools.metrics.hota import Similarity
 from pipelines.figures import FigureTable, cell
-from saga_fg.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 
 SIMILARITIES: dict[str, Similarity] = {"2D": "bev_iou", "3D": "iou_3d"}
 KITTI_SIMILARITIES: dict[str, KittiSimilarity] = {"image": "image", "2D": "bev_iou", "3D": "iou_3d"}

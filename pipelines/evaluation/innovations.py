@@ -15,7 +15,7 @@ import numpy as np
 from data_tools.metrics import coverages
 from pipelines.explaining import read_events
 from pipelines.figures import FigureTable, cell
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 _COLUMNS = ("class", "matches", "NIS / 2", "median", "in 50 %", "in 90 %", "in 99 %")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.kitti.scored_sequences import ScoredSequence
+from data_tools.datasets.kitti.scored_sequences import ScoredSequence
 from data_tools.metrics import (
     KittiTrackingFigures,
     KittiTrackingSequence,
@@ -22,7 +22,7 @@ from pipelines.evaluation.hota import HotaRow, hota_json, hota_table, kitti_hota
 from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.figures import FigureTable, cell
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 CLASSES = ("car", "pedestrian", "cyclist")
 IOUS = (0.25, 0.5, 0.7)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.label_files import LabelRows, read_label_table
+from data_tools.export.labels import LabelRows, read_label_table
 from data_tools.metrics import TrackTable, coverages
 from data_tools.metrics.labels import (
     LabelledScene,
@@ -26,12 +26,12 @@ from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.figures import FigureTable, cell
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Dataset, Scene
 from saga_fg.errors import InputError
-from saga_fg.sensor import sensor_model
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import gather_evidence
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.sensor import sensor_model
 
 DISTANCES = (0.5, 1.0, 2.0)  # m
 PRECISIONS = (0.9, 0.8, 0.7)

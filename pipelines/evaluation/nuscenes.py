@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.nuscenes import ScoredScene
 from data_tools.metrics import (
     LabelErrors,
     NuScenesTrackingMetrics,
@@ -19,14 +20,13 @@ from data_tools.metrics import (
     label_velocities,
     nuscenes_tracking_metrics,
 )
-from data_tools.nuscenes import ScoredScene
 from data_tools.plots import recall_sweep
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
 from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.evaluation.placed_detections import PlacedBoxes, placed_detections
 from pipelines.figures import FigureTable, cell, count
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 REACH = 1  # keyframes to either side for a label's velocity, 0.5 s
 _COLUMNS = (

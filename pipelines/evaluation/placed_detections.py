@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
+from saga_fg.numerics.arrays import IntArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
 
 PlacedBoxes = tuple[IntArray, Boxes]
 """(moment (N,), boxes (N))"""

@@ -12,10 +12,10 @@ from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.figures import FigureTable, cell
 from pipelines.observers import Innovations
 from pipelines.tracking import OnlineTracker, Progress, track_dataset
-from saga_fg.arrays import FloatArray
-from saga_fg.dataset import Annotations, Dataset
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import Observer
+from saga_fg.types.dataset import Annotations, Dataset
 
 _COLUMNS = (
     *("class", "MOTA", "MOTP", "recall", "IDS", "FP", "FN", "objects", "hidden", "... tracked", "carried error"),

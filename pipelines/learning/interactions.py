@@ -8,7 +8,6 @@ import numpy as np
 
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learned_interactions import LearnedInteractions
 from saga_fg.learning import (
     FORMS_OF_TRACKERS,
     GapSettings,
@@ -19,6 +18,7 @@ from saga_fg.learning import (
     fit_interactions,
     fit_networks,
 )
+from saga_fg.model.learned_interactions import LearnedInteractions
 
 
 def learn_interactions(

@@ -15,8 +15,6 @@ import numpy as np
 from data_tools.sightings import sightings
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress
-from saga_fg.by_class import DEFAULT, class_settings
-from saga_fg.dataset import Dataset, Scene
 from saga_fg.errors import InputError
 from saga_fg.learning import (
     GATE,
@@ -30,9 +28,11 @@ from saga_fg.learning import (
     learn_confusion,
     sample_with_truth,
 )
-from saga_fg.node import ConstantVelocity
-from saga_fg.sensor import NoiseModel, Sensor, sensor_model
+from saga_fg.model.node import ConstantVelocity
 from saga_fg.tracking import ClassSettings, Tracker
+from saga_fg.types.by_class import DEFAULT, class_settings
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.sensor import NoiseModel, Sensor, sensor_model
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from saga_fg.learning import Trajectories
 
 if TYPE_CHECKING:
     from pipelines.config import Family
-    from saga_fg.dataset import Dataset
+    from saga_fg.types.dataset import Dataset
 
 KINDS = ("kitti", "nuscenes", "simulated", "eth_ucy", "argoverse", "file")
 FAMILIES: dict[str, Family] = {"kitti": "kitti", "simulated": "simulated", "file": "file"}  # nuscenes serves the rest
@@ -80,11 +80,11 @@ class TrajectorySource:
         truth, root = self.detections is None, Path(self.place)
         dataset: Dataset
         if self.kind == "kitti":
-            from data_tools.kitti import KittiTracking
+            from data_tools.datasets.kitti import KittiTracking
 
             dataset = KittiTracking(root, self.detections, self.names, truth)
         elif self.kind == "nuscenes":
-            from data_tools.nuscenes import NuScenes, split_scenes
+            from data_tools.datasets.nuscenes import NuScenes, split_scenes
 
             files = {} if self.detections is None else {"lidar": self.detections}
             names = self.names or split_scenes(root, self.version, "all")
@@ -96,15 +96,15 @@ class TrajectorySource:
                 raise InputError(f"--data simulated={self.place}: expected a number of scenes")
             dataset = SimulatedTraffic(scenes=int(self.place))
         elif self.kind == "eth_ucy":
-            from data_tools.eth_ucy import EthUcy
+            from data_tools.datasets.eth_ucy import EthUcy
 
             dataset = EthUcy(root)
         elif self.kind == "argoverse":
-            from data_tools.argoverse import ArgoverseLogs
+            from data_tools.datasets.argoverse2 import ArgoverseLogs
 
             dataset = ArgoverseLogs(root)
         else:
-            from data_tools.detection_files import read_detections
+            from data_tools.datasets.detection_files import read_detections
 
             dataset = read_detections(root)
         return dataset, dataset.scenes if self.names is None else self.names

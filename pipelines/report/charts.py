@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.metrics import LabelErrors, coverages, errors_by_class
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 CURVE_POINTS = 100
 FEWEST = 20  # errors that make a curve

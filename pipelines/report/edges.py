@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from data_tools.metrics import TrackTable
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.edge_rules import EdgeRule
-from saga_fg.interactions import NodeTable
-from saga_fg.node import ConstantVelocity, NodeType
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 MOVING = 2.0  # m/s, from which a track has moved
 VELOCITY_VARIANCE = 1.0  # (m/s)^2, results do not give it

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.detection_files import TrackRows, read_detections, read_tracks
-from data_tools.kitti.scored_sequences import ScoredSequence
+from data_tools.datasets.detection_files import TrackRows, read_detections, read_tracks
+from data_tools.datasets.kitti.scored_sequences import ScoredSequence
+from data_tools.datasets.nuscenes import ScoredScene
 from data_tools.metrics import TrackTable
-from data_tools.nuscenes import ScoredScene
 from pipelines.config import Family, load_config
 from pipelines.report.run_record import RunRecord, read_run_record
 from pipelines.report.scenes import ReportScene
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.dataset import Scene
 
 
 @dataclass(frozen=True, eq=False)

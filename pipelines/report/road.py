@@ -4,8 +4,8 @@
            "colours": [[colour of each light]]}, or null where no frame brought a map
 
 Lengths in cm about the scene's start; lights are counted from 0. A colour is 0 red, 1 amber, 2 green
-(`saga_fg.road.COLOURS`), the one last reported at or before the moment; null before the first report. A report is of
-the light nearest to it, or of none if that is further than `SignalSettings.max_distance` is by default.
+(`saga_fg.model.road.COLOURS`), the one last reported at or before the moment; null before the first report. A report is
+of the light nearest to it, or of none if that is further than `SignalSettings.max_distance` is by default.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Frame
-from saga_fg.road import SIGHTINGS, Lane, SignalSettings, StopLine, TrafficLight
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Frame
+from saga_fg.types.road_map import Lane, StopLine, TrafficLight
+from saga_fg.types.signal import SIGHTINGS, SignalSettings
 
 Colours = list[list[int | None]]
 

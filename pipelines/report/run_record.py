@@ -11,9 +11,9 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from data_tools.atomic_files import write_text
-from data_tools.input_files import read_bytes
-from data_tools.json_stream import parsed_json
+from data_tools.files.atomic_files import write_text
+from data_tools.files.input_files import read_bytes
+from data_tools.files.json_stream import parsed_json
 from saga_fg.errors import InputError
 
 

@@ -24,13 +24,13 @@ from data_tools.metrics import TrackTable
 from pipelines.report.edges import edges_of_moments
 from pipelines.report.road import road_data
 from pipelines.tracking import TrackedScene
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
-from saga_fg.edge_rules import EdgeRule
-from saga_fg.frame import Frame
-from saga_fg.geometry import yaw_of
-from saga_fg.sensor import Sensor, sensor_model
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import yaw_of
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor, sensor_model
 
 Rows = list[list[int | None]]
 UNMEASURED = 1.0  # side of the cube an object of unknown size is drawn as, m

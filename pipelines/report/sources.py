@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.kitti.scored_sequences import read_scored_sequences
-from data_tools.nuscenes import read_scored_scenes
+from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.nuscenes import read_scored_scenes
 from pipelines.evaluation import evaluate_kitti, evaluate_nuscenes
 from pipelines.figures import FigureTable
 from pipelines.report.charts import Chart, accuracy_charts, latency_chart

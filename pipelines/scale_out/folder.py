@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
-from data_tools.atomic_files import LEFTOVER
+from data_tools.files.atomic_files import LEFTOVER
 from saga_fg.errors import InputError
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY

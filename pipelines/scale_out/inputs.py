@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.input_files import open_bytes
-from data_tools.remote_files import local_copy, name_of
+from data_tools.files.input_files import open_bytes
+from data_tools.files.remote_files import local_copy, name_of
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.scale_out.job import OpenedInput, sha256
-from saga_fg.dataset import Dataset, Scene
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class KittiInput:
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
         """With the digests of its text files."""
-        from data_tools.kitti import local_kitti
+        from data_tools.datasets.kitti import local_kitti
 
         with local_kitti(self.dataroot, self.detections, [self.name]) as dataset:
             files = dataset.files(self.name)
@@ -98,7 +98,7 @@ class DetectionFileInput:
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
         """With the digest of the file."""
-        from data_tools.detection_files import read_detections
+        from data_tools.datasets.detection_files import read_detections
 
         with local_copy(self.url) as path:
             yield OpenedInput({name_of(self.url): _file_digest(path)}, lambda: read_detections(path))

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from pipelines.process import one_thread
-from saga_fg.dataset import Dataset
 from saga_fg.errors import SagaError
+from saga_fg.types.dataset import Dataset
 
 Status = Literal["done", "unchanged", "failed"]
 

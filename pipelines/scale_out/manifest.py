@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import PurePosixPath
 from urllib.parse import quote
 
-from data_tools.json_stream import parsed_json
+from data_tools.files.json_stream import parsed_json
 from pipelines.scale_out.folder import OutputFolder, is_inside
 from pipelines.scale_out.job import Outcome, sha256
 from saga_fg.errors import InputError

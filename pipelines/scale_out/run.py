@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
-from data_tools.atomic_files import remove_leftovers
+from data_tools.files.atomic_files import remove_leftovers
 from pipelines.scale_out.folder import OutputFolder
 from pipelines.scale_out.job import Job, Outcome, SceneInput, SceneTask, sha256
 from pipelines.scale_out.manifest import Manifest, Record

@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from data_tools.nuscenes import ResultMeta
+from data_tools.datasets.nuscenes import ResultMeta
 from pipelines.config import Method
 from pipelines.configuration import write_settings
 from pipelines.scale_out.manifest import file_name
 from pipelines.smoothing import SmoothConfig, smooth_dataset
-from saga_fg.dataset import Dataset
 from saga_fg.smoothing import LabelCounts
+from saga_fg.types.dataset import Dataset
 
 LabelForm = Literal["nuscenes", "kitti", "table"]
 
@@ -43,9 +43,9 @@ class SmoothTask:
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the labels; counts objects, and boxes by where they come from."""
-        from data_tools.kitti import KittiTracking, write_kitti_results
-        from data_tools.label_files import write_kitti_labels, write_label_part, write_label_table
-        from data_tools.nuscenes import write_tracking_results
+        from data_tools.datasets.kitti import KittiTracking, write_kitti_results
+        from data_tools.datasets.nuscenes import write_tracking_results
+        from data_tools.export.labels import write_kitti_labels, write_label_part, write_label_table
 
         runs = tuple(smooth_dataset(dataset, self.settings, self.method))
         labels = [(run.scene, run.labels) for run in runs]

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from data_tools.nuscenes import ResultMeta
+from data_tools.datasets.nuscenes import ResultMeta
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
 from pipelines.scale_out.manifest import file_name
 from pipelines.tracking import TrackedScene, track_dataset
-from saga_fg.dataset import Dataset
+from saga_fg.types.dataset import Dataset
 
 ResultFormat = Literal["nuscenes", "kitti", ".csv", ".ndjson", ".jsonl"]
 
@@ -37,9 +37,9 @@ class TrackTask:
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the tracks; counts scenes, frames, tracks and boxes."""
-        from data_tools.detection_files import write_tracks
-        from data_tools.kitti import KittiTracking, write_kitti_results
-        from data_tools.nuscenes import write_tracking_results
+        from data_tools.datasets.detection_files import write_tracks
+        from data_tools.datasets.kitti import KittiTracking, write_kitti_results
+        from data_tools.datasets.nuscenes import write_tracking_results
 
         counts = dict.fromkeys(("frames", "tracks", "boxes"), 0)
         runs = _counted(track_dataset(dataset, lambda: self.settings.new_tracker(self.method)), counts)

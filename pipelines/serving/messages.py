@@ -26,12 +26,12 @@ from typing import Any, Literal, NoReturn, cast
 import numpy as np
 
 from pipelines.serving.settings import StreamSettings
-from saga_fg.arrays import FloatArray
-from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
-from saga_fg.frame import Coordinates, Detections, Frame
-from saga_fg.geometry import yaw_transform
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Coordinates, Detections, Frame
+from saga_fg.types.track import Tracks
 
 Request = Literal["status", "subscribe", "reset"]
 REQUESTS: tuple[Request, ...] = ("status", "subscribe", "reset")

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from data_tools.atomic_files import atomic_file
+from data_tools.files.atomic_files import atomic_file
 from pipelines.serving.value_tree import TreeWriter, read_tree
 from saga_fg.errors import InputError
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from data_tools.atomic_files import check_writable, remove_leftovers
+from data_tools.files.atomic_files import check_writable, remove_leftovers
 from pipelines.serving.seldom import Seldom
 from pipelines.serving.state_file import read_state, write_state
 from pipelines.serving.stream import StreamTracker

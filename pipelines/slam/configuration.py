@@ -9,11 +9,11 @@ from pathlib import Path
 from pipelines.config import Family, TrackConfig
 from pipelines.configuration import load_settings, read_settings
 from pipelines.slam.lidar_slam import LidarSlamSettings
-from saga_fg.ego import JointSettings
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.landmarks import LandmarkDetector
+from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.settings import setting, settings_group
+from saga_fg.slam.joint import JointSettings
 from saga_fg.tracking.provider_names import made_by_name, new_provider
 
 

@@ -13,8 +13,8 @@ from data_tools.lidar import constant_velocity, deskewed
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray
-from saga_fg.geometry import inverse_transform
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
 
 LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: what no registration gets better than, rad and m
 

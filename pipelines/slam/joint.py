@@ -13,8 +13,9 @@ import numpy as np
 
 from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odometry, trajectory_errors
 from pipelines.config import TrackConfig
-from saga_fg.dataset import Scene
-from saga_fg.ego import (
+from saga_fg.errors import InputError
+from saga_fg.graph import FactorProvider
+from saga_fg.slam.joint import (
     JointEstimate,
     JointSettings,
     Observations,
@@ -23,10 +24,9 @@ from saga_fg.ego import (
     estimate_jointly,
     estimate_online,
 )
-from saga_fg.errors import InputError
-from saga_fg.frame import Frame
-from saga_fg.graph import FactorProvider
 from saga_fg.tracking import Tracker
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
@@ -34,9 +34,9 @@ from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.object_tracks import tracks, tracks_csv
 from pipelines.slam.sightings import EDGE, GROUND, WALL
 from pipelines.slam.with_objects import SlamWithObjects
-from saga_fg.arrays import FloatArray
-from saga_fg.geometry import transform_points
-from saga_fg.landmarks import Landmark
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import transform_points
+from saga_fg.types.landmark import Landmark
 
 POLE_HEIGHT = 3.0  # m above the first pose, to which poles are drawn
 _GAP = 2.0  # m between sightings of a wall, beyond which two pieces of it are drawn

@@ -2,7 +2,7 @@
 
     prior         the first pose
     odometry      || log( (T_k^-1 T_(k+1))^-1  D_k ) ||_{P_k}      between successive keyframes
-    landmarks     walls, ground and poles seen from keyframes, told apart online (`saga_fg.landmarks`)
+    landmarks     walls, ground and poles seen from keyframes, told apart online (`saga_fg.slam.mapping`)
     loops         || log( (T_i^-1 T_j)^-1  L_ij ) ||, robust       places that the vehicle came back to
 
 Online, every keyframe is placed when it comes, by the joint Gaussian of pose and landmarks; the whole graph is smoothed
@@ -29,23 +29,15 @@ from pipelines.slam.loop_closures import LoopClosure, LoopSettings, find_loops
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.sightings import Seen, SightingSettings, landmarks_seen
 from pipelines.tracking import Progress
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.ego import JointSettings, OdometryNoise
 from saga_fg.estimators import BatchSolver
-from saga_fg.geometry import inverse_transform
 from saga_fg.graph import Additions, FactorProvider, GraphView
-from saga_fg.landmarks import (
-    Landmark,
-    LandmarkDetector,
-    LandmarkMapper,
-    MapperSettings,
-    MeasuredMotion,
-    Observation,
-    Sighting,
-    Sightings,
-    pose_key,
-)
+from saga_fg.model.landmarks.detector import LandmarkDetector
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.slam.joint import JointSettings, OdometryNoise
+from saga_fg.slam.mapping import LandmarkMapper, MapperSettings, MeasuredMotion, Sighting, Sightings, pose_key
+from saga_fg.types.landmark import Landmark, Observation
 
 OdometrySource = Literal["lidar", "oxts"]
 _START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins

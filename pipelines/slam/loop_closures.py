@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.lidar import RegistrationError, RegistrationSettings, SurfelMap, register, voxel_downsample
-from saga_fg.arrays import FloatArray
-from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.settings import require_between, require_positive, setting, settings_group
 
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.ego import JointEstimate
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.joint import JointEstimate
 
 
 def tracks(estimate: JointEstimate) -> dict[int, FloatArray]:

@@ -32,9 +32,9 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.trajectories import rotation_angle
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
-from saga_fg.geometry import inverse_transform, transform_points
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.settings import require_positive, setting, settings_group
 
 _LOG = logging.getLogger(__name__)

@@ -17,17 +17,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.plaza import BeaconRanges
+from data_tools.datasets.plaza import BeaconRanges
 from data_tools.trajectories import absolute_errors, matched, rigid_alignment
 from factors import Robust, SolverSettings, calibrated_range_factors, prior_factor
 from pipelines.slam.landmark_results import planar_trajectory
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
-from saga_fg.geometry import inverse_transform, transform_points
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
-from saga_fg.landmarks import MeasuredMotion, landmark_key, pose_key
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
 _START = 1e-8  # variance of the first pose, m^2 and rad^2

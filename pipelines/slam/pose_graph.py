@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.pose_graphs import write_g2o
 from pipelines.figures import write_figures
-from saga_fg.arrays import FloatArray
-from saga_fg.pose_graph import OptimisedPoses, PoseGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
 
 
 def write_pose_graph(

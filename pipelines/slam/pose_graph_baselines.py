@@ -17,7 +17,7 @@ import numpy as np
 
 from factors import pose
 from saga_fg.errors import InputError
-from saga_fg.pose_graph import PoseGraph, factor_graph, pose_values
+from saga_fg.slam.pose_graph import PoseGraph, factor_graph, pose_values
 
 _UNCHANGED = 1e-9  # relative change of the error below which iSAM2 counts as converged
 _ROUNDS = 20  # of relinearisation at most, after the last measurement

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.ego import Observations
-from saga_fg.frame import Frame
-from saga_fg.geometry import inverse_transform, transform_points
-from saga_fg.landmarks import Observation, PoleLandmark
+from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.slam.joint import Observations
+from saga_fg.types.frame import Frame
+from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)

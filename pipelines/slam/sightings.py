@@ -20,9 +20,13 @@ from data_tools.lidar import (
     segment_ground,
     straight_edges,
 )
-from saga_fg.arrays import FloatArray
-from saga_fg.landmarks import LandmarkDetector, LaneEdgeLandmark, Observation, PlaneLandmark, PoleLandmark
+from saga_fg.model.landmarks.detector import LandmarkDetector
+from saga_fg.model.landmarks.line import LaneEdgeLandmark
+from saga_fg.model.landmarks.plane import PlaneLandmark
+from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import setting, settings_group
+from saga_fg.types.landmark import Observation
 
 GROUND = PlaneLandmark(name="ground")
 WALL = PlaneLandmark(name="wall")

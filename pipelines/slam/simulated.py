@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import LightSettings, SurroundingSettings

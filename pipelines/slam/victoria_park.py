@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.victoria_park import TreeSightings
+from data_tools.datasets.victoria_park import TreeSightings
 from pipelines.tracking import Progress
-from saga_fg.landmarks import LandmarkMap, LandmarkMapper, MapperSettings, Observation, PointLandmark
+from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.settings import require_between, setting, settings_group
+from saga_fg.slam.mapping import LandmarkMap, LandmarkMapper, MapperSettings
+from saga_fg.types.landmark import Observation
 
 _START = 1e-6  # variance of the first pose, m^2 and rad^2
 

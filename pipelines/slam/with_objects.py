@@ -1,6 +1,6 @@
 """LiDAR SLAM with what moves: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
 
-The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.ego` (detections,
+The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.slam.joint` (detections,
 interactions, objects that stand) are solved as one. Its moments are the keyframes, and scans in between where the
 vehicle is slow, since objects move while it stands. Poses are those of the sensor; detections are brought into its
 frame.
@@ -17,15 +17,15 @@ from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers
-from saga_fg.arrays import FloatArray
-from saga_fg.ego import JointEstimate, Odometry, estimate_jointly, estimate_online
-from saga_fg.ego.record import in_ego
 from saga_fg.errors import InputError
-from saga_fg.frame import Frame
-from saga_fg.geometry import inverse_transform
 from saga_fg.graph import FactorProvider
-from saga_fg.landmarks import Observation
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.slam.joint import JointEstimate, Odometry, estimate_jointly, estimate_online
+from saga_fg.slam.joint.record import in_ego
 from saga_fg.tracking import Tracker
+from saga_fg.types.frame import Frame
+from saga_fg.types.landmark import Observation
 
 _SAME_TIME = 0.01  # s
 

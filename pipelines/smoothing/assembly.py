@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.smoothing.rounds import SmoothedObjects
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_values
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.smoothing import (
     Evidence,
     Headings,
@@ -27,7 +25,9 @@ from saga_fg.smoothing import (
     smooth_headings,
     smooth_walks,
 )
-from saga_fg.track import Tracks
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_values
+from saga_fg.types.track import Tracks
 
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
 

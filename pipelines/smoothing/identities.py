@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 class Identities:

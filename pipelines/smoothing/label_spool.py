@@ -11,12 +11,12 @@ import numpy as np
 
 from pipelines.smoothing.assembly import LabelledStates
 from pipelines.smoothing.lifetimes import Lifetimes
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing import Labels, SmoothingSettings, quality_of
-from saga_fg.track import Tracks
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import is_backwards, weighted_medians
 
 RESOLUTION = 5e-4  # m, of the sizes that are kept

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipelines.tracking import OnlineTracker, Progress
-from saga_fg.arrays import IntArray
-from saga_fg.by_class import class_values
-from saga_fg.frame import Frame
-from saga_fg.sensor import Sensor
+from saga_fg.numerics.arrays import IntArray
 from saga_fg.smoothing.attribution import attribute
 from saga_fg.smoothing.evidence import Evidence, measured_in_order
 from saga_fg.tracking.settings import ClassSettings
+from saga_fg.types.by_class import class_values
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor
 
 UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
 

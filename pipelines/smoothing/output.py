@@ -16,10 +16,10 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from data_tools.atomic_files import atomic_directory
-from data_tools.kitti import KittiTracking, write_kitti_results
-from data_tools.label_files import write_kitti_labels, write_label_table, write_nuscenes_labels
-from data_tools.nuscenes import ResultMeta, write_tracking_results
+from data_tools.datasets.kitti import KittiTracking, write_kitti_results
+from data_tools.datasets.nuscenes import ResultMeta, write_tracking_results
+from data_tools.export.labels import write_kitti_labels, write_label_table, write_nuscenes_labels
+from data_tools.files.atomic_files import atomic_directory
 from pipelines.figures import write_figures
 from pipelines.smoothing.scene import SmoothedScene
 from pipelines.smoothing.streamed import StreamedScene

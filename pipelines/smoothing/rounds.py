@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.by_class import class_values
 from saga_fg.graph import FactorProvider
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
     Lives,
@@ -38,6 +37,7 @@ from saga_fg.smoothing import (
 from saga_fg.tracking import TrackerSettings
 from saga_fg.tracking.provider_names import new_provider
 from saga_fg.tracking.settings import ClassSettings
+from saga_fg.types.by_class import class_values
 
 TAKES_PART = 0.5  # share of the score an object needs that a tracklet needs to become part of one
 MAX_CLAIM = 3.0  # largest distance between a state and a detection it claims, m

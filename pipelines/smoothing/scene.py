@@ -13,10 +13,10 @@ from pipelines.smoothing.config import SmoothConfig
 from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import smooth_objects
 from pipelines.tracking import Progress
-from saga_fg.dataset import Dataset, Scene
 from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
-from saga_fg.track import Tracks
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)

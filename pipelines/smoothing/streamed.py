@@ -34,9 +34,7 @@ from pipelines.smoothing.online import track_evidence
 from pipelines.smoothing.rounds import SmoothedObjects, smooth_objects
 from pipelines.smoothing.stretches import Backlog, StretchSettings, TrackedFrame
 from pipelines.tracking import OnlineTracker, Progress
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.dataset import Scene
-from saga_fg.frame import Frame
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
@@ -45,6 +43,8 @@ from saga_fg.smoothing import (
     measured_in_order,
     size_weights,
 )
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.frame import Frame
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 VEHICLE = (4.6, 1.9, 1.6)  # length, width, height of the box drawn for the vehicle, m
 Colour = tuple[int, int, int]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from data_tools.atomic_files import check_writable
+from data_tools.files.atomic_files import check_writable
 from pipelines.view.drawing import Drawing
 from pipelines.view.to_mcap import load_mcap, write_mcap
 from pipelines.view.to_rerun import load_rerun, write_rerun

@@ -49,9 +49,9 @@ from pipelines.view.drawing import (
     in_order,
     one_colour,
 )
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.boxes import Boxes
 
 TRAIL = 4.0  # s
 SUNK = 2.0  # m, earlier states below the newest ones

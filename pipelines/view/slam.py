@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.input_files import read_bytes
-from data_tools.json_stream import parsed_json
+from data_tools.files.input_files import read_bytes
+from data_tools.files.json_stream import parsed_json
 from data_tools.lidar import read_scan
 from data_tools.trajectories import Trajectory, read_tum_poses
 from pipelines.view.drawing import VEHICLE, Cubes, Drawing, Lines, Marks, Points, Pose, one_colour
-from saga_fg.arrays import FloatArray, checked
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, checked
 
 PATHS = {
     "trajectory": one_colour((90, 90, 200)),

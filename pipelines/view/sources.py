@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from data_tools.kitti import KittiScans
-from data_tools.kitti.scored_sequences import read_scored_sequences
-from data_tools.nuscenes import NuScenes, nuscenes_scans, read_scored_scenes
+from data_tools.datasets.kitti import KittiScans
+from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.nuscenes import NuScenes, nuscenes_scans, read_scored_scenes
 from pipelines.report.results import kitti_results, nuscenes_results, table_results
 from pipelines.view.scenes import SceneView
 

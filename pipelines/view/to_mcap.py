@@ -16,11 +16,11 @@ from typing import Any, assert_never
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_file
+from data_tools.files.atomic_files import atomic_file
 from pipelines.view.drawing import Arrows, Cubes, Drawing, Ellipses, Lines, Marks, Points, Pose
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import MissingExtraError
-from saga_fg.geometry import rotation_quaternion, yaw_quaternion
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import rotation_quaternion, yaw_quaternion
 
 FLAT = 0.04  # height of an ellipse, m
 OPACITY = 0.4  # of solids

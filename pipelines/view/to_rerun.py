@@ -12,11 +12,11 @@ from typing import Any, assert_never
 
 import numpy as np
 
-from data_tools.atomic_files import atomic_file
+from data_tools.files.atomic_files import atomic_file
 from pipelines.view.drawing import Arrows, Cubes, Drawing, Ellipses, Lines, Marks, Points, Pose, Shape
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.geometry import yaw_quaternion
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_quaternion
 
 APPLICATION = "saga-fg"
 FLAT = 0.02  # half height of an ellipse, m

@@ -32,13 +32,13 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian, block_product, joint_block
 from saga_fg.estimators.correction import Gain, solve_lower
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Pass
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped, zeros
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 def smoothed_means(passes: Sequence[Pass]) -> list[FloatArray]:

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import FactorError, Robust, nonlinear_graph
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.block_gaussian import BlockGaussian
@@ -36,7 +35,8 @@ from saga_fg.estimators.sighting import Observations, Sighting
 from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 log = logging.getLogger(__name__)
 

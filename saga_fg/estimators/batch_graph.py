@@ -13,15 +13,15 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from factors import FactorError, SolverSettings, linearised
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.graph_solution import GraphSolution
-from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.point import Point
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.frame import Frame
 
 
 class BatchSolver:

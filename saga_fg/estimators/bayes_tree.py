@@ -12,13 +12,13 @@ import gtsam
 import numpy as np
 
 from factors import nonlinear_graph
-from saga_fg.arrays import IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.cells import Cells
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.sighting import WhitenedRows
+from saga_fg.numerics.arrays import IntArray
 
 
 @dataclass(frozen=True, eq=False)

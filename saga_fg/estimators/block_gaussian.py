@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
 

@@ -26,7 +26,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
@@ -40,7 +39,8 @@ from saga_fg.estimators.overlapping import gathered, propagated
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,13 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from factors.gaussian import native_factor
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.sighting import WhitenedRows
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _WHOLE = 64  # size of a component up to which it is one cell
 _PART = 24  # size of the cells of a larger one

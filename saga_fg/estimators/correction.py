@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
 _BATCHED_BELOW = 10  # size from which a triangular system is worth a call of its own

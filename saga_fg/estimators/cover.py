@@ -16,10 +16,10 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import IntArray
 from saga_fg.estimators.graph_parts import parts
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import Partition
+from saga_fg.numerics.arrays import IntArray
 
 
 @dataclass(frozen=True)

@@ -13,20 +13,21 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import BlockDiagonal, Partition
 from saga_fg.estimators.protocol import require_kind
-from saga_fg.transition import Blocks, Transition
+from saga_fg.model.transition import Blocks, Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _SPARSE_FROM = 100  # size of a component from which its part of F is kept sparse
 
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """x <- F x + b + q, q ~ N(0, Q) over the nodes of `layout` in its order; see `saga_fg.transition.Transition`."""
+    """x <- F x + b + q, q ~ N(0, Q) over the nodes of `layout` in its order; see
+    `saga_fg.model.transition.Transition`."""
 
     layout: Layout
     F: tuple[Blocks, ...]

@@ -20,11 +20,11 @@ import numpy as np
 import scipy.linalg
 
 from factors import Linearisable, linearised
-from saga_fg.arrays import FloatArray
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.elimination_order import Order, sparse_ordering
 from saga_fg.estimators.fixed_point import FixedPoint
 from saga_fg.estimators.layout import Layout
+from saga_fg.numerics.arrays import FloatArray
 
 log = logging.getLogger(__name__)
 

@@ -20,10 +20,10 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import IntArray
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion
+from saga_fg.numerics.arrays import IntArray
 
 log = logging.getLogger(__name__)
 

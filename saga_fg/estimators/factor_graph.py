@@ -27,7 +27,6 @@ from factors import (
     joint_prior_factor,
     prior_factors,
 )
-from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import Layout
@@ -38,7 +37,8 @@ from saga_fg.estimators.sighting import Sighting
 from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Blocks
+from saga_fg.model.transition import Blocks
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
 Factors = list[gtsam.JacobianFactor | ResidualFactors]

@@ -19,7 +19,6 @@ import math
 from numpy.typing import ArrayLike
 
 from factors import Robust
-from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.motion import Motion
@@ -29,7 +28,8 @@ from saga_fg.estimators.recording import GaussNewtonSettings, Recording, Recordi
 from saga_fg.estimators.sighting import Observations, along_the_way
 from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import IntArray
 
 
 class FixedLagSmoother(NewestMarginals):

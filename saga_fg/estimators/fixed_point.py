@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 _MEMORY = 6  # evaluations that are kept
 _GROWTH = 2.0  # of the step, from which the memory misleads

@@ -19,12 +19,12 @@ import scipy.linalg
 
 from factors import ResidualFactors
 from factors.validation import KeyArray
-from saga_fg.arrays import FloatArray, IntArray, checked
 from saga_fg.errors import InputError
-from saga_fg.interactions import POSITION, VELOCITY
-from saga_fg.node import NodeType, NonlinearMotion
-from saga_fg.nonlinear_interactions import AccelerationLaw, held
-from saga_fg.transition import Transition
+from saga_fg.model.interactions import POSITION, VELOCITY
+from saga_fg.model.node import NodeType, NonlinearMotion
+from saga_fg.model.nonlinear_interactions import AccelerationLaw, held
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 
 
 @dataclass(frozen=True, eq=False)

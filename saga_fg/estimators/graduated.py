@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import ResidualFactor, ResidualFactors, Solution, SolverSettings, solve
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_groups import ActiveRows, SingleGroup, StackedGroup
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import setting
 
 log = logging.getLogger(__name__)

@@ -16,11 +16,11 @@ import numpy as np
 from factors import SingularSystemError, SolverSettings, marginal_moments
 from factors.marginal import Elimination
 from factors.singular import singular_system
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.linearisation_points import LinearisationPoints
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import require_between, require_positive, setting
 
 log = logging.getLogger(__name__)

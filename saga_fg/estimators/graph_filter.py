@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
@@ -24,11 +23,12 @@ from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.frame import Frame
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)

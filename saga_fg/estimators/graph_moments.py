@@ -18,7 +18,6 @@ from scipy.sparse.csgraph import connected_components
 
 from factors import FactorError, joint_prior_factor, marginal_factors, marginal_moments
 from factors.marginal import Elimination
-from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, predict
@@ -26,6 +25,7 @@ from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.estimators.prediction import Prediction
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 _SMALL = 64  # size of the largest component that is eliminated by QR
 _LIMIT = 1e8  # variance predicted over process noise, up to which factors keep enough digits

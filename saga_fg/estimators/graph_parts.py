@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 def adjacency(count: int, target: IntArray, source: IntArray) -> scipy.sparse.csr_array:

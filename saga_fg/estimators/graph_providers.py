@@ -14,7 +14,6 @@ from typing import ClassVar
 import numpy as np
 
 from factors import detection_factors, gaussian_factors, prior_factors
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
@@ -23,7 +22,8 @@ from saga_fg.estimators.sighting import Observations
 from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

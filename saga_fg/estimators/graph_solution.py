@@ -12,9 +12,9 @@ import numpy as np
 from factors import marginal_moments
 from factors.marginal import Elimination
 from factors.singular import singular_system
-from saga_fg.arrays import FloatArray
 from saga_fg.estimators.elimination import tree_covariances, width
 from saga_fg.graph.point import Point
+from saga_fg.numerics.arrays import FloatArray
 
 _WIDE = 400  # dimensions of a clique from which QR takes ten times as long as Cholesky
 

@@ -20,18 +20,18 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graph_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.graph_moments import joint_gaussian
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.layout import Layout
-from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.point import Point
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.frame import Frame
 
 
 class IncrementalSmoother:

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import smoothed_means
 from saga_fg.estimators.bayes_tree import BayesTree
@@ -36,7 +35,8 @@ from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting, whitened
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import IntArray
 
 log = logging.getLogger(__name__)
 

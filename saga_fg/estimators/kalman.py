@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
@@ -26,10 +25,11 @@ from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.frame import Frame
 from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.frame import Frame
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
 

@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from factors import SingularSystemError
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import WhitenedFactor, correct_whitened
 from saga_fg.estimators.dynamics import Dynamics, identity, predict
@@ -32,7 +31,6 @@ from saga_fg.estimators.graph_moments import condense
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.partition import Partition
-from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import node_kind
 from saga_fg.graph.parts import NewVariable
@@ -40,7 +38,9 @@ from saga_fg.graph.point import Point
 from saga_fg.graph.providers import FactorProvider, GraphView, ask
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, insert_state
-from saga_fg.transition import Blocks, Transition
+from saga_fg.model.transition import Blocks, Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.frame import Frame
 
 _TOGETHER = -(1 << 62)  # id of the new variables while they are one node
 _UNDETERMINED = 1e-12  # share of its column that is left of a variable which the factors do not determine

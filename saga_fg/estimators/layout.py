@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
 from saga_fg.errors import InputError, UnknownNodeError
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
 
 
 @dataclass(frozen=True, eq=False)

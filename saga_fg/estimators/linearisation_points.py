@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 class LinearisationPoints:

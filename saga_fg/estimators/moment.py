@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct
 from saga_fg.estimators.dynamics import Dynamics, predict
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.sighting import Sighting
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.discretisation import discretise
 from saga_fg.estimators.dynamics import Dynamics, identity
 from saga_fg.estimators.flow import Flow, flows
 from saga_fg.estimators.layout import Layout
-from saga_fg.transition import Blocks, Transition
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.transition import Blocks, Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

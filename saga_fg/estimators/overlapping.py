@@ -14,12 +14,12 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.cover import Cover
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.partition import Partition, zeros
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 def gathered(x: BlockGaussian, partition: Partition, source: IntArray) -> BlockGaussian:

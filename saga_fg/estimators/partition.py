@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators.layout import Layout
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _FEW = 4  # components of a size that are not worth a batched operation of their own
 _PACK = 64  # states that such components together may have

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.partition import Partition
+from saga_fg.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

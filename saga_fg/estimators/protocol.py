@@ -14,10 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
 from saga_fg.errors import InputError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.transition import Transition
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, checked
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import (
     MarginalCovariances,
@@ -32,6 +31,7 @@ from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.estimators.sighting import Sighting
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.settings import setting
 
 log = logging.getLogger(__name__)

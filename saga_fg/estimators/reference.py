@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 class Gaussian(NamedTuple):

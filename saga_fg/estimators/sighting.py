@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from factors import FactorError, MeasurementModel, Robust
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.recording import Recording
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

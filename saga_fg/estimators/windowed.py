@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import Robust
-from saga_fg.arrays import IntArray
 from saga_fg.estimators.backward import future_influence
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording
 from saga_fg.estimators.sighting import Observations, along_the_way
 from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import IntArray
 from saga_fg.settings import require_between, require_positive, setting
-from saga_fg.transition import Transition
 
 _SURE = 5.0  # standard deviations
 

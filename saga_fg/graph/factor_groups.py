@@ -17,8 +17,8 @@ import numpy as np
 from factors import FactorError, Linearisable, ResidualFactor, ResidualFactors, nonlinear_graph, nonlinear_graph_at
 from factors.differences import central_differences
 from factors.gaussian import gaussian_graph, native_factor, whitened_factors
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.graph.point import LARGEST, Point
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 Rows = tuple[tuple[int, ...], ...]
 

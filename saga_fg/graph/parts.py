@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, IntArray
 from saga_fg.graph.factor_groups import FactorGroup, PriorGroup
 from saga_fg.graph.keys import Kind
 from saga_fg.graph.variables import GraphVariable
+from saga_fg.numerics.arrays import BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

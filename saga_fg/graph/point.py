@@ -18,8 +18,8 @@ import numpy as np
 
 from factors import FactorError, Vector
 from factors.gaussian import native_factor
-from saga_fg.arrays import FloatArray
 from saga_fg.graph.variables import GraphVariable, transport
+from saga_fg.numerics.arrays import FloatArray
 
 LARGEST = 1e30  # of whitened numbers, whose squares numbers can hold
 

@@ -23,14 +23,14 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.frame import Frame
 from saga_fg.graph.errors import GraphError, ProviderError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import Kind, key_of
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.frame import Frame
 
 Factors = Sequence[Factor] | gtsam.NonlinearFactorGraph
 

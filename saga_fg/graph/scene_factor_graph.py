@@ -26,7 +26,6 @@ import numpy as np
 from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
 from factors.marginal import Elimination
 from factors.validation import format_key
-from saga_fg.arrays import IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_checks import Factor, grouped
@@ -35,6 +34,7 @@ from saga_fg.graph.keys import Kind, described, key_of
 from saga_fg.graph.parts import FactorEntry, HeldGroup, NewVariable
 from saga_fg.graph.point import Point
 from saga_fg.graph.variables import GraphVariable, insert_state, variable_type
+from saga_fg.numerics.arrays import IntArray
 
 _MARGINALS = "marginals"
 _WIDE = 64  # dimensions that hang together, from which QR takes many times as long as Cholesky

@@ -19,9 +19,9 @@ import gtsam
 import numpy as np
 
 from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
-from saga_fg.arrays import FloatArray
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import Kind
+from saga_fg.numerics.arrays import FloatArray
 
 _STEP = 1e-6
 

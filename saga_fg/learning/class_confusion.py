@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
-from saga_fg.dataset import Scene
 from saga_fg.learning.truth_matches import match_to_truth
-from saga_fg.sensor import Sensor
+from saga_fg.types.dataset import Scene
+from saga_fg.types.sensor import Sensor
 
 FEWEST = 20  # detections of a class that tell what it is taken for
 

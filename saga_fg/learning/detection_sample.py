@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 
 OF_OBJECTS = ("object_label", "object_range", "object_azimuth", "detected")
 

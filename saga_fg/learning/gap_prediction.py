@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.edge_features import EdgeEnds, EdgeFeatures, edge_features
 from saga_fg.errors import InputError
-from saga_fg.interactions import CarFollowing, Interaction, SharedCourse, SharedVelocity
 from saga_fg.learning.gaps import GapSample
+from saga_fg.model.edge_features import EdgeEnds, EdgeFeatures, edge_features
+from saga_fg.model.interactions import CarFollowing, Interaction, SharedCourse, SharedVelocity
+from saga_fg.numerics.arrays import FloatArray
 
 TAILS = 3.0  # degrees of freedom of the innovations
 SUBSTEPS = 2  # of a step: neighbours move on, edges are made anew

@@ -11,10 +11,10 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.columns import Columns
 from saga_fg.learning.independent_filter import FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
 
 
 @dataclass(frozen=True)

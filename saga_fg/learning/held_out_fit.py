@@ -27,16 +27,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_news import News
-from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.learning.gap_prediction import errors_alone
 from saga_fg.learning.gaps import GapSample, GapSettings, sample_gaps
 from saga_fg.learning.interaction_fit import MOST_GAPS, FittedInteractions, fit_interactions
 from saga_fg.learning.joint_gaps import JointGaps
 from saga_fg.learning.own_motion_fit import OwnMotion
 from saga_fg.learning.trajectories import Trajectories
+from saga_fg.model.edge_information import News
+from saga_fg.model.edge_network import EdgeNetwork
+from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 
 TRIED_GAPS = 40  # of a recording
 HIDDEN = News(spread=0.5, unseen_acceleration=2.0)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
 from saga_fg.learning.trajectories import Trajectories
-from saga_fg.node import ConstantVelocity
+from saga_fg.model.node import ConstantVelocity
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.box_filter import MOVING
 
 BIRTH_SPEED = 10.0  # standard deviation of a velocity component before the second sighting, m/s

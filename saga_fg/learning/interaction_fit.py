@@ -15,17 +15,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.edge_features import EdgeFeatures
-from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_rules import VEHICLES, Following, Neighbours
 from saga_fg.errors import InputError
-from saga_fg.interactions import CarFollowing, SharedCourse
 from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample
 from saga_fg.learning.rule_parameters import Rule, RuleParameters
-from saga_fg.nonlinear_interactions import AccelerationLaw
+from saga_fg.model.edge_features import EdgeFeatures
+from saga_fg.model.edge_network import EdgeNetwork
+from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
+from saga_fg.model.interactions import CarFollowing, SharedCourse
+from saga_fg.model.nonlinear_interactions import AccelerationLaw
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.types.by_class import DEFAULT
 
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s

@@ -24,15 +24,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from saga_fg.arrays import FloatArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.edge_rules import Neighbours
 from saga_fg.errors import InputError
 from saga_fg.learning.independent_filter import filter_independently
 from saga_fg.learning.interaction_fit import EXPLAINED_BOUNDS, NOISE_BOUNDS, FittedInteractions
 from saga_fg.learning.joint_gaps import JointGaps
 from saga_fg.learning.rule_parameters import Rule, RuleParameters
 from saga_fg.learning.trajectories import Trajectories
+from saga_fg.model.edge_rules import Neighbours
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.by_class import DEFAULT
 
 
 def fit_interactions_in_view(

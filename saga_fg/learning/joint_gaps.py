@@ -10,17 +10,17 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.discretisation import discretise
-from saga_fg.edge_rules import EdgeRule, build_graph
 from saga_fg.estimators import JointKalmanFilter, Measurements
-from saga_fg.interactions import NodeTable
 from saga_fg.learning.gap_prediction import SUBSTEPS, TURNS_ABOVE
 from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments
 from saga_fg.learning.independent_filter import BIRTH_SPEED, FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
-from saga_fg.node import ConstantVelocity, NodeType
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.by_class import DEFAULT
 
 _H = np.eye(2, 4)
 

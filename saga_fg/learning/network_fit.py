@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.by_class import DEFAULT
-from saga_fg.edge_features import EdgeFeatures
-from saga_fg.edge_network import FEATURES, EdgeNetwork
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.interactions import CarFollowing, SharedCourse, SharedVelocity
 from saga_fg.learning.gap_prediction import Coupling, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample
 from saga_fg.learning.interaction_fit import FittedInteractions, acting_classes, thinned
+from saga_fg.model.edge_features import EdgeFeatures
+from saga_fg.model.edge_network import FEATURES, EdgeNetwork
+from saga_fg.model.interactions import CarFollowing, SharedCourse, SharedVelocity
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.by_class import DEFAULT
 
 HIDDEN = 8  # entries of a message
 EPOCHS = 150

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.by_class import DEFAULT
 from saga_fg.learning.gap_prediction import negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSettings, sample_gaps
 from saga_fg.learning.independent_filter import FilteredTrajectories, filter_independently
 from saga_fg.learning.trajectories import Trajectories
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.by_class import DEFAULT
 
 ACCELERATION_NOISE = tuple(np.geomspace(0.003, 3.0, 7).tolist())  # m^2/s^3
 POSITION_NOISE = (0.01, 0.02, 0.05, 0.1, 0.2)  # m

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from saga_fg.arrays import FloatArray, IntArray, checked
-from saga_fg.by_class import DEFAULT
 from saga_fg.errors import InputError
-from saga_fg.node import ConstantVelocity
+from saga_fg.model.node import ConstantVelocity
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked
+from saga_fg.types.by_class import DEFAULT
 
 FEWEST_OBJECTS = 10  # a class with fewer has the noise of all objects together
 WRONG_REACH = 4.0  # m

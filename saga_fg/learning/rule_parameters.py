@@ -12,8 +12,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.edge_rules import Following, Neighbours
+from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.numerics.arrays import FloatArray
 
 Rule = Following | Neighbours
 

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.by_class import DEFAULT
 from saga_fg.learning.detection_sample import DetectionSample
 from saga_fg.learning.measurement_noise import FEWEST, fit_position_noise, robust_deviation
 from saga_fg.learning.score_calibration import fit_score_calibration
-from saga_fg.sensor import FieldOfView, NoiseModel, ScoreCalibration, Sensor
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.sensor import FieldOfView, NoiseModel, ScoreCalibration, Sensor
 
 FEWEST_CHANCES = 20  # to see an object of a class, for a detection probability of its own
 FEWEST_DETECTIONS = 200  # to tell where a sensor does not look

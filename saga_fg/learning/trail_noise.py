@@ -20,13 +20,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.by_class import class_settings
-from saga_fg.geometry import wrap_angle
 from saga_fg.learning.measurement_noise import FEWEST, LEAST, PRIOR_WIDTH, robust_deviation
 from saga_fg.learning.process_noise import innovation_likelihood
 from saga_fg.learning.trails import Trail
-from saga_fg.sensor import NoiseModel, Sensor, sensor_model
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.by_class import class_settings
+from saga_fg.types.sensor import NoiseModel, Sensor, sensor_model
 
 POSITION = ("position", "range_noise", "bearing_noise")
 LONGEST = 40  # sightings filtered in one piece: longer trails are cut, and side by side take less time

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.association import Assignment
-from saga_fg.dataset import Scene
-from saga_fg.frame import Detections, Frame
 from saga_fg.learning.detection_sample import DetectionSample
-from saga_fg.sensor import Sensor, sensor_model
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking import Tracker
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.sensor import Sensor, sensor_model
 
 FEWEST_DETECTIONS = 5  # of a trail that counts as an object
 SEEN_SHARE = 0.5  # of the frames in which it was in view, at least

@@ -8,11 +8,11 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.boxes import Boxes
-from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)

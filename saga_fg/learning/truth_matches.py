@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.association import assign
-from saga_fg.dataset import Annotations, Scene
 from saga_fg.errors import InputError
-from saga_fg.frame import Detections, Frame
-from saga_fg.geometry import wrap_angle
 from saga_fg.learning.detection_sample import DetectionSample
-from saga_fg.sensor import Sensor, sensor_model
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import assign
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.class_belief import ClassGroups
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.sensor import Sensor, sensor_model
 
 GATE = 4.0  # m; poor sensors err by metres, and wrong matches are taken account of
 

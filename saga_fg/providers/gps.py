@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 
 from factors import Robust, position_factor
-from saga_fg.chi_square import chi_square_quantile
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import require_between, require_positive, setting
 

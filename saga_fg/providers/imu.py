@@ -14,14 +14,14 @@ import gtsam
 import numpy as np
 
 from factors import prior_factor
-from saga_fg.arrays import FloatArray
-from saga_fg.ego_measurements import ImuSamples
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_BIAS, EGO_POSE, EGO_VELOCITY
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.start import StartSettings
 from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.types.ego_measurements import ImuSamples
 
 
 @dataclass(frozen=True)

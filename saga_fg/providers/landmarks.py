@@ -13,17 +13,17 @@ from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import EGO_POSE, LANDMARK
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.landmarks.point import PointLandmark
-from saga_fg.landmarks.protocol import Observation
+from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import require_positive, setting
+from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)
 class Landmarks:
     """Adds sightings of landmarks (`frame.ego.landmarks`), and each landmark when it is first seen.
 
-    Which one is seen is known; its kind is the observation's (`saga_fg.landmarks`).
+    Which one is seen is known; its kind is the observation's (`saga_fg.slam.mapping`).
     """
 
     labels: tuple[str, ...] = setting(

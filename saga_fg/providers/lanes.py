@@ -11,16 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import Robust, lane_keeping_factors, prior_factor
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.edge_rules import VEHICLES
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import MAP_NODE, OBJECT
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.road.polyline import feet, on_it
-from saga_fg.road.road_map import Lane
+from saga_fg.model.edge_rules import VEHICLES
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.polyline import feet, on_it
 from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.types.road_map import Lane
 
 _ALONG = 0.9  # cosine of the angle between a course and a lane within which an object goes along it
 _LETS_GO = 3.0  # standard deviations

@@ -15,14 +15,14 @@ import gtsam
 import numpy as np
 
 from factors import Pose, between_factor, pose
-from saga_fg.arrays import FloatArray
-from saga_fg.ego_measurements import OdometryIncrement
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.start import StartSettings
 from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.types.ego_measurements import OdometryIncrement
 
 _SAME = 1e-4  # relative difference of two intervals that timestamps make
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import relative_detection_factors
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE, OBJECT
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.providers.start import NO_POSE
 
 

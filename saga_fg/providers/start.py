@@ -9,14 +9,14 @@ import gtsam
 import numpy as np
 
 from factors import Pose, pose, pose_prior_factor
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
-from saga_fg.frame import Frame
-from saga_fg.geometry import yaw_of, yaw_transform
 from saga_fg.graph.keys import EGO_POSE
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_of, yaw_transform
 from saga_fg.settings import require_positive, setting
+from saga_fg.types.frame import Frame
 
 NO_POSE = "expected a provider that adds the vehicle's pose before it, such as saga_fg.providers:Odometry"
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import ResidualFactors, Robust
-from saga_fg.arrays import FloatArray
 from saga_fg.graph.keys import OBJECT
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import require_positive, setting
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.association import assign, gate, mahalanobis
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.assignment import assign, gate, mahalanobis
 
 
 def attribute(

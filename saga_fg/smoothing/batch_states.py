@@ -20,18 +20,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from factors import Robust
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.by_class import class_settings
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import BatchSmoother, Births, Measurements, Smoothed, WindowedSmoother
 from saga_fg.graph import FactorProvider
-from saga_fg.interactions import VELOCITY
-from saga_fg.node import NodeType
-from saga_fg.scene_graph import SceneGraph
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.interactions import VELOCITY
+from saga_fg.model.node import NodeType
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.graph_states import Epoch, states_in_graph
 from saga_fg.smoothing.settings import OfflineClass, StandingSettings
 from saga_fg.smoothing.states import Lives, StateTable
+from saga_fg.types.by_class import class_settings
 
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
 UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of a life, m

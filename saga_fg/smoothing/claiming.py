@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import IntArray
+from saga_fg.numerics.arrays import IntArray
 from saga_fg.smoothing.attribution import attribute
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.states import Lives, StateTable

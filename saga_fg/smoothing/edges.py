@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.edge_rules import EdgeRule, build_graph
-from saga_fg.interactions import NodeTable
-from saga_fg.node import NodeType
-from saga_fg.scene_graph import SceneGraph
+from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.node import NodeType
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.smoothing.states import Lives, StateTable
 
 MOVING = 2.0  # speed that is no estimation error, m/s

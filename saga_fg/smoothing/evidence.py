@@ -13,12 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Frame
-from saga_fg.sensor import Sensor, sensor_model
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.observation import observe
 from saga_fg.tracking.settings import ClassSettings
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor, sensor_model
 
 
 @dataclass(frozen=True, eq=False)

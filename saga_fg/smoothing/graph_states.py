@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
 from saga_fg.estimators import BatchSolver, Births, DetectionFactors, Interactions, Measurements
 from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.states import StateTable
-from saga_fg.transition import Transition
 
 log = logging.getLogger(__name__)
 

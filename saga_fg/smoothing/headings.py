@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.random_walk import ScalarReadings, previous_rows, scalar_readings, smooth_walks
 from saga_fg.smoothing.states import Lives, StateTable

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.association import gate
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import gate
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.settings import JoiningSettings
 from saga_fg.smoothing.states import Lives, StateTable

@@ -8,10 +8,10 @@ from typing import Literal, Self, get_args
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, StrArray
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.smoothing.settings import QualitySettings
-from saga_fg.track import Tracks
+from saga_fg.types.track import Tracks
 
 Source = Literal["observed", "filled", "extended"]
 """Observed: the object was detected; filled: between detections; extended: before its online track or after it."""

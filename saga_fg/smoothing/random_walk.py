@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing.states import StateTable
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.states import Lives, StateTable
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from factors import Robust
-from saga_fg.by_class import DEFAULT
 from saga_fg.graph import FactorProvider
-from saga_fg.node import ConstantVelocity
+from saga_fg.model.node import ConstantVelocity
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+from saga_fg.types.by_class import DEFAULT
 
 
 @dataclass(frozen=True)

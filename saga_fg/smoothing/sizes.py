@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 FAR = 20.0  # distance at which a detection's size counts half, m
 

@@ -14,12 +14,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from saga_fg.arrays import IntArray
-from saga_fg.by_class import class_values
+from saga_fg.numerics.arrays import IntArray
 from saga_fg.smoothing.batch_states import Standing
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.settings import OfflineClass, StandingSettings
 from saga_fg.smoothing.states import Lives, StateTable
+from saga_fg.types.by_class import class_values
 
 
 def standing_states(

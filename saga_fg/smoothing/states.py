@@ -9,8 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.columns import Columns
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
 
 
 @dataclass(frozen=True, eq=False)

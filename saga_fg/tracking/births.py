@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_values
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tracking.joint_state import Kinematics
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.tracking.standing import after_evidence, log_density
 from saga_fg.tracking.traffic_flow import TrafficFlow
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_values
 
 
 def newborn(

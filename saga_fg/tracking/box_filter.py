@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.columns import Columns
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import wrap_angle
 
 HEIGHT_DRIFT = 0.1  # standard deviation after one second, m
 MOVING = 2.0  # speed from which the motion tells front from rear, m/s

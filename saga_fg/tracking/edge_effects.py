@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.discretisation import discretise
-from saga_fg.interactions import POSITION, VELOCITY, NodeTable
-from saga_fg.nonlinear_interactions import held
-from saga_fg.scene_graph import Edges, SceneGraph
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable
+from saga_fg.model.nonlinear_interactions import held
+from saga_fg.model.scene_graph import Edges, SceneGraph
+from saga_fg.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

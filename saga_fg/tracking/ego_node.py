@@ -11,17 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.by_class import class_settings
 from saga_fg.errors import InputError
-from saga_fg.frame import Frame
-from saga_fg.geometry import yaw_of
-from saga_fg.interactions import NodeTable
+from saga_fg.model.interactions import NodeTable
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_of
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.ego_pose import RelativePositions
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
+from saga_fg.types.by_class import class_settings
+from saga_fg.types.frame import Frame
 
 EGO_ID = 0  # tracks begin at 1, the road's nodes count down from -1
 _ID = np.array([EGO_ID])

@@ -14,13 +14,13 @@ import gtsam
 import numpy as np
 
 from factors import relative_detection_factors
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.columns import Columns
 from saga_fg.estimators import GraphFilter
-from saga_fg.geometry import inverse_transform, transform_points, yaw_transform
 from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
-from saga_fg.interactions import POSITION
-from saga_fg.node import NodeType
+from saga_fg.model.interactions import POSITION
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.columns import TrackColumns
 from saga_fg.tracking.settings import ExistenceSettings
 

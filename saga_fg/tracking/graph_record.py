@@ -17,8 +17,8 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.arrays import FloatArray
 from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.observer import TrackerView
 
 OWN = {"interactions": "interaction", "detections": "detection", "births": "birth", "marginals": "marginal prior"}

@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.boxes import MAX_POSITION, MAX_SPEED, Boxes
-from saga_fg.by_class import DEFAULT, class_numbers
-from saga_fg.columns import Columns
 from saga_fg.errors import InputError
-from saga_fg.frame import Frame
-from saga_fg.sensor import Sensor, sensor_model
-from saga_fg.track import Tracks
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.settings import GreedySettings
+from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
+from saga_fg.types.by_class import DEFAULT, class_numbers
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor, sensor_model
+from saga_fg.types.track import Tracks
 
 NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 and (m/s)^2
 

@@ -13,19 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factors import RangeRate
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
-from saga_fg.frame import Frame
 from saga_fg.graph import FactorProvider, SceneFactorGraph
-from saga_fg.interactions import POSITION, VELOCITY
-from saga_fg.modes import Mixture, ModeTable
-from saga_fg.node import Motion, NodeType
-from saga_fg.pairwise_costs import CrossCovariances
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.interactions import POSITION, VELOCITY
+from saga_fg.model.modes import Mixture, ModeTable
+from saga_fg.model.node import Motion, NodeType
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
+from saga_fg.numerics.pairwise_costs import CrossCovariances
 from saga_fg.providers import RelativeDetections
-from saga_fg.scene_graph import SceneGraph
 from saga_fg.tracking.ego_pose import RelativePositions, local_pose, relative_covariances
 from saga_fg.tracking.names import EstimatorName
+from saga_fg.types.frame import Frame
 
 _ANYWHERE = 1e5  # m
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate

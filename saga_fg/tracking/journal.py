@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.association import gate, mahalanobis
-from saga_fg.by_class import class_settings
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.assignment import gate, mahalanobis
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.edge_effects import EdgeEffect, edge_effects
 from saga_fg.tracking.graph_record import graph_of_frame
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.observer import Stage, TrackerView
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.types.by_class import class_settings
 
 Event = dict[str, Any]
 LISTED = 5  # candidates of an event

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.boxes import MAX_POSITION, MAX_SPEED
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.joint_state import Kinematics
+from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 
 
 def trackable(now: Kinematics, origin: FloatArray) -> BoolArray:

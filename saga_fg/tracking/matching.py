@@ -13,8 +13,8 @@ strong detection from afar, least of all among many weak ones, and of two detect
 
 Candidates are the pairs of one class inside its gate. The assignment is the one of least total cost (`hungarian`), is
 made cheapest pair first (`greedy`), or registers the graph observed to the graph predicted (`graph`): to the costs
-above come those of `saga_fg.pairwise_costs` between the pairs, of all classes, whose tracks the filter knows to be
-displaced alike.
+above come those of `saga_fg.numerics.pairwise_costs` between the pairs, of all classes, whose tracks the filter knows
+to be displaced alike.
 
 Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
 Generalized Intersection over Union, CVPR 2019.
@@ -27,16 +27,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, distinct
-from saga_fg.association import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
-from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_settings, class_values
-from saga_fg.overlap import paired_giou_3d
-from saga_fg.pairwise_costs import CrossCovariances, pair_costs
-from saga_fg.quadratic_matching import QuadraticMatching
+from saga_fg.numerics.arrays import FloatArray, IntArray, distinct
+from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
+from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
+from saga_fg.numerics.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.class_belief import ClassEvidence
 from saga_fg.tracking.observation import Observed
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_settings, class_values
+from saga_fg.types.overlap import paired_giou_3d
 
 LEAST_CLUTTER = 0.05  # false detections to be reckoned with, however sure the detector is
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 
 
 def duplicates(position: FloatArray, label: StrArray, seen: BoolArray, distance: FloatArray) -> BoolArray:

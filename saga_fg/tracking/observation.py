@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_values
-from saga_fg.frame import Frame
-from saga_fg.road.signal import SIGHTINGS
-from saga_fg.sensor import Sensor
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.tracking.suppression import of_one_class, strongest
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_values
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor
+from saga_fg.types.signal import SIGHTINGS
 
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 

@@ -11,14 +11,14 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.association import Matching
-from saga_fg.boxes import Boxes
 from saga_fg.graph import SceneFactorGraph
-from saga_fg.interactions import NodeTable
-from saga_fg.scene_graph import SceneGraph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.columns import TrackColumns
 from saga_fg.tracking.observation import Observed
+from saga_fg.types.boxes import Boxes
 
 Stage = Literal["predict", "observe", "associate", "update", "believe", "births", "deaths", "report"]
 

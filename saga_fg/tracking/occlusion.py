@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.boxes import Boxes
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.boxes import Boxes
 
 HIDDEN = 0.5  # share from which nobody looks at a box
 

@@ -2,8 +2,8 @@
 
 Nodes of the roadside stand still; their places start where the map has them, as uncertain as the map, and are corrected
 by whatever is seen: of a light itself, and through the interactions of the vehicles that heed a line or keep a lane.
-Ids count down from -1, so that they are never those of tracks. Detections labelled `saga_fg.road.SIGHTINGS` report the
-colour of a light, of the nearest known one within reach.
+Ids count down from -1, so that they are never those of tracks. Detections labelled `saga_fg.model.road.SIGHTINGS`
+report the colour of a light, of the nearest known one within reach.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray, of_classes
-from saga_fg.association import assign, gate, mahalanobis
-from saga_fg.by_class import class_settings
-from saga_fg.frame import Frame
-from saga_fg.interactions import NodeTable
-from saga_fg.node import Motion, RandomWalk
-from saga_fg.road.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, WALL, RoadMap
-from saga_fg.road.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
-from saga_fg.sensor import Sensor
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.node import Motion, RandomWalk
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, of_classes
+from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.tracking.joint_state import JointTrackState, Kinematics
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.types.by_class import class_settings
+from saga_fg.types.frame import Frame
+from saga_fg.types.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, WALL, RoadMap
+from saga_fg.types.sensor import Sensor
+from saga_fg.types.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:

@@ -17,7 +17,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 PRIOR_LOGIT = math.log(0.3 / 0.7)  # of a detection about which its score says nothing
 MANY_SENSORS = 32  # from here on, sensors without a part in any track are forgotten: names come from outside

@@ -7,23 +7,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import get_args
 
-from saga_fg.by_class import DEFAULT, class_settings
-from saga_fg.edge_network import EdgeNetwork
-from saga_fg.edge_rules import EdgeRule, Following, Neighbours, Repulsion
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.modes import Mixture
-from saga_fg.node import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
-from saga_fg.nonlinear_interactions import AccelerationLaw
-from saga_fg.rigid_coupling import Attached
-from saga_fg.road import RoadMap, SignalSettings
-from saga_fg.road.cones import ConeEdge
-from saga_fg.road.lane_keeping import InLane
-from saga_fg.road.stopping import RedLight
+from saga_fg.model.edge_network import EdgeNetwork
+from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion
+from saga_fg.model.modes import Mixture
+from saga_fg.model.node import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
+from saga_fg.model.nonlinear_interactions import AccelerationLaw
+from saga_fg.model.rigid_coupling import Attached
+from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.stopping import RedLight
+from saga_fg.model.stability import require_stable
+from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
-from saga_fg.stability import require_stable
 from saga_fg.tracking.names import AssociationName, EstimatorName
-from saga_fg.turning import Bicycle, CoordinatedTurn
+from saga_fg.types.by_class import DEFAULT, class_settings
+from saga_fg.types.road_map import RoadMap
+from saga_fg.types.signal import SignalSettings
 
 
 @dataclass(frozen=True)

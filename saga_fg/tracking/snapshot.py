@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray
-from saga_fg.association import Assignment
-from saga_fg.scene_graph import SceneGraph
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.columns import TrackColumns

@@ -25,9 +25,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.association import mahalanobis_of_pairs
-from saga_fg.columns import Columns
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.assignment import mahalanobis_of_pairs
+from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.joint_state import Kinematics
 from saga_fg.tracking.settings import StandingSettings
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.overlap import paired_bev_iou, touching_pairs
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.overlap import paired_bev_iou, touching_pairs
 
 
 def strongest(

@@ -7,14 +7,14 @@ as Gaussian as it takes them for: the factor c, of sensor and class, is for that
 of the latest detection says. On the other hand a detector that sees one side of a car misjudges its length, and with it
 the place of its centre along the heading u, in one frame as in the next. No filter averages that away: the shared error
 e. Both are for what is told; the filter and the association, which compare detections with detections, do without them.
-c, e and their growth are the sensor's noise settings, see `saga_fg.sensor`.
+c, e and their growth are the sensor's noise settings, see `saga_fg.types.sensor`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 
 def told_covariance(P: FloatArray, yaw: FloatArray, factor: FloatArray, shared: FloatArray) -> FloatArray:

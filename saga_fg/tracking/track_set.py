@@ -14,19 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.association import Assignment, Matching
-from saga_fg.boxes import Boxes
-from saga_fg.by_class import class_values
-from saga_fg.chi_square import chi_square_quantile
-from saga_fg.edge_rules import EdgeRule, build_graph
-from saga_fg.frame import Frame
 from saga_fg.graph import FactorProvider, SceneFactorGraph
-from saga_fg.interactions import NodeTable
-from saga_fg.pairwise_costs import CrossCovariances
-from saga_fg.scene_graph import SceneGraph
-from saga_fg.sensor import Sensor
-from saga_fg.track import Tracks
+from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.assignment import Assignment, Matching
+from saga_fg.numerics.chi_square import chi_square_quantile
+from saga_fg.numerics.pairwise_costs import CrossCovariances
 from saga_fg.tracking.births import newborn
 from saga_fg.tracking.box_filter import MOVING, BoxFilter
 from saga_fg.tracking.class_belief import ClassEvidence, ClassGroups
@@ -45,6 +40,11 @@ from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.snapshot import TrackSetState, TrackTables
 from saga_fg.tracking.standing import Standing
 from saga_fg.tracking.views import boxes_of, local_origin, nodes_of, passages_of, reported_tracks, speed_deviation
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_values
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor
+from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)
 

@@ -13,16 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from saga_fg.arrays import FloatArray
-from saga_fg.association import Assignment
-from saga_fg.by_class import class_settings
-from saga_fg.edge_rules import EdgeRule
 from saga_fg.errors import InputError
-from saga_fg.frame import LATEST, Frame, finite_seconds
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
-from saga_fg.scene_graph import SceneGraph
-from saga_fg.sensor import Sensor, sensor_model
-from saga_fg.track import Tracks
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.observer import Observer
 from saga_fg.tracking.provider_names import new_provider
@@ -30,6 +26,10 @@ from saga_fg.tracking.roadside import Roadside
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.snapshot import Snapshot
 from saga_fg.tracking.track_set import TrackSet
+from saga_fg.types.by_class import class_settings
+from saga_fg.types.frame import LATEST, Frame, finite_seconds
+from saga_fg.types.sensor import Sensor, sensor_model
+from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)
 

@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray, StrArray
-from saga_fg.columns import Columns
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.settings import FlowSettings
 
 

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.frame import Frame
-from saga_fg.interactions import NodeTable
-from saga_fg.node import NodeType
-from saga_fg.track import Tracks
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.columns import TrackColumns
 from saga_fg.tracking.existence import reported_score
@@ -21,6 +18,9 @@ from saga_fg.tracking.joint_state import Kinematics
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.told_covariance import told_covariance
 from saga_fg.tracking.traffic_flow import Passages
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Frame
+from saga_fg.types.track import Tracks
 
 
 def local_origin(frame: Frame) -> FloatArray:

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 from benchmarks import coasting_trajectories
 from benchmarks.app import app
 from benchmarks.coasting_trajectories import CoastingErrors, CoastingSettings, coasting_figures
-from saga_fg.edge_rules import Following
 from saga_fg.errors import InputError
-from saga_fg.interactions import CarFollowing
 from saga_fg.learning import FittedInteractions, Trajectories, filter_independently, sample_gaps
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.interactions import CarFollowing
 
 
 def test_figures_are_those_of_the_errors_at_the_end_of_each_gap():

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from benchmarks.app import app
 from benchmarks.fusion import of_sensors, survived, without
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Sensor, Tracks
-from saga_fg.sensor import FieldOfView
+from saga_fg.types.sensor import FieldOfView
 
 TIMES = np.arange(0.0, 10.0)
 PLACES = {"a": (10.0, 0.0), "b": (20.0, 0.0), "behind": (-10.0, 0.0), "hidden": (30.0, 5.0)}

@@ -12,7 +12,7 @@ from benchmarks.predictions import prediction_errors
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.config import load_config
 from saga_fg import Detection, Detections, Frame
-from saga_fg.track import Tracks
+from saga_fg.types.track import Tracks
 
 
 class Clairvoyant:

@@ -10,8 +10,8 @@ from benchmarks.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, wit
 from benchmarks.predictions import FOLLOWED
 from data_tools.simulator.trajectories import Trajectories
 from saga_fg import Boxes, Detections, Frame
-from saga_fg.dataset import Annotations, Scene
-from saga_fg.track import Tracks
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.track import Tracks
 
 RATE = 10.0
 IDS = np.array(["vehicle-003", "trailer-003", "vehicle-007"])  # a truck, what it tows, and a truck that tows nothing

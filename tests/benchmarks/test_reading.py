@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from benchmarks.app import app
 from benchmarks.large_tables import VERSION, TableSize, write_large_tables
-from data_tools.nuscenes import NuScenes
+from data_tools.datasets.nuscenes import NuScenes
 
 
 def test_tables_of_any_size_are_tables_of_nuscenes(tmp_path: Path) -> None:

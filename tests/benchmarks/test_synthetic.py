@@ -14,7 +14,7 @@ from benchmarks import synthetic as bench
 from benchmarks.app import app
 from benchmarks.drawn_scenes import INTERVAL, DrawnSettings, drawn_scene
 from pipelines.cli.options import names
-from saga_fg.edge_rules import Neighbours
+from saga_fg.model.edge_rules import Neighbours
 
 SHORT = DrawnSettings(groups=2, members=3, seconds=6.0)
 

@@ -17,7 +17,7 @@ from data_tools.plots import (
     trails,
 )
 from saga_fg import Annotations, Boxes, Detections, Tracks
-from saga_fg.geometry import yaw_transform
+from saga_fg.numerics.geometry import yaw_transform
 
 
 def tracks(timestamp: float, x: float, coasting: float = 0.0) -> Tracks:

@@ -10,7 +10,7 @@ import pytest
 
 from data_tools.pose_graphs import read_g2o, write_g2o
 from saga_fg import InputError
-from saga_fg.pose_graph import factor_graph, pose_values
+from saga_fg.slam.pose_graph import factor_graph, pose_values
 
 PLANAR = """\
 VERTEX_SE2 7 1 0 1.5707963267948966

@@ -9,8 +9,8 @@ import pytest
 
 from data_tools.pose_graphs import city, torus
 from saga_fg import InputError
-from saga_fg.arrays import FloatArray
-from saga_fg.pose_graph import PoseGraph, factor_graph, optimise_poses, pose_values
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph import PoseGraph, factor_graph, optimise_poses, pose_values
 
 Generator = Callable[..., tuple[PoseGraph, FloatArray]]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipelines.config import load_config
 from pipelines.scale_out import DetectionFileInput, Job, Outcome, TrackTask, perform
-from saga_fg.dataset import Dataset
+from saga_fg.types.dataset import Dataset
 
 CONFIG = load_config("file")
 TRACK = TrackTask(CONFIG, "saga", ".csv")

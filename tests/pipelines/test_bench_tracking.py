@@ -23,8 +23,8 @@ from pipelines.cli import app
 from pipelines.config import Family, load_config
 from pipelines.tracking import track_scene
 from saga_fg import InputError
-from saga_fg.edge_rules import Following
-from saga_fg.learned_interactions import LearnedInteractions
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.learned_interactions import LearnedInteractions
 
 FAMILIES: tuple[Family, ...] = ("nuscenes", "kitti", "simulated", "file")
 SHORT = replace(SimulatorSettings(), duration=6.0, warm_up=5.0)

@@ -18,6 +18,7 @@ from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from pipelines.cli import app
+from pipelines.cli.config import FIRST
 from pipelines.cli.options import names, sensor_files
 from saga_fg import InputError
 
@@ -52,15 +53,36 @@ def test_version_is_that_of_the_distribution() -> None:
 
 
 def test_config_prints_yaml_that_leads_to_itself(tmp_path: Path) -> None:
-    printed = saga_fg("config", "--for", "kitti").stdout
+    printed = saga_fg("config", "--full", "--for", "kitti").stdout
     path = tmp_path / "all.yaml"
     path.write_text(printed)
-    assert saga_fg("config", "--for", "file", "--config", path).stdout == printed
+    assert saga_fg("config", "--full", "--for", "file", "--config", path).stdout == printed
     assert set(yaml.safe_load(printed)) == {"tracker", "greedy", "sensors"}
 
 
+@pytest.mark.parametrize("kind", list(FIRST))
+def test_config_begins_with_five_settings_and_leads_to_all(kind: str, tmp_path: Path) -> None:
+    option = () if kind == "tracking" else (f"--{kind}",)
+    printed = saga_fg("config", *option).stdout
+    assert len(FIRST[kind]) == 5
+    for key in FIRST[kind]:
+        value = yaml.safe_load(printed)
+        for part in key.split("."):
+            value = value[next(iter(value)) if part == "*" else part]
+    assert "saga-fg config --full" in printed.splitlines()[0]
+    everything = saga_fg("config", "--full", *option).stdout
+    assert len(printed) < 0.5 * len(everything)
+    path = tmp_path / "first.yaml"
+    path.write_text(printed)
+    assert saga_fg("config", "--full", *option, "--config", path).stdout == everything
+    for kind_of_data in ("nuscenes", "kitti"):
+        defaults = saga_fg("config", "--full", "--for", kind_of_data, *option).stdout
+        path.write_text(saga_fg("config", "--for", kind_of_data, *option).stdout)
+        assert saga_fg("config", "--full", "--for", kind_of_data, *option, "--config", path).stdout == defaults
+
+
 def test_config_prints_the_simulators_settings_and_markdown() -> None:
-    assert "keyframe_rate" in yaml.safe_load(saga_fg("config", "--simulator").stdout)
+    assert "visible_share" in yaml.safe_load(saga_fg("config", "--full", "--simulator").stdout)
     assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout
     assert "## `road`" in saga_fg("config", "--markdown", "--simulator").stdout
 
@@ -189,6 +211,6 @@ def test_an_output_that_cannot_be_written_is_noticed_before_any_work(
 
 def test_the_installed_command_runs_on_its_own(tmp_path: Path) -> None:
     """As a process of its own: a clean stdout, no progress bar where stderr is no terminal."""
-    run = subprocess.run([*SAGA_FG, "config"], capture_output=True, text=True, check=True, cwd=tmp_path)
+    run = subprocess.run([*SAGA_FG, "config", "--full"], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert run.stderr == ""
     assert json.dumps(yaml.safe_load(run.stdout)["tracker"]["max_delay"]) == "0.5"

@@ -10,8 +10,8 @@ from kitti_example import write_sequence
 from nuscenes_random_drive import VERSION, write_random_drive
 from typer.testing import CliRunner, Result
 
+from data_tools.datasets.nuscenes import read_scored_scenes
 from data_tools.metrics import nuscenes_tracking_metrics
-from data_tools.nuscenes import read_scored_scenes
 from pipelines.cli import app
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from data_tools.nuscenes import NuScenes, read_tracking_results
+from data_tools.datasets.nuscenes import NuScenes, read_tracking_results
 from pipelines.cli import app
 
 METHODS = ("saga", "kf", "centerpoint")

@@ -11,8 +11,8 @@ from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
 from pipelines.learning import TrajectorySource
 from saga_fg import InputError
-from saga_fg.edge_rules import Following, Neighbours
 from saga_fg.learning import fit_interactions
+from saga_fg.model.edge_rules import Following, Neighbours
 
 run = CliRunner().invoke
 

@@ -12,9 +12,9 @@ from data_tools.metrics import TrackTable
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.scenes import scene_data
 from saga_fg import Boxes, Frame, Scene
-from saga_fg.frame import Detections
-from saga_fg.geometry import yaw_transform
-from saga_fg.road import Lane, RoadMap, StopLine, TrafficLight
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.frame import Detections
+from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
 
 ORIGIN = (100.0, 50.0)
 LIGHT = TrafficLight("north", (130.0, 50.0))

@@ -18,11 +18,11 @@ import pytest
 from scale_out_example import InThisProcess, content, write_recordings
 from typer.testing import CliRunner, Result
 
-from data_tools.nuscenes import read_tracking_results
+from data_tools.datasets.nuscenes import read_tracking_results
 from pipelines.cli import app
 from pipelines.scale_out import TrackTask
-from saga_fg.dataset import Dataset
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset
 
 COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
 

@@ -16,8 +16,8 @@ from pipelines.cli import app
 from pipelines.scale_out import Manifest, Report, run_scenes
 from pipelines.scale_out.folder import OutputFolder, is_inside
 from pipelines.scale_out.manifest import file_name
-from saga_fg.dataset import Dataset
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset
 
 
 def run(folder: Path, scenes: int = 1) -> Report:

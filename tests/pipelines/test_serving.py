@@ -17,7 +17,7 @@ from pipelines.serving.latency import Latencies
 from pipelines.serving.messages import encode, parse_message
 from pipelines.serving.reordering import Reordering
 from saga_fg import InputError
-from saga_fg.geometry import yaw_of
+from saga_fg.numerics.geometry import yaw_of
 
 SETTINGS = StreamSettings()
 

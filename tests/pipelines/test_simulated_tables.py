@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from typer.testing import CliRunner
 
-from data_tools.detection_files import read_detections
+from data_tools.datasets.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic
 from data_tools.simulator.scenarios import scenario_settings
 from pipelines.cli import app

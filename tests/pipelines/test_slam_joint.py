@@ -21,8 +21,8 @@ from pipelines.slam.joint import keyframes, run_joint
 from pipelines.slam.roadside import RoadsideSettings, observe_poles
 from pipelines.slam.simulated import street
 from saga_fg import InputError
-from saga_fg.ego import JointSettings
-from saga_fg.geometry import yaw_transform
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.slam.joint import JointSettings
 
 SHORT = replace(street(), duration=2.0)
 

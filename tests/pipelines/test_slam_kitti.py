@@ -20,7 +20,7 @@ from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
 from pipelines.slam.sightings import EDGE, POLE
 from saga_fg.errors import InputError
-from saga_fg.geometry import inverse_transform, yaw_transform
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.kitti import KittiScans
+from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan
 from data_tools.simulator.scan_drive import SimulatedScans
 from data_tools.simulator.street import drive, scans, street
@@ -17,8 +17,8 @@ from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.bench.slam import bench_slam
 from pipelines.cli import app
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
-from saga_fg.arrays import FloatArray
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
 
 PERIOD = 0.1
 

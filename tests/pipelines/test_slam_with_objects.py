@@ -18,7 +18,7 @@ from pipelines.slam.kitti import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.with_objects import with_objects
 from saga_fg import Boxes, Detections, Frame, InputError
-from saga_fg.geometry import inverse_transform, yaw_transform
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
 MOVER = np.array([8.0, -1.5]), np.array([7.0, 0.0])  # m, m/s
 

@@ -108,7 +108,7 @@ def test_with_workers(tmp_path: Path, command: tuple[str, str]) -> None:
     assert {path: path.stat().st_mtime_ns for path in done} == done
 
 
-@pytest.mark.parametrize("module", ["typer.core", "gtsam.gtsam", "data_tools.detection_files.formats"])
+@pytest.mark.parametrize("module", ["typer.core", "gtsam.gtsam", "data_tools.datasets.detection_files.formats"])
 def test_while_modules_are_imported(tmp_path: Path, module: str) -> None:
     """Python says on stderr what it has imported, so that the signal can come in between."""
     recording = long_recording(tmp_path)
@@ -136,7 +136,7 @@ MOMENTS = {
 }
 SCRIPT = """
 import os, pathlib, shutil, signal, sys, tempfile, time
-from data_tools.atomic_files import atomic_directory, write_text
+from data_tools.files.atomic_files import atomic_directory, write_text
 from pipelines.cli.termination import Terminated, raise_on_sigterm
 from pipelines.scale_out.folder import OutputFolder
 

@@ -11,8 +11,8 @@ from kitti_example import write_sequence
 from nuscenes_example import VERSION, write_results, write_tables
 from typer.testing import CliRunner
 
-from data_tools.kitti import local_kitti
-from data_tools.remote_files import local_tree
+from data_tools.datasets.kitti import local_kitti
+from data_tools.files.remote_files import local_tree
 from pipelines.cli import app
 from pipelines.scale_out.inputs import KittiInput
 from saga_fg.errors import InputError

@@ -10,14 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.fusion import of_sensors
-from data_tools.detection_files import read_detections, read_tracks
+from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.metrics import difference, paired_bootstrap, root_mean_square, scene_metrics
 from data_tools.simulator import SimulatorSettings, lidar, radar, simulate_scene
 from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import track_scene
-from saga_fg.dataset import Scene
 from saga_fg.errors import InputError
+from saga_fg.types.dataset import Scene
 
 SEEDS = range(500, 506)
 TRAFFIC = SimulatorSettings(duration=6.0, sensors={"lidar": lidar(), "radar": radar()})

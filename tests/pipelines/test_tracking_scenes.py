@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipelines.config import TrackConfig
 from pipelines.tracking import track_dataset, track_scene
 from saga_fg import Detections, Frame, InputError, Scene, Tracks
-from saga_fg.boxes import Boxes
+from saga_fg.types.boxes import Boxes
 
 
 class Recorder:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipelines.config import load_config
 from pipelines.serving.value_tree import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, InputError
-from saga_fg.node import ConstantVelocity
+from saga_fg.model.node import ConstantVelocity
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.traffic_flow import Expected
 
@@ -110,7 +110,7 @@ def test_objects_are_made_again_by_their_constructors():
         [{"object": ["saga_fg.tracking.tracker", "np"], "parts": {}}],
         [{"object": ["saga_fg.tracking.tracker", "InputError"], "parts": {}}],
         [{"object": ["saga_fg.errors", "InputError"], "parts": {}}],
-        [{"object": ["saga_fg.frame", "Frame.__init__"], "parts": {}}],
+        [{"object": ["saga_fg.types.frame", "Frame.__init__"], "parts": {}}],
         [{"object": ["saga_fg.no_such_module", "Frame"], "parts": {}}],
         [{"list": [0]}],
         [1, {"list": [-1]}],

@@ -13,8 +13,8 @@ from kitti_example import write_sequence
 from nuscenes_example import VERSION, tables, write_tables
 from typer.testing import CliRunner
 
+from data_tools.datasets.nuscenes import NuScenes, nuscenes_scans
 from data_tools.lidar import write_ply
-from data_tools.nuscenes import NuScenes, nuscenes_scans
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.trajectories import Trajectory, write_tum_poses
 from pipelines.cli import app

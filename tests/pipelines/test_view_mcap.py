@@ -20,8 +20,8 @@ from pipelines.report import ReportScene, scene_of_run
 from pipelines.tracking import track_scene
 from pipelines.view import Drawing, SceneView, draw_scene, in_order, write_view
 from saga_fg import InputError
-from saga_fg.arrays import FloatArray
-from saga_fg.geometry import yaw_transform
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_transform
 
 ROOT = "/scene-0001"
 

@@ -6,8 +6,8 @@ import numpy as np
 import scipy.linalg
 from random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
+from saga_fg.model.discretisation import discretise
 
 
 class Add(NamedTuple):

@@ -7,8 +7,8 @@ from random_graphs import CAR
 from scipy.spatial import cKDTree
 
 from saga_fg import Edges, SceneGraph
-from saga_fg.discretisation import discretise
 from saga_fg.estimators import Measurements
+from saga_fg.model.discretisation import discretise
 
 
 @dataclass

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from saga_fg.arrays import FloatArray
-from saga_fg.pose_graph import PoseGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph import PoseGraph
 
 
 def moved(dim: int, tangents: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, Edges, NodeType, RandomWalk, SceneGraph
-from saga_fg.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 
 CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
 BUS = NodeType("bus", ConstantAcceleration(jerk_noise=0.4))

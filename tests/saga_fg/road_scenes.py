@@ -6,15 +6,15 @@ import numpy as np
 from estimator_programs import Add, Marginalise, Predict, Update
 
 from saga_fg import ConstantVelocity, NodeType, RandomWalk
-from saga_fg.discretisation import discretise
-from saga_fg.edge_rules import Following, build_graph
 from saga_fg.estimators import Measurements
-from saga_fg.interactions import NodeTable
-from saga_fg.rigid_coupling import Attached
-from saga_fg.road.cone_geometry import ConeGeometry
-from saga_fg.road.cones import ConeEdge
-from saga_fg.road.lane_keeping import InLane
-from saga_fg.road.stopping import RedLight
+from saga_fg.model.cone_geometry import ConeGeometry
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import Following, build_graph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.rigid_coupling import Attached
+from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.stopping import RedLight
 
 CAR = NodeType("vehicle", ConstantVelocity(acceleration_noise=0.5))
 STANDING = NodeType("standing", RandomWalk())

@@ -3,7 +3,7 @@
 import numpy as np
 
 from saga_fg import Boxes, Detections, Frame
-from saga_fg.geometry import inverse_transform, yaw_transform
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
 NAN = float("nan")
 SIZE = (4.5, 1.9, 1.6)

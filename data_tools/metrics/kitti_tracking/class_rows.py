@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.kitti.camera_boxes import camera_boxes_to_world
-from data_tools.kitti.labels import KittiObjects
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.boxes import Boxes
+from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
+from data_tools.datasets.kitti.labels import KittiObjects
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.boxes import Boxes
 
 NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting"}
 MIN_HEIGHT = 25.0  # px

@@ -33,8 +33,8 @@ from data_tools.metrics.kitti_tracking.class_rows import (
 )
 from data_tools.metrics.kitti_tracking.track_scores import track_scores
 from data_tools.metrics.kitti_tracking.trajectories import TrajectoryFigures, trajectory_figures
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.overlap import paired_iou_3d
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.overlap import paired_iou_3d
 
 RECALLS = 40
 

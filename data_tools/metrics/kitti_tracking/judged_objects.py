@@ -18,8 +18,8 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from data_tools.kitti.camera_boxes import camera_boxes_to_world
-from data_tools.kitti.labels import KittiObjects, has_box
+from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
+from data_tools.datasets.kitti.labels import KittiObjects, has_box
 from data_tools.metrics.hota import Compared, HotaFigures, box_similarities, compared_figures
 from data_tools.metrics.kitti_tracking.class_rows import (
     NEIGHBOUR,
@@ -29,7 +29,7 @@ from data_tools.metrics.kitti_tracking.class_rows import (
     in_ignored_area,
     is_small,
 )
-from saga_fg.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 KittiSimilarity = Literal["image", "bev_iou", "iou_3d"]
 

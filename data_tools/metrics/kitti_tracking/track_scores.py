@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 def track_scores(score: FloatArray, identity: IntArray, runs: int) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 class ScoredPairs(NamedTuple):

@@ -16,8 +16,8 @@ import numpy as np
 from data_tools.metrics.consistency import nees
 from data_tools.metrics.nearest_pairs import nearest_pairs
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import wrap_angle
 
 QUANTITIES = ("position", "heading", "size", "velocity", "nees")
 

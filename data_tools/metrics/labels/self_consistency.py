@@ -17,9 +17,9 @@ import numpy as np
 
 from data_tools.metrics.nearest_pairs import nearest_pairs
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.geometry import wrap_angle
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.boxes import Boxes
 
 GATE = 2.0  # between a box and its detection, m
 

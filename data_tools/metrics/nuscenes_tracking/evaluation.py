@@ -21,9 +21,9 @@ from data_tools.metrics.nuscenes_tracking.sightings import sightings
 from data_tools.metrics.nuscenes_tracking.spans import span_figures
 from data_tools.metrics.nuscenes_tracking.sweep import Rows, Sweep, candidate_pairs, sweep
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import FloatArray, checked
-from saga_fg.boxes import Boxes
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.types.boxes import Boxes
 
 
 @dataclass(frozen=True, eq=False)

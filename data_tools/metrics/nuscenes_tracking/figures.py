@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray
 
 SUMMED = frozenset({"gt", "tp", "fp", "fn", "ids", "frag", "mt", "ml"})
 

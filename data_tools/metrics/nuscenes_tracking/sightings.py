@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.metrics.track_table import TrackTable
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.boxes import Boxes
-from saga_fg.columns import Columns
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.types.boxes import Boxes
 
 RACKED = ("bicycle", "motorcycle")
 

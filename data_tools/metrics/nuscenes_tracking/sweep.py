@@ -19,7 +19,7 @@ import numpy as np
 
 from data_tools.metrics.assignment import Candidates, optimal_pairs
 from data_tools.metrics.nuscenes_tracking.sightings import Sightings
-from saga_fg.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,147 @@
+"""Argoverse 2 sensor logs: annotations and poses, in; `Scene`s with ground truth alone, out.
+
+    LOG/annotations.feather            timestamp_ns, track_uuid, category, length_m, width_m, height_m,
+                                       qw, qx, qy, qz, tx_m, ty_m, tz_m (in the ego frame), num_interior_pts
+    LOG/city_SE3_egovehicle.feather    timestamp_ns, qw, qx, qy, qz, tx_m, ty_m, tz_m
+
+A moment is an annotated time (10 Hz). World coordinates are the city's; a box is visible if points lie inside. Classes
+are those of `CLASSES`, and the category in lower case where it is not there.
+
+Source: Wilson et al., Argoverse 2, NeurIPS 2021 datasets track; https://argoverse.github.io/user-guide/. Feather
+needs pyarrow (extra [parquet]).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.central_differences import central_differences
+from data_tools.files.input_files import open_bytes
+from data_tools.files.located import located, unknown
+from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations, Scene
+
+CLASSES = {
+    "REGULAR_VEHICLE": "car",
+    "LARGE_VEHICLE": "truck",
+    "BOX_TRUCK": "truck",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "truck",
+    "BUS": "bus",
+    "SCHOOL_BUS": "bus",
+    "ARTICULATED_BUS": "bus",
+    "VEHICULAR_TRAILER": "trailer",
+}
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_SIZE = ("length_m", "width_m", "height_m")
+_ANNOTATIONS = ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE, "num_interior_pts")
+_LONGEST_GAP = 0.5  # s between boxes of an object, for a velocity
+_REACH = 2  # moments to either side, for a velocity
+
+
+class ArgoverseLogs:
+    """The logs below `root`: folders with annotations.feather and city_SE3_egovehicle.feather.
+
+    Files are read when asked for. Raises `InputError` for a root without any, `MissingExtraError` without pyarrow.
+    """
+
+    def __init__(self, root: str | Path) -> None:
+        self._root = Path(root)
+        self._scenes = tuple(sorted(path.parent.name for path in self._root.glob("*/annotations.feather")))
+        if not self._scenes:
+            raise InputError(f"{self._root}: expected LOG/annotations.feather, there is none")
+        _pyarrow()
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The names of the logs."""
+        return self._scenes
+
+    def scene(self, name: str) -> Scene:
+        """Read a log; raises `InputError` for an unknown name, a missing column, or a time without a pose."""
+        if name not in self._scenes:
+            raise InputError(f"{self._root}: {unknown('log', name, self._scenes)}")
+        path = self._root / name / "annotations.feather"
+        rows = _columns(path, _ANNOTATIONS)
+        stamp: IntArray = rows["timestamp_ns"]
+        stamps, moment = np.unique(stamp, return_inverse=True)
+        poses = self._poses(name, stamps)
+        with located(str(path)):
+            ego_T_box = _transforms(rows)
+            world_T_box = poses[moment] @ ego_T_box
+            category: StrArray = rows["category"].astype(np.str_)
+            label = np.array([CLASSES.get(c, c.lower()) for c in category.tolist()], dtype=np.str_)
+            ids: StrArray = rows["track_uuid"].astype(np.str_)
+            time = (stamps - stamps[0]) * 1e-9 if len(stamps) else np.empty(0)
+            position = world_T_box[:, :3, 3]
+            velocity = central_differences(ids, time[moment], position[:, :2], _LONGEST_GAP, _REACH)
+            size = np.stack([rows[name] for name in _SIZE], axis=1).astype(np.float64)
+            boxes = Boxes(label, position, size, yaw_of(world_T_box[:, :3, :3]), velocity)
+            seen = rows["num_interior_pts"] > 0
+            of_moment = [np.flatnonzero(moment == k) for k in range(len(stamps))]
+            truth = [Annotations(ids[at], boxes.select(at), seen[at]) for at in of_moment]
+        return Scene(name, time, poses, tuple(map(str, stamps.tolist())), [], truth)
+
+    def _poses(self, name: str, stamps: IntArray) -> FloatArray:
+        """city_T_ego (K, 4, 4) at the annotated times."""
+        path = self._root / name / "city_SE3_egovehicle.feather"
+        rows = _columns(path, ("timestamp_ns", *_POSE))
+        order = np.argsort(rows["timestamp_ns"])
+        known = rows["timestamp_ns"][order]
+        at = np.minimum(np.searchsorted(known, stamps), max(len(known) - 1, 0))
+        absent = known[at] != stamps if len(known) else np.ones(len(stamps), dtype=bool)
+        if absent.any():
+            raise InputError(
+                f"{path}: timestamp_ns: expected a pose at every annotated time, {stamps[absent][0]} has none"
+            )
+        with located(str(path)):
+            return _transforms(rows)[order][at]
+
+
+def _transforms(rows: dict[str, Any]) -> FloatArray:
+    """(N, 4, 4) of the pose columns."""
+    quaternion, translation = (np.stack([rows[name] for name in names], axis=1) for names in (_POSE[:4], _POSE[4:]))
+    T = np.tile(np.eye(4), (len(quaternion), 1, 1))
+    T[:, :3, :3] = quaternion_rotation(checked_quaternions("qw qx qy qz", quaternion))
+    T[:, :3, 3] = translation
+    return T
+
+
+def _columns(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    """The named columns of a Feather file as arrays."""
+    arrow = _pyarrow()
+    try:
+        with open_bytes(path) as file:
+            table = arrow.feather.read_table(file)
+            missing = [name for name in names if name not in table.column_names]
+            if missing:
+                there = ", ".join(table.column_names)
+                raise InputError(f"{path}: {missing[0]}: expected this column, the file has {there}")
+            table = table.select(list(names))
+            table.validate(full=True)  # its C++ trusts what it has read
+            empty = [name for name in names if table[name].null_count]
+            if empty:
+                raise InputError(f"{path}: {empty[0]}: expected a value in every row")
+            columns = {name: table[name].to_numpy() for name in names}
+    except (OSError, UnicodeDecodeError, arrow.ArrowException) as error:  # names of columns are decoded on demand
+        raise InputError(f"{path}: expected a readable Feather file: {str(error).splitlines()[0]}") from error
+    for name, column in columns.items():
+        kinds = {"timestamp_ns": "iu", "track_uuid": "OU", "category": "OU"}.get(name, "iuf")
+        if column.dtype.kind not in kinds:
+            expected = "text" if kinds == "OU" else "whole numbers" if kinds == "iu" else "numbers"
+            raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
+    return columns
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow.feather
+    except ImportError as error:
+        raise MissingExtraError("Argoverse logs: Feather needs pyarrow: pip install 'saga-fg[parquet]'") from error
+    return pyarrow

@@ -1,0 +1,61 @@
+"""Anyone's own detections in, tracks out, as plain tables: CSV, newline-delimited JSON, NumPy arrays.
+
+One row per detection. The same columns in every format; only the first three are required:
+
+    timestamp             s, any epoch; must not decrease within a scene
+    x, y                  centre, m
+    z                     centre, m                                  default 0
+    length, width, height m                                          default unknown
+    yaw                   rad, from x towards y                      default unknown
+    vx, vy                m/s over ground                            default unknown
+    range_rate            m/s over ground along the horizontal line of sight from the sensor, positive when the object
+                          moves away; needs ego_x, ego_y, ego_yaw    default unknown
+    score                 any finite number, higher is surer         default 1
+    label                 class name                                 default "object"
+    sensor                name of the sensor                         default "sensor"
+    scene                 name of the recording                      default the file's name
+    coordinates           "world", "ego" or "sensor"                 default "world"
+    ego_x, ego_y, ego_yaw pose of the vehicle, m and rad             required unless coordinates is "world", or the
+    ego_z                 m                                          vehicle measures itself; ego_z: default 0
+    odometry_x, odometry_y, odometry_yaw, odometry_dt                default unknown
+                          how the vehicle has moved over the last odometry_dt s, in its frame of then, m and rad
+    gps_x, gps_y, gps_z   its place as measured, m                   default unknown
+
+Rows with the same scene, timestamp and sensor are one frame. A row whose x and y are both left out says that the sensor
+looked and saw nothing (in NumPy arrays, which cannot leave anything out: a boolean array `empty`).
+
+CSV has a header line with the names of its columns, in any order; what is unknown is left empty:
+
+    timestamp,sensor,label,x,y,length,width,yaw,score
+    0.0,lidar,car,10.2,3.1,4.5,1.9,0.02,0.91
+    0.0,lidar,pedestrian,4.0,-2.0,,,,0.40
+    0.1,lidar,,,,,,,
+
+Newline-delimited JSON (.ndjson, .jsonl) has an object with the same names on each line; what is unknown is left out:
+
+    {"timestamp": 0.0, "sensor": "lidar", "label": "car", "x": 10.2, "y": 3.1, "yaw": 0.02, "score": 0.91}
+    {"timestamp": 0.1, "sensor": "lidar"}
+
+NumPy archives (.npz, without pickled objects) have an array for each column, all of one length:
+
+    np.savez("detections.npz", timestamp=[0.0, 0.1], x=[10.2, 0.0], y=[3.1, 0.0], empty=[False, True])
+
+Tracks are written with the same columns and, besides, id, cov_xx, cov_xy, cov_yy (covariance of the horizontal
+position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coasting (s since the last detection).
+"""
+
+from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.track_rows import TrackRows, read_tracks
+from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
+
+__all__ = [
+    "TRACK_COLUMNS",
+    "DetectionFile",
+    "TrackRows",
+    "read_detections",
+    "read_scenes_in_parts",
+    "read_tracks",
+    "track_rows",
+    "write_rows",
+    "write_tracks",
+]

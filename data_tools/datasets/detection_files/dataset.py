@@ -1,0 +1,219 @@
+"""A table of detections as a dataset: rows with the same scene, time and sensor become frames."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from data_tools.datasets.detection_files.columns import POSE, RawTable
+from data_tools.datasets.detection_files.ego_columns import EgoColumns
+from data_tools.datasets.detection_files.formats import read_raw_parts, read_raw_table
+from data_tools.files.located import located, unknown
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Coordinates, Detections, Frame
+
+_COORDINATES = ("world", "ego", "sensor")
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The checked table: N rows, of which those that are not `empty` hold a detection."""
+
+    raw: RawTable
+    scene: StrArray
+    timestamp: FloatArray
+    sensor: StrArray
+    coordinates: StrArray
+    empty: BoolArray
+    detections: Detections
+    pose: FloatArray | None  # (N, 4): x, y, z, yaw
+    ego: EgoColumns | None
+
+
+class DetectionFile:
+    """The scenes of one table of detections. See the package for its columns.
+
+    A scene's moments are all times at which some sensor spoke; without pose columns its poses are the identity.
+    """
+
+    def __init__(self, table: RawTable) -> None:
+        """Check everything. Raises `InputError` naming file, row and column."""
+        self._rows = _checked(table)
+        names, first = np.unique(self._rows.scene, return_index=True)
+        self._scenes = tuple(names[np.argsort(first)].tolist())
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The names of the scenes, in the order of the file."""
+        return self._scenes
+
+    def scene(self, name: str) -> Scene:
+        """One of the scenes; raises `InputError` for an unknown name."""
+        path = self._rows.raw.path
+        if name not in self._scenes:
+            raise InputError(f"{path}: {unknown('scene', name, self._scenes)}")
+        rows = np.flatnonzero(self._rows.scene == name)
+        times, moment = np.unique(self._rows.timestamp[rows], return_inverse=True)
+        with located(f"{path}: scene {name}"):
+            poses = self._poses(rows, moment, len(times))
+            world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
+            return Scene(name, times, world_T_ego, ("",) * len(times), self._frames(rows, moment, poses))
+
+    @property
+    def with_poses(self) -> bool:
+        """Whether the table says where the vehicle was."""
+        return self._rows.pose is not None
+
+    def _poses(self, rows: IntArray, moment: IntArray, count: int) -> FloatArray | None:
+        """world_T_ego (K, 4, 4) of the moments of a scene, None without pose columns."""
+        if self._rows.pose is None:
+            return None
+        pose = self._rows.pose[rows]
+        _, first = np.unique(moment, return_index=True)
+        other = (pose != pose[first][moment]).any(axis=1)
+        if other.any():
+            row = int(rows[np.argmax(other)])
+            raise self._rows.raw.fault(row, "ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time, got another")
+        return np.array([yaw_transform(*pose[k]) for k in first.tolist()]).reshape(count, 4, 4)
+
+    def _frames(self, rows: IntArray, moment: IntArray, poses: FloatArray | None) -> list[Frame]:
+        table = self._rows
+        sensors, sensor = np.unique(table.sensor[rows], return_inverse=True)
+        key = moment * len(sensors) + sensor
+        order = np.argsort(key, kind="stable")
+        starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+        frames = []
+        for group in np.split(order, starts[1:]):
+            k = int(moment[group[0]])
+            members = rows[group]
+            kind = table.coordinates[members]
+            if (kind != kind[0]).any():
+                row = int(members[np.argmax(kind != kind[0])])
+                raise table.raw.fault(row, "coordinates: expected the same in all rows of a frame")
+            frames.append(
+                Frame(
+                    timestamp=float(table.timestamp[members[0]]),
+                    sensor=str(table.sensor[members[0]]),
+                    detections=table.detections.select(members[~table.empty[members]]),
+                    world_T_ego=None if poses is None else poses[k],
+                    coordinates=cast(Coordinates, str(kind[0])),
+                    ego=None if table.ego is None else table.ego.measured(members),
+                )
+            )
+        return frames
+
+
+def read_detections(path: str | Path) -> DetectionFile:
+    """Read a table of detections, .csv, .ndjson, .jsonl or .npz. Raises `InputError` naming file, row and column."""
+    return DetectionFile(read_raw_table(Path(path)))
+
+
+def read_scenes_in_parts(
+    path: str | Path, rows: int = 50_000, scenes: Collection[str] | None = None
+) -> Iterator[Scene]:
+    """The scenes of a table as they come, each as successive `Scene`s of about `rows` rows: without holding them all.
+
+    scenes: the names of those wanted, None for all
+
+    Raises `InputError` as `read_detections` does, when it comes to the row; where a scene goes on after another; and at
+    the end, for names that did not come.
+    """
+    done: set[str] = set()
+    name, latest, with_poses = "", -np.inf, None
+    for table in read_raw_parts(Path(path), rows=rows):
+        part = DetectionFile(table)
+        if with_poses not in (None, part.with_poses):
+            raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
+        with_poses = part.with_poses
+        for scene in (part.scene(name) for name in part.scenes):
+            if scene.name in done:
+                raise InputError(f"{path}: scene {scene.name}: expected its rows together, it goes on after {name}")
+            if scene.name != name:
+                done.add(name)
+                name, latest = scene.name, -np.inf
+            if scene.timestamps[0] <= latest:
+                raise InputError(
+                    f"{path}: {table.where(0)}: timestamp: expected rows in order of time, "
+                    f"time runs backwards at {scene.timestamps[0]} s"
+                )
+            latest = float(scene.timestamps[-1])
+            if scenes is None or name in scenes:
+                yield scene
+    for wanted in scenes or ():
+        if wanted not in done and wanted != name:
+            raise InputError(f"{path}: {unknown('scene', wanted, tuple(sorted({*done, name} - {''})))}")
+
+
+def _checked(raw: RawTable) -> _Rows:
+    if raw.length == 0:
+        raise InputError(f"{raw.path}: expected at least one row, the table is empty")
+    timestamp = raw.numbers("timestamp")
+    _require(raw, np.isfinite(timestamp), "timestamp", timestamp, "a finite number of seconds")
+    scene = raw.texts("scene", raw.path.stem)
+    _check_order(raw, scene, timestamp)
+    empty = raw.flags("empty") | (~raw.present("x") & ~raw.present("y"))
+    coordinates = raw.texts("coordinates", "world")
+    strange = ~np.isin(coordinates, _COORDINATES)
+    if strange.any():
+        row = int(np.argmax(strange))
+        raise raw.fault(row, f"coordinates: expected world, ego or sensor, got {str(coordinates[row])!r}")
+    ego = EgoColumns.of(raw)
+    pose = _pose(raw, coordinates, ego is not None)
+    detections = box_columns(raw, empty)
+    return _Rows(raw, scene, timestamp, raw.texts("sensor", "sensor"), coordinates, empty, detections, pose, ego)
+
+
+def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
+    order = np.argsort(scene, kind="stable")
+    late = (np.diff(timestamp[order]) < 0) & (scene[order][1:] == scene[order][:-1])
+    if late.any():
+        row = int(order[1:][np.argmax(late)])
+        raise raw.fault(row, f"timestamp: expected rows in order of time, time runs backwards at {timestamp[row]} s")
+
+
+def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
+    """Boxes and scores of all rows; those of empty rows hold zeros and are never looked at."""
+    position = np.stack([raw.numbers("x"), raw.numbers("y"), raw.numbers("z", 0.0)], axis=-1)
+    position[empty] = 0.0
+    for axis, name in enumerate("xyz"):
+        column = position[:, axis]
+        _require(raw, np.isfinite(column), name, column, "a finite number of metres")
+    size = np.stack([raw.numbers(name) for name in ("length", "width", "height")], axis=-1)
+    size[empty] = np.nan
+    for axis, name in enumerate(("length", "width", "height")):
+        column = size[:, axis]
+        _require(raw, ~(column <= 0), name, column, "a positive number of metres")
+    score = np.where(empty, 0.0, raw.numbers("score", 1.0))
+    _require(raw, np.isfinite(score), "score", score, "a finite number")
+    velocity = np.stack([raw.numbers("vx"), raw.numbers("vy")], axis=-1)
+    boxes = Boxes(raw.texts("label", "object"), position, size, raw.numbers("yaw"), velocity)
+    return Detections(boxes, score, np.where(empty, np.nan, raw.numbers("range_rate")))
+
+
+def _pose(raw: RawTable, coordinates: StrArray, estimated: bool) -> FloatArray | None:
+    """(N, 4); None where there are none, as there may where the vehicle's own measurements stand in for them."""
+    given = [name for name in POSE if raw.present(name).any()]
+    if not given:
+        if (coordinates != "world").any() and not estimated:
+            row = int(np.argmax(coordinates != "world"))
+            raise raw.fault(row, f"coordinates: {coordinates[row]} needs the columns ego_x, ego_y and ego_yaw")
+        return None
+    columns = {name: raw.numbers(name, 0.0 if name == "ego_z" else np.nan) for name in POSE}
+    for name, column in columns.items():
+        _require(raw, np.isfinite(column), name, column, f"a finite number, since {given[0]} is given")
+    return np.stack(list(columns.values()), axis=-1)
+
+
+def _require(raw: RawTable, good: BoolArray, name: str, column: FloatArray, expected: str) -> None:
+    if not good.all():
+        row = int(np.argmin(good))
+        got = f"got {column[row]:g}" if raw.present(name)[row] else "it is left out"
+        raise raw.fault(row, f"{name}: expected {expected}, {got}")

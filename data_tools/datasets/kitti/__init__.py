@@ -1,0 +1,30 @@
+"""KITTI tracking: official poses, calibration and labels, and detections as text, in; official result text out."""
+
+from data_tools.datasets.kitti.calibration import Calibration, read_calibration
+from data_tools.datasets.kitti.camera_boxes import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
+from data_tools.datasets.kitti.dataset import KittiTracking
+from data_tools.datasets.kitti.image_boxes import image_boxes, observation_angles
+from data_tools.datasets.kitti.labels import KittiObjects, has_box, read_kitti_labels
+from data_tools.datasets.kitti.oxts import read_poses
+from data_tools.datasets.kitti.remote import local_kitti
+from data_tools.datasets.kitti.tracking_results import kitti_result_text, write_kitti_results
+from data_tools.datasets.kitti.velodyne import KittiScans
+
+__all__ = [
+    "Calibration",
+    "CameraBoxes",
+    "KittiObjects",
+    "KittiScans",
+    "KittiTracking",
+    "camera_boxes_to_world",
+    "has_box",
+    "image_boxes",
+    "kitti_result_text",
+    "local_kitti",
+    "observation_angles",
+    "read_calibration",
+    "read_kitti_labels",
+    "read_poses",
+    "world_boxes_to_camera",
+    "write_kitti_results",
+]

@@ -1,0 +1,89 @@
+"""KITTI tracking labels and results: one object a line,
+
+    frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y [score]
+
+2D boxes in pixels, sizes and positions in m in the rectified camera frame (bottom centre), angles in rad. `DontCare`
+lines mark regions of the image and have id -1. `Person` is the other name of `Person_sitting`. Source: development kit
+of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.datasets.kitti.camera_boxes import CameraBoxes
+from data_tools.files.located import unknown
+from data_tools.files.text_tables import TextTable, read_table
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
+
+TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
+
+_IMAGE_COLUMNS = ("truncated", "occluded", "alpha", "x1", "y1", "x2", "y2")
+_BOX_COLUMNS = ("h", "w", "l", "x", "y", "z", "rotation_y", "score")
+_NO_BOX = -999.0  # positions below: the object has no 3D box
+
+
+@dataclass(frozen=True, eq=False)
+class KittiObjects(Columns):
+    """Objects of a sequence, N lines as columns, in the order of the file.
+
+    frame (N,), track_id (N,), type (N,) as in the file, truncated (N,), occluded (N,), alpha (N,), bbox (N, 4) left,
+    top, right, bottom, boxes (N), score (N,) NaN where there is none.
+    """
+
+    frame: IntArray
+    track_id: IntArray
+    type: StrArray
+    truncated: FloatArray
+    occluded: FloatArray
+    alpha: FloatArray
+    bbox: FloatArray
+    boxes: CameraBoxes
+    score: FloatArray
+
+
+def read_kitti_labels(path: str | Path) -> KittiObjects:
+    """Read a label or result file. Raises `InputError` naming line and column of what is not as it should be."""
+    table = read_table(Path(path), (17, 18), "frame id type truncated ... rotation_y [score]")
+    with_score = table.values.shape[1] == 18
+    numbers = table.numbers(slice(3, None), _IMAGE_COLUMNS + _BOX_COLUMNS)
+    objects = KittiObjects(
+        frame=table.integers(0, "frame", 0),
+        track_id=table.integers(1, "id", -1),
+        type=np.where(table.values[:, 2] == "Person", "Person_sitting", table.values[:, 2]),
+        truncated=numbers[:, 0],
+        occluded=numbers[:, 1],
+        alpha=numbers[:, 2],
+        bbox=numbers[:, 3:7],
+        boxes=CameraBoxes(numbers[:, 7:10], numbers[:, 10:13], numbers[:, 13]),
+        score=numbers[:, 14] if with_score else np.full(len(table), np.nan),
+    )
+    _check(table, objects)
+    return objects
+
+
+def _check(table: TextTable, objects: KittiObjects) -> None:
+    strange = ~np.isin(objects.type, TYPES)
+    if strange.any():
+        row = int(np.argmax(strange))
+        raise table.fault(row, f"type: {unknown('class', str(objects.type[row]), TYPES)}")
+    flat = has_box(objects) & (objects.boxes.size <= 0).any(axis=1)
+    if flat.any():
+        row = int(np.argmax(flat))
+        raise table.fault(row, f"h w l: expected a positive size in m, got {objects.boxes.size[row].tolist()}")
+    tracked = np.flatnonzero(objects.track_id >= 0)
+    pairs = np.stack([objects.frame[tracked], objects.track_id[tracked]], axis=1)
+    _, first = np.unique(pairs, axis=0, return_index=True)
+    if len(first) < len(tracked):
+        row = int(np.setdiff1d(np.arange(len(tracked)), first)[0])
+        frame, id_ = pairs[row].tolist()
+        raise table.fault(int(tracked[row]), f"id: expected each track once a frame, {id_} is in frame {frame} again")
+
+
+def has_box(objects: KittiObjects) -> BoolArray:
+    """Which objects (N,) have a 3D box; `DontCare` regions and results of image trackers have none."""
+    return np.asarray((objects.type != "DontCare") & (objects.boxes.location > _NO_BOX).all(axis=1))

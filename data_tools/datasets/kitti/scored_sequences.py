@@ -1,0 +1,96 @@
+"""Tracking results in KITTI's text format beside the labels: as the benchmark scores them, and in world coordinates.
+
+Velocities and covariances come from the table `tracks.csv` beside the results, if there is one; else they are unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.datasets.detection_files import TrackRows, read_tracks
+from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
+from data_tools.datasets.kitti.dataset import FRAME_PERIOD, KittiTracking
+from data_tools.datasets.kitti.labels import KittiObjects, has_box, read_kitti_labels
+from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
+from data_tools.files.located import located
+from data_tools.metrics.track_table import TrackTable
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.types.dataset import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredSequence:
+    """One sequence: the lines of its label file and of the result, and both as boxes in world coordinates.
+
+    scene  with the detections, if they were given
+    """
+
+    labels: KittiObjects
+    result: KittiObjects
+    scene: Scene
+    truth: TrackTable
+    found: TrackTable
+
+
+def read_scored_sequences(
+    result: str | Path,
+    dataroot: str | Path,
+    sequences: Collection[str] | None = None,
+    detections: str | Path | None = None,
+) -> dict[str, ScoredSequence]:
+    """The chosen sequences by name (None: all that folder `result` has a file for).
+
+    Raises `InputError` for missing or broken files, and for results beyond the end of a sequence.
+    """
+    folder = Path(result)
+    if sequences is None:
+        sequences = sorted(path.stem for path in folder.glob("[0-9]*.txt"))
+        if not sequences:
+            raise InputError(f"{folder}: expected results NNNN.txt, there are none")
+    dataset = KittiTracking(dataroot, detections, sequences, ground_truth=True)
+    table = read_tracks(folder / TRACK_TABLE) if (folder / TRACK_TABLE).exists() else None
+    return {name: _scored(folder / f"{name}.txt", name, dataset, table) for name in dataset.scenes}
+
+
+def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | None) -> ScoredSequence:
+    if not path.is_file():
+        raise InputError(f"{path}: expected the results of sequence {name}, there is no such file")
+    scene = dataset.scene(name)
+    result = read_kitti_labels(path)
+    if len(result) and result.frame.max() >= len(scene):
+        raise InputError(f"{path}: frame {result.frame.max()}: expected frames 0 to {len(scene) - 1} only")
+    world_T_camera = scene.world_T_ego @ inverse_transform(dataset.calibration(name).camera_T_imu)
+    with located(str(path)):
+        found = _in_world(result, world_T_camera)
+    if table is not None:
+        found = _with_motion(found, table, name)
+    assert scene.ground_truth is not None
+    return ScoredSequence(dataset.labels(name), result, scene, TrackTable.of_annotations(scene.ground_truth), found)
+
+
+def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> TrackTable:
+    """Objects with a 3D box; `world_T_camera` (K, 4, 4) of the frames."""
+    objects = objects.select(has_box(objects) & (objects.track_id >= 0))
+    objects = objects.select(np.argsort(objects.frame, kind="stable"))
+    boxes = camera_boxes_to_world(objects.boxes, np.strings.lower(objects.type), world_T_camera[objects.frame])
+    return TrackTable(objects.frame, objects.track_id.astype(np.str_), boxes, np.nan_to_num(objects.score))
+
+
+def _with_motion(found: TrackTable, table: TrackRows, scene: str) -> TrackTable:
+    """The boxes with velocities and covariances of the rows of the same frame and track."""
+    rows = np.flatnonzero(table.scene == scene)
+    frame = np.rint(table.timestamp[rows] / FRAME_PERIOD).astype(np.int64)
+    row_of = dict(zip(zip(frame.tolist(), table.id[rows].tolist(), strict=True), rows.tolist(), strict=True))
+    wanted = zip(found.moment.tolist(), found.id.tolist(), strict=True)
+    at = np.array([row_of.get(key, -1) for key in wanted], dtype=np.int64)
+    known = at >= 0
+    velocity, covariance = found.boxes.velocity.copy(), found.position_covariance.copy()
+    velocity[known] = table.boxes.velocity[at[known]]
+    covariance[known] = table.position_covariance[at[known]]
+    return replace(found, boxes=replace(found.boxes, velocity=velocity), position_covariance=covariance)

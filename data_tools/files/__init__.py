@@ -1,0 +1,1 @@
+"""Reading and writing of files: atomic, by URL, tables, JSON streams."""

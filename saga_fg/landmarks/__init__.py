@@ -1,5 +1,0 @@
-"""Landmarks: their types, which observation is of which, and maps built from them."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

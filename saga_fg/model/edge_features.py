@@ -1,0 +1,76 @@
+"""What edge rules see of a pair of nodes: how the source of an edge stands and moves, as its target sees it.
+
+    ahead, lateral   the source's offset along and across the target's heading (left is positive), m
+    turn             heading of the target less that of the source, in [-pi, pi), rad
+
+The functions take arrays of any shape, NumPy's or JAX's (`xp`), so that a learned rule is trained on the very features
+that it will see.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saga_fg.model.interactions import NodeTable
+from saga_fg.numerics.arrays import IntArray
+
+
+class EdgeEnds(NamedTuple):
+    """One end of edges: position (..., 2) m, velocity (..., 2) m/s, heading (...) rad, has_moved (...) 1 or 0."""
+
+    position: Any
+    velocity: Any
+    heading: Any
+    has_moved: Any
+
+
+class EdgeFeatures(NamedTuple):
+    """Of edges (...): see the module; distance m, velocity_difference m/s, speeds m/s, has_moved 1 or 0."""
+
+    ahead: Any
+    lateral: Any
+    turn: Any
+    distance: Any
+    velocity_difference: Any
+    target_speed: Any
+    source_speed: Any
+    target_moved: Any
+    source_moved: Any
+
+
+def edge_features(target: EdgeEnds, source: EdgeEnds, xp: Any = np) -> EdgeFeatures:
+    """The features of edges between ends whose shapes broadcast."""
+    offset, difference = source.position - target.position, source.velocity - target.velocity
+    c, s = xp.cos(target.heading), xp.sin(target.heading)
+    ahead = offset[..., 0] * c + offset[..., 1] * s
+    lateral = offset[..., 1] * c - offset[..., 0] * s
+    turn = (target.heading - source.heading + np.pi) % (2 * np.pi) - np.pi
+    none = 0.0 * ahead
+    return EdgeFeatures(
+        ahead,
+        lateral,
+        turn,
+        _norm(offset, xp),
+        _norm(difference, xp),
+        _norm(target.velocity, xp) + none,
+        _norm(source.velocity, xp) + none,
+        target.has_moved + none,
+        source.has_moved + none,
+    )
+
+
+def features_of(nodes: NodeTable, target: IntArray, source: IntArray) -> EdgeFeatures:
+    """The features (E,) of edges between rows of a table; who has moved is taken for granted where nobody knows."""
+    return edge_features(_ends(nodes, target), _ends(nodes, source))
+
+
+def _ends(nodes: NodeTable, rows: IntArray) -> EdgeEnds:
+    moved = np.ones(len(rows)) if nodes.has_moved is None else nodes.has_moved[rows].astype(np.float64)
+    return EdgeEnds(nodes.position[rows], nodes.velocity[rows], nodes.heading[rows], moved)
+
+
+def _norm(vector: Any, xp: Any) -> Any:
+    """Length of (..., 2), with a derivative at zero."""
+    return xp.sqrt(vector[..., 0] ** 2 + vector[..., 1] ** 2 + 1e-12)

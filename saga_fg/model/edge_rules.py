@@ -1,0 +1,272 @@
+r"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
+
+    rate_ij = rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
+
+A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the tracker in place of these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Protocol, get_args
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from saga_fg.errors import InputError
+from saga_fg.model.cone_geometry import ConeGeometry, anticipated
+from saga_fg.model.edge_features import EdgeFeatures, features_of
+from saga_fg.model.edge_information import News, counted, news_setting
+from saga_fg.model.intelligent_driver import IntelligentDriver
+from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
+from saga_fg.model.node import distinct_types
+from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
+from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
+from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+
+_MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+Leaders = Literal["any", "moving", "standing"]
+VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
+
+
+class Pairs(NamedTuple):
+    """E directed edges source -> target (rows of a `NodeTable`) with their rates, 1/s."""
+
+    target: IntArray
+    source: IntArray
+    rate: FloatArray
+
+
+class EdgeRule(Protocol):
+    """Chooses edges from the estimates at the start of an interval."""
+
+    @property
+    def interaction(self) -> Interaction | AccelerationLaw: ...
+
+    def pairs(self, nodes: NodeTable) -> Pairs: ...
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Moving objects that are close and head the same way share something, by default their velocity."""
+
+    interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
+        SharedVelocity, "interaction function of the edges"
+    )
+    rate: float = setting(0.3, "strength of an edge at distance and heading difference zero, 1/s")
+    distance_scale: float = setting(8.0, "sigma of the distance kernel, m")
+    heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
+    speed_scale: float = setting(3.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
+    max_distance: float = setting(20.0, "no edge beyond this distance, m")
+    min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
+    max_degree: int = setting(4, "edges kept per influenced node, strongest first")
+    news: News | None = news_setting()
+    parked: bool = setting(
+        False,
+        "couples objects never seen moving whose velocity is known to within speed_scale, and no others; the "
+        "speed of either is held against speed_scale as well",
+    )
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_distance", "min_speed", "max_degree")
+        require_positive(self, "distance_scale", "heading_scale", "speed_scale", infinite=True)
+
+    def strength(self, f: EdgeFeatures) -> FloatArray:
+        """Rates (...), 1/s, of edges with these features, whatever their ends are and is known of them."""
+        exponent = (f.distance / self.distance_scale) ** 2 + (f.turn / self.heading_scale) ** 2
+        if self.parked:  # who creeps in a jam does not share what makes standing objects seem to move
+            able = (f.target_moved == 0) & (f.source_moved == 0)
+            exponent = exponent + (f.target_speed**2 + f.source_speed**2) / self.speed_scale**2
+        else:
+            able = (f.target_speed >= self.min_speed) & (f.source_speed >= self.min_speed)
+        rate = self.rate * np.exp(-(exponent + (f.velocity_difference / self.speed_scale) ** 2) / 2)
+        return np.where(able & (f.distance <= self.max_distance), rate, 0.0)
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        able = of_classes(nodes.label, self.classes)
+        if not self.parked:
+            able &= np.hypot(*nodes.velocity.T) >= self.min_speed
+        else:  # a new track may move for all that is known of it
+            able &= nodes.velocity_variance < self.speed_scale**2
+            able &= ~nodes.has_moved if nodes.has_moved is not None else False
+        target, source = close_pairs(nodes.position, able, self.max_distance)
+        rate = counted(self.news, self.strength(features_of(nodes, target, source)), nodes, target, source)
+        return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
+
+
+@dataclass(frozen=True)
+class Following:
+    """A vehicle is led by the nearest vehicle ahead in its lane, as far as headings tell the lane."""
+
+    interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
+        CarFollowing, "interaction function of the edges"
+    )
+    rate: float = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
+    max_gap: float = setting(40.0, "no leader further ahead than this, centre to centre, m")
+    gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
+    lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
+    heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
+    news: News | None = news_setting()
+    parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
+    apart: float = setting(
+        0.0,
+        "leaders are ahead by at least this share of half of both lengths: nearer is itself, tracked twice",
+    )
+    leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
+    cones: ConeGeometry | None = settings_group(
+        lambda: None, "vehicles that cones push aside lead, and are led, where they will be then; null: where they are"
+    )
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    towed: tuple[str, ...] = setting(
+        (), "those among them that lead and are not led: a trailer goes where its truck does"
+    )
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_gap", "apart")
+        require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
+        require_one_of(self, "leaders", get_args(Leaders))
+
+    def strength(self, f: EdgeFeatures) -> FloatArray:
+        """Rates (...), 1/s, of edges with these features, whatever the classes of their ends and whoever is nearer."""
+        lateral = lateral_of_arc(f)
+        led = (f.ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
+        if not self.parked:
+            led &= f.target_moved > 0
+        if self.leaders != "any":
+            led &= (f.source_moved > 0) == (self.leaders == "moving")
+        exponent = (
+            (f.ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (f.turn / self.heading_scale) ** 2
+        )
+        return np.where(led & (f.distance <= self.max_gap), self.rate * np.exp(-exponent / 2), 0.0)
+
+    def remoteness(self, f: EdgeFeatures) -> FloatArray:
+        """What is least for the leader among all that are ahead, m."""
+        return np.asarray(f.ahead + 10 * np.abs(lateral_of_arc(f)))
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        able = of_classes(nodes.label, self.classes)
+        seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
+        target, source = close_pairs(seen.position, able, self.max_gap)
+        features = features_of(seen, target, source)
+        near = self.apart * (nodes.length[target] + nodes.length[source]) / 2
+        led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
+        rate = counted(self.news, np.where(led, self.strength(features), 0.0), nodes, target, source)
+        nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
+        return Pairs(target[nearest], source[nearest], rate[nearest])
+
+
+@dataclass(frozen=True)
+class Repulsion:
+    """Pedestrians keep away from each other; with `sources: [wall]`, from the walls of the road map."""
+
+    interaction: SocialForce = settings_group(SocialForce, "how strongly")
+    rate: float = setting(1.0, "1/s; 1: with all of the force")
+    max_distance: float = setting(4.0, "nobody further away counts, m")
+    max_degree: int = setting(4, "sources kept per object, the nearest first")
+    classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
+    sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "max_distance", "max_degree")
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        pushed, pushing = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.classes, self.sources))
+        target, source = np.repeat(pushed, len(pushing)), np.tile(pushing, len(pushed))
+        target, source = target[target != source], source[target != source]
+        given = self.interaction.given(nodes, target, source)
+        apart, _ = nearest_offset(nodes.position[target] - nodes.position[source], given)
+        distance = np.hypot(*apart.T)
+        near = np.flatnonzero(distance <= self.max_distance)
+        closest = strongest(Pairs(target[near], source[near], -distance[near]), len(nodes), self.max_degree)
+        return closest._replace(rate=np.full(len(closest.rate), self.rate))
+
+
+def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
+    """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
+    return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))
+
+
+def build_graph(
+    nodes: NodeTable,
+    rules: Sequence[EdgeRule],
+    min_rate: float = 1e-3,
+    explained_noise: float = 0.0,
+    noise_scale: FloatArray | None = None,
+) -> SceneGraph:
+    """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out.
+
+    A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
+    a driver who does what his leader does is no longer a surprise. `noise_scale` (n,) are further factors on it.
+
+    Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
+    """
+    groups: list[Edges] = []
+    nonlinear: list[NonlinearEdges] = []
+    total_rate = np.zeros(len(nodes))
+    if len(nodes) > 1:
+        kinds, kind = distinct_types(nodes.types)
+        first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
+        kind = np.array([first.setdefault(t.components, len(first)) for t in kinds])[kind]
+        for rule in rules:
+            target, source, rate = _checked_pairs(rule, nodes)
+            keep = rate >= min_rate
+            target, source, rate = target[keep], source[keep], rate[keep]
+            pair_kind = kind[target] * len(first) + kind[source]
+            for k in np.flatnonzero(np.bincount(pair_kind)):
+                mine = pair_kind == k
+                t, s = target[mine], source[mine]
+                law = rule.interaction
+                if not law.applies(nodes.types[t[0]], nodes.types[s[0]]):
+                    continue
+                if isinstance(law, AccelerationLaw):
+                    nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))
+                else:
+                    groups.append(Edges(type(law).__name__, t, s, rate[mine], *law.triples(nodes, t, s)))
+                np.add.at(total_rate, t, rate[mine])
+    scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
+    if noise_scale is not None:
+        scale = scale * noise_scale
+    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale, tuple(nonlinear))
+
+
+def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """What the rule, perhaps a user's own, chooses; `InputError` if it makes no sense."""
+    what = f"edge rule {type(rule).__name__}"
+    pairs = rule.pairs(nodes)
+    target = checked_rows(f"{what}: target", pairs[0])
+    source = checked_rows(f"{what}: source", pairs[1], len(target))
+    for name, rows in (("target", target), ("source", source)):
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(nodes)):
+            bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
+            raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
+    return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))
+
+
+def close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray]:
+    """All ordered pairs of able nodes within `radius` m: target rows, source rows."""
+    rows = np.flatnonzero(able)
+    if len(rows) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    pairs = cKDTree(position[rows]).query_pairs(radius, output_type="ndarray")
+    a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
+    return np.concatenate([a, b]), np.concatenate([b, a])
+
+
+def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:
+    """At most `degree` edges into each node, the strongest."""
+    order = np.lexsort((-pairs.rate, pairs.target))
+    rank = np.arange(len(order)) - np.searchsorted(pairs.target[order], np.arange(n))[pairs.target[order]]
+    kept = order[rank < degree]
+    return Pairs(pairs.target[kept], pairs.source[kept], pairs.rate[kept])
+
+
+def _nearest_leader(target: IntArray, distance: FloatArray, n: int) -> IntArray:
+    """For every target that has a leader at finite distance, the index of the nearest one's pair."""
+    order = np.lexsort((distance, target))
+    first = np.unique(target[order], return_index=True)[1]
+    nearest = order[first]
+    return np.asarray(nearest[np.isfinite(distance[nearest])])

@@ -1,0 +1,147 @@
+r"""How a driver follows, and how he comes to a halt: the Intelligent Driver Model as an interaction function.
+
+    f(v, s, w) = a [ 1 - (v / v_free)^4 - (s* / s)^2 ],      s* = s0 + max(0, v T + v (v - w) / (2 sqrt(a b)))
+
+is the acceleration at speed v with the gap s, bumper to bumper, to a leader of speed w (Treiber, Hennecke, Helbing
+2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line where he has to stop is a leader that stands. Nobody
+drives backwards, so braking is at most -v / t_halt. An edge of rate 1 / tau acts with all of it, linearised at the
+estimate (v', s', w'):
+
+    dv_i/dt += rate tau u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
+
+Nobody starts behind one who stands, f <= max(v, w) / tau: parked cars stay where they are, and so does a queue.
+A gap with `room` for another vehicle may hold one that nobody sees. Then a driver does not speed up into it: he does as
+the leader does at most, f <= (w - v) / tau, and before a line he keeps his speed at most, f <= 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.settings import require_between, require_positive, setting
+
+LEAST_GAP = 0.5  # m; nearer, the estimate of a gap is all noise
+
+
+class Linearised(NamedTuple):
+    """An acceleration (E,), m/s^2, at the estimate, and its derivatives by v, s and w."""
+
+    value: FloatArray
+    by_speed: FloatArray
+    by_gap: FloatArray
+    by_leader: FloatArray
+
+    def where(self, chosen: BoolArray, other: Linearised) -> Linearised:
+        """Itself where `chosen` (E,), else `other`."""
+        return Linearised(*(np.where(chosen, mine, its) for mine, its in zip(self, other, strict=True)))
+
+
+@dataclass(frozen=True)
+class IntelligentDriver:
+    """A vehicle follows its leader as a driver does; the source is the leader.
+
+    The defaults are those of city traffic in Treiber and Kesting, Traffic Flow Dynamics (2013), table 11.2.
+    """
+
+    free_speed: float = setting(15.0, "v_free: speed of a driver whom nobody hinders, m/s")
+    headway: float = setting(1.0, "T: time headway that drivers want to keep, s")
+    standstill_gap: float = setting(2.0, "s0: gap that drivers keep when they stand, bumper to bumper, m")
+    acceleration: float = setting(1.0, "a: highest acceleration, m/s^2")
+    deceleration: float = setting(1.5, "b: comfortable deceleration, m/s^2")
+    hardest: float = setting(6.0, "no driver brakes harder, m/s^2")
+    halt_time: float = setting(0.4, "t_halt: time constant with which the last of the speed goes, s")
+    room: float = setting(7.0, "a gap of this length may hold a vehicle that nobody sees, m; .inf: never")
+    time_constant: float = setting(1.0, "tau: an edge of rate 1 / tau accelerates as the driver does, s")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "free_speed", "headway", "acceleration", "deceleration", "hardest", "halt_time")
+        require_positive(self, "time_constant")
+        require_positive(self, "room", infinite=True)
+        require_between(self, 0, math.inf, "standstill_gap")
+
+    def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
+        """f (E,) where nobody hides in the gap; v, w >= 0 m/s, s m."""
+        a, T, s = self.acceleration, self.headway, np.maximum(s, LEAST_GAP)
+        root = 2 * math.sqrt(a * self.deceleration)
+        dynamic = v * T + v * (v - w) / root
+        share = (self.standstill_gap + np.maximum(dynamic, 0.0)) / s
+        by_gap_wanted = -2 * a * share / s  # the derivative of f by s*
+        closing = dynamic > 0
+        below = v < self.free_speed
+        free = np.where(below, 1 - (v / self.free_speed) ** 4, 0.0)
+        by_free = np.where(below, -4 * v**3 / self.free_speed**4, 0.0)
+        none = np.zeros_like(share)
+        f = Linearised(
+            a * (free - share**2),
+            a * by_free + by_gap_wanted * np.where(closing, T + (2 * v - w) / root, 0.0),
+            2 * a * share**2 / s,
+            by_gap_wanted * np.where(closing, -v / root, 0.0),
+        )
+        hardest = Linearised(none - self.hardest, none, none, none)
+        halt = Linearised(-v / self.halt_time, none - 1 / self.halt_time, none, none)
+        f = hardest.where(f.value < -self.hardest, f)
+        f = halt.where(f.value < halt.value, f)
+        rate = np.where(np.maximum(v, w) < f.value * self.time_constant, 1 / self.time_constant, 0.0)
+        start = Linearised(rate * np.maximum(v, w), rate * (v >= w), none, rate * (v < w))
+        return start.where(rate > 0, f)
+
+    def following(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
+        """Acceleration (E,) behind a leader."""
+        rate, none = 1 / self.time_constant, np.zeros_like(v)
+        return self._capped(v, s, w, Linearised(rate * (w - v), none - rate, none, none + rate))
+
+    def stopping(self, v: FloatArray, s: FloatArray) -> Linearised:
+        """Acceleration (E,) before a line where one has to stop."""
+        none = np.zeros_like(v)
+        return self._capped(v, s, none, Linearised(none, none, none, none))
+
+    def _capped(self, v: FloatArray, s: FloatArray, w: FloatArray, highest: Linearised) -> Linearised:
+        """f, but at most `highest` where the gap has room for somebody else."""
+        f = self.alone(v, s, w)
+        return highest.where((s >= self.room) & (highest.value < f.value), f)
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
+        v_i, v_j = (nodes.types[rows[0]].index(VELOCITY) for rows in (target, source))
+        v, w = speed_along(nodes, target, u_i), speed_along(nodes, source, u_j)
+        distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u_i)
+        f = self.following(v, distance - (nodes.length[target] + nodes.length[source]) / 2, w)
+        before = f._replace(value=f.value - f.by_leader * w)  # what the leader's speed adds is added below
+        triples = accelerated(nodes, target, source, u_i, v, before, self.time_constant)
+        from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :]
+        triples.A_other[:, v_i[:, None], v_j] = from_leader * f.by_leader[:, None, None]
+        return triples
+
+
+def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
+    """(E,) speeds of nodes `rows` along u (E, 2), m/s, not below 0."""
+    return np.asarray(np.maximum(np.einsum("ei,ei->e", nodes.velocity[rows], u), 0.0))
+
+
+def accelerated(
+    nodes: NodeTable, target: IntArray, source: IntArray, u: FloatArray, v: FloatArray, f: Linearised, tau: float
+) -> Triples:
+    """The triples of an acceleration along u (E, 2), but for what depends on the speed of the source.
+
+    Linearised at the speeds v (E,) and the distances along u.
+    """
+    p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+    p_j = nodes.types[source[0]].index(POSITION)
+    along = tau * u[:, :, None] * u[:, None, :]
+    distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
+    triples = no_triples(nodes, target, source)
+    triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
+    triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
+    triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
+    triples.b[:, v_i] = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
+    return triples

@@ -1,0 +1,173 @@
+r"""Interaction functions: the triple (A_self, A_other, b) with which an edge j -> i acts on the state of node i.
+
+    dx_i/dt += rate_ij ( A_self x_i + A_other x_j + b )
+
+The mathematics of each interaction is written here, once; graphs, filters and factors adapt it. With u_i the unit
+heading of node i and R_ij the rotation from the heading of j to that of i:
+
+    shared velocity    dv_i/dt += rate ( R_ij v_j - v_i )
+    car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( u_i.(p_j - p_i) - gap_ij - headway u_i.v_i ) / tau )
+    shared course      dv_i/dt += -rate m_j m_j.v_i,  m_j normal to u_j
+
+Car-following is Helly's linear law (Helly 1959); with the gap taken from the present estimate it keeps the formation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.settings import require_between, require_one_of, require_positive, setting
+
+POSITION = ("x", "y")
+VELOCITY = ("vx", "vy")
+
+
+@dataclass(frozen=True, eq=False)
+class NodeTable:
+    """The nodes as rules and interactions see them: estimates at the start of an interval, in world coordinates.
+
+    id (n,); label (n,) classes; types n node types; position (n, 2) m; velocity (n, 2) m/s; heading (n,) rad;
+    length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2;
+    has_moved (n,) whether a node was ever clearly in motion, which tells a parked car from one that waits in a queue;
+    None if nobody knows; closed (n,) the weight in [0, 1] with which a stop line is closed, as the belief on its light
+    says, None where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
+    or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
+    nobody knows
+    """
+
+    id: IntArray
+    label: StrArray
+    types: tuple[NodeType, ...]
+    position: FloatArray
+    velocity: FloatArray
+    heading: FloatArray
+    length: FloatArray
+    velocity_variance: FloatArray
+    has_moved: BoolArray | None = None
+    closed: FloatArray | None = None
+    outline: Mapping[int, FloatArray] = field(default_factory=dict)
+    width: Mapping[int, float] = field(default_factory=dict)
+    unseen: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+class Triples(NamedTuple):
+    """A_self (E, d_i, d_i), A_other (E, d_i, d_j), b (E, d_i)."""
+
+    A_self: FloatArray
+    A_other: FloatArray
+    b: FloatArray
+
+
+class Interaction(Protocol):
+    """An interaction function, evaluated for E edges between nodes of one type and nodes of one type."""
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        """Whether both types have the components the interaction acts on."""
+        ...
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        """The triples of the edges source[k] -> target[k] (rows of `nodes`)."""
+        ...
+
+
+@dataclass(frozen=True)
+class SharedVelocity:
+    """Consensus of velocities: a node relaxes towards the velocity of its neighbour at the edge's rate."""
+
+    along_heading: bool = setting(
+        False, "turn the neighbour's velocity by the difference of headings, so that a queue keeps its speed in a bend"
+    )
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(VELOCITY) and source.has(VELOCITY)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        turn = nodes.heading[target] - nodes.heading[source] if self.along_heading else np.zeros(len(target))
+        c, s = np.cos(turn), np.sin(turn)
+        R = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+        triples = no_triples(nodes, target, source)
+        v_i = nodes.types[target[0]].index(VELOCITY)
+        v_j = nodes.types[source[0]].index(VELOCITY)
+        triples.A_self[:, v_i, v_i] = -1.0
+        triples.A_other[:, v_i[:, None], v_j] = R
+        return triples
+
+
+@dataclass(frozen=True)
+class CarFollowing:
+    """Helly's linear car-following law along the follower's heading; the source is the leader."""
+
+    time_constant: float = setting(
+        4.0, "tau: time over which a wrong gap is made good, s; .inf: only speeds are shared"
+    )
+    headway: float = setting(0.0, "part of the desired gap that grows with the follower's speed, s")
+    gap: Literal["present", "standstill"] = setting(
+        "present", "desired gap: the one of the present estimate (formation), or standstill_gap + headway * speed"
+    )
+    standstill_gap: float = setting(2.0, "bumper to bumper, m; used with gap: standstill")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "time_constant", infinite=True)
+        require_between(self, 0, math.inf, "headway", "standstill_gap")
+        require_one_of(self, "gap", ("present", "standstill"))
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return all(t.has(POSITION + VELOCITY) for t in (target, source))
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
+        along = u_i[:, :, None] * u_i[:, None, :]
+        from_leader = u_i[:, :, None] * u_j[:, None, :]
+        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+        p_j, v_j = (nodes.types[source[0]].index(names) for names in (POSITION, VELOCITY))
+        triples = no_triples(nodes, target, source)
+        triples.A_self[:, v_i[:, None], p_i] = -along / self.time_constant
+        triples.A_self[:, v_i[:, None], v_i] = -along * (1 + self.headway / self.time_constant)
+        triples.A_other[:, v_i[:, None], p_j] = along / self.time_constant
+        triples.A_other[:, v_i[:, None], v_j] = from_leader
+        triples.b[:, v_i] = -u_i * (self._gap(nodes, target, source, u_i) / self.time_constant)[:, None]
+        return triples
+
+    def _gap(self, nodes: NodeTable, target: IntArray, source: IntArray, u_i: FloatArray) -> FloatArray:
+        """Desired distance between the centres at speed zero, m (E,)."""
+        if self.gap == "standstill":
+            return np.asarray(self.standstill_gap + (nodes.length[target] + nodes.length[source]) / 2)
+        distance = ((nodes.position[source] - nodes.position[target]) * u_i).sum(axis=1)
+        return np.asarray(distance - self.headway * (nodes.velocity[target] * u_i).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class SharedCourse:
+    """A node turns to where its leader heads: what of its velocity is across the leader's heading fades."""
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(VELOCITY)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        u_j = unit(nodes.heading[source])
+        m_j = np.stack([-u_j[:, 1], u_j[:, 0]], axis=-1)
+        v_i = nodes.types[target[0]].index(VELOCITY)
+        triples = no_triples(nodes, target, source)
+        triples.A_self[:, v_i[:, None], v_i] = -m_j[:, :, None] * m_j[:, None, :]
+        return triples
+
+
+def unit(heading: FloatArray) -> FloatArray:
+    """Unit vectors (n, 2) of headings (n,), rad."""
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+def no_triples(nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+    """Triples of E edges, all zero, of the sizes that their nodes' types have."""
+    d_i, d_j, E = nodes.types[target[0]].dim, nodes.types[source[0]].dim, len(target)
+    return Triples(np.zeros((E, d_i, d_i)), np.zeros((E, d_i, d_j)), np.zeros((E, d_i)))

@@ -1,0 +1,1 @@
+"""Kinds of landmarks: points, poles, planes, lines."""

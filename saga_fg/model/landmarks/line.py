@@ -1,0 +1,56 @@
+"""Edges of lanes and of the road: curbs, border lines. A straight line on the ground, (theta, rho): n . x = rho.
+
+A bend is a chain of such edges, each as long as it is straight; what is seen farther along the same line is the same
+edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factors import HesseLine, ResidualFactors, SpatialPose, edge_factors
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.settings import require_positive, setting
+
+
+@dataclass(frozen=True)
+class LaneEdgeLandmark:
+    """An edge, observed as the two ends (6,) of the piece seen, in the frame of the pose; its noise is that of the two
+    ends across the edge, m.
+    """
+
+    name: str = setting("lane edge", "what it is called in files")
+    density: float = setting(0.2, "landmarks per rad m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "density")
+
+    @property
+    def pose(self) -> SpatialPose:
+        return SpatialPose()
+
+    @property
+    def variable(self) -> HesseLine:
+        return HesseLine()
+
+    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
+        return [edge_factors(rows, observed.reshape(-1, 2, 3), covariances)]
+
+    def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
+        first, second = (observed.reshape(2, 3) @ world_T_pose[:3, :3].T + world_T_pose[:3, 3])[:, :2]
+        length = np.linalg.norm(second - first)
+        if length == 0.0:
+            raise InputError(f"observed {self.name}: expected two ends that are apart from above, got {observed}")
+        along = (second - first) / length
+        normal = np.array([-along[1], along[0]])
+        rho = float(normal @ (first + second) / 2)
+        normal, rho = (normal, rho) if rho >= 0 else (-normal, -rho)
+        return np.array([np.arctan2(normal[1], normal[0]), rho])
+
+    def coordinates(self, state: FloatArray) -> dict[str, float]:
+        theta, rho = state.tolist()
+        nx, ny = float(np.cos(theta)), float(np.sin(theta))
+        return {"x": rho * nx, "y": rho * ny, "nx": nx, "ny": ny, "rho": rho}

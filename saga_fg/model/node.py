@@ -1,0 +1,216 @@
+"""Node types: what the state of a node means, and how it moves on its own.
+
+    dx/dt = A x + w,    E[w(t) w(s)^T] = Qc delta(t - s)
+
+A nonlinear motion has a `flow` besides, its state dt seconds later without noise and interactions (see
+`saga_fg.model.turning`); A is then what of it is linear everywhere, along which noise and interactions are discretised.
+
+A type names its state components ("x", "vx", ...), so that sensors and interactions find what they need by name and
+nodes of different types, with states of different size, live in one graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked
+from saga_fg.settings import require_between, require_positive, setting
+
+
+class Motion(Protocol):
+    """Own motion of a node: named components, generator A (d, d) in 1/s, diffusion Qc (d, d) per s."""
+
+    @property
+    def components(self) -> tuple[str, ...]: ...
+
+    @property
+    def generator(self) -> FloatArray: ...
+
+    @property
+    def diffusion(self) -> FloatArray: ...
+
+
+@runtime_checkable
+class NonlinearMotion(Motion, Protocol):
+    """Own motion x(t + dt) = flow(x(t), dt) + q; both functions take stacks of states (..., d).
+
+    Any motion may have an `initial_deviation` (d,) as well: of components that nothing is known of, 1 by default.
+    """
+
+    def flow(self, x: FloatArray, dt: float) -> FloatArray: ...
+
+    def flow_jacobian(self, x: FloatArray, dt: float) -> FloatArray: ...
+
+
+def _planar(one_axis: ArrayLike) -> FloatArray:
+    """The matrix of one axis, for x and y: components alternate x, y."""
+    return np.asarray(np.kron(np.asarray(one_axis), np.eye(2)), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """White noise acceleration in the plane (Bar-Shalom, Li, Kirubarajan 2001, section 6.2.2)."""
+
+    acceleration_noise: float = setting(1.0, "spectral density of the acceleration, m^2/s^3")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "acceleration_noise")
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        return ("x", "y", "vx", "vy")
+
+    @property
+    def generator(self) -> FloatArray:
+        return _planar([[0.0, 1.0], [0.0, 0.0]])
+
+    @property
+    def diffusion(self) -> FloatArray:
+        return _planar(np.diag([0.0, self.acceleration_noise]))
+
+
+@dataclass(frozen=True)
+class ConstantAcceleration:
+    """White noise jerk in the plane, acceleration fading with a time constant (Singer 1970).
+
+    Without fading (`fading_time` infinite) this is the Wiener-process acceleration model of Bar-Shalom, Li,
+    Kirubarajan 2001, section 6.2.3; fading keeps a long prediction from running away.
+    """
+
+    jerk_noise: float = setting(1.0, "spectral density of the jerk, m^2/s^5")
+    fading_time: float = setting(float("inf"), "time constant with which the acceleration fades, s; .inf for never")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "jerk_noise")
+        require_positive(self, "fading_time", infinite=True)
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        return ("x", "y", "vx", "vy", "ax", "ay")
+
+    @property
+    def generator(self) -> FloatArray:
+        return _planar([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / self.fading_time]])
+
+    @property
+    def diffusion(self) -> FloatArray:
+        return _planar(np.diag([0.0, 0.0, self.jerk_noise]))
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """Components that drift without a velocity; with drift 0 they stand still (a stop line, a pole)."""
+
+    names: tuple[str, ...] = setting(("x", "y"), "state components")
+    drift: float = setting(0.0, "spectral density of the drift, unit^2/s")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "drift")
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        return self.names
+
+    @property
+    def generator(self) -> FloatArray:
+        return np.zeros((len(self.names), len(self.names)))
+
+    @property
+    def diffusion(self) -> FloatArray:
+        return self.drift * np.eye(len(self.names))
+
+
+@dataclass(frozen=True)
+class NodeType:
+    """A class of nodes: its name and its own motion.
+
+    Raises `InputError` for repeated component names, matrices of the wrong shape, or a diffusion that is not symmetric
+    positive semidefinite.
+    """
+
+    name: str
+    motion: Motion
+
+    def __post_init__(self) -> None:
+        d = len(self.components)
+        if d == 0 or len(set(self.components)) != d:
+            raise InputError(f"node type {self.name}: expected distinct component names, got {self.components}")
+        checked(f"node type {self.name}: generator", self.motion.generator, (d, d))
+        Qc = checked(f"node type {self.name}: diffusion", self.motion.diffusion, (d, d))
+        if not np.allclose(Qc, Qc.T) or np.linalg.eigvalsh(Qc)[0] < -1e-12 * max(1.0, float(np.abs(Qc).max())):
+            raise InputError(f"node type {self.name}: diffusion: expected a symmetric positive semidefinite matrix")
+
+    @cached_property
+    def components(self) -> tuple[str, ...]:
+        return self.motion.components
+
+    @cached_property
+    def dim(self) -> int:
+        """Size d of the state."""
+        return len(self.components)
+
+    @cached_property
+    def generator(self) -> FloatArray:
+        """A (d, d), 1/s."""
+        return checked("generator", self.motion.generator, (self.dim, self.dim))
+
+    @cached_property
+    def diffusion(self) -> FloatArray:
+        """Qc (d, d), per s."""
+        return checked("diffusion", self.motion.diffusion, (self.dim, self.dim))
+
+    @cached_property
+    def flow(self) -> NonlinearMotion | None:
+        """The motion where it is nonlinear."""
+        return self.motion if isinstance(self.motion, NonlinearMotion) else None
+
+    @cached_property
+    def initial_deviation(self) -> FloatArray:
+        """(d,) of components that nothing is known of: 1 unless the motion says otherwise."""
+        given = getattr(self.motion, "initial_deviation", np.ones(self.dim))
+        return checked("initial_deviation", given, (self.dim,))
+
+    @cached_property
+    def nilpotency(self) -> int | None:
+        """Smallest k with A^k = 0, so that exp(A s) is a polynomial in s of degree k - 1; None if there is none."""
+        power = np.eye(self.dim)
+        for k in range(self.dim + 1):
+            if not power.any():
+                return k
+            power = power @ self.generator
+        return None
+
+    def has(self, names: Sequence[str]) -> bool:
+        """Whether the state has all these components."""
+        return set(names) <= set(self.components)
+
+    def index(self, names: Sequence[str]) -> IntArray:
+        """Positions of the named components in the state; raises `InputError` for one it has not."""
+        for name in names:
+            if name not in self.components:
+                raise InputError(
+                    f"node type {self.name} has no component {name!r}; it has {', '.join(self.components)}"
+                )
+        return np.array([self.components.index(name) for name in names], dtype=np.int64)
+
+    def selector(self, names: Sequence[str]) -> FloatArray:
+        """H (k, d) that picks the named components: z = H x."""
+        H = np.zeros((len(names), self.dim))
+        H[np.arange(len(names)), self.index(names)] = 1.0
+        return H
+
+
+def distinct_types(types: Sequence[NodeType]) -> tuple[list[NodeType], IntArray]:
+    """The distinct ones of n node types, in order of appearance, and the number (n,) of each among them."""
+    ids = list(map(id, types))
+    found = dict(zip(ids, types, strict=True))
+    number = dict(zip(found, range(len(found)), strict=True))
+    return list(found.values()), np.array(list(map(number.__getitem__, ids)), dtype=np.int64)

@@ -1,0 +1,218 @@
+"""Interaction functions that are not linear: accelerations by the states of two nodes.
+
+    p' = p + dt v + dt^2 / 2 a,        v' = v + dt a,         a = sum_j rate_j tau a_j(x, x_j), held over the interval
+
+    following   a = f(v . u, |d| - length, w . u) u        d = p_leader - p, u = d / |d|, w the leader's velocity,
+                                                           f of the Intelligent Driver Model
+    repulsion   a = A exp( (reach - |d|) / B ) d / |d|,    d from the neighbour, or the nearest point of a wall, to p
+
+The second is the circular specification of the social force (Helbing, Farkas, Vicsek 2000, doi 10.1038/35035023,
+equation 2 without body contact). The first is that of Treiber, Hennecke, Helbing (2000, doi
+10.1103/PhysRevE.62.1805, equations 3 and 4) with round corners: a least-squares solution that lies on a corner has no
+linearisation, and solvers go round it for ever.
+
+    f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + hardest
+    s* = s0 + S(v T + v (v - w) / (2 sqrt(a b))),    S(x) = log(1 + e^x) for max(0, x), s likewise, m
+    f  = -v / t_halt + h S((f0 + v / t_halt) / h)    for max(f0, -v / t_halt): nobody drives backwards; h 0.05 m/s^2
+
+An edge rule whose `interaction` is one of these makes `NonlinearEdges` of a scene graph: a filter linearises them at
+the start of the interval, smoothers wherever their estimates are. `interaction` gives the same law for factors by hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from scipy.special import expit
+
+from factors import NonlinearInteraction
+from saga_fg.model.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised
+from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.settings import require_positive, setting, settings_group
+
+_NEAREST = 1e-3  # m; nearer, there is no direction
+_HALT = 0.05  # m/s^2
+
+
+class Accelerations(NamedTuple):
+    """Of E pairs: value (E, 2), m/s^2, and its derivatives (E, 2, 4) by (p, v) of the node and of the other."""
+
+    value: FloatArray
+    by_own: FloatArray
+    by_other: FloatArray
+
+
+@runtime_checkable
+class AccelerationLaw(Protocol):
+    """How a node with position and velocity is accelerated by another; an edge of rate 1 / tau acts with all of it."""
+
+    @property
+    def time_constant(self) -> float:
+        """tau, s."""
+
+    @property
+    def alone(self) -> FloatArray:
+        """What `accelerations` is given of a pair where nobody says more."""
+
+    def applies(self, target: NodeType, source: NodeType) -> bool: ...
+
+    def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+        """What of the edges source[k] -> target[k] does not depend on states: (E, ...)."""
+
+    def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
+        """At (p, v) of the nodes (E, 4) and of the others, whose v is 0 if they have none."""
+
+
+@dataclass(frozen=True)
+class SmoothDriver:
+    """A vehicle follows its leader, the source, as a driver does: an intelligent driver whose law has no corners."""
+
+    driver: IntelligentDriver = settings_group(IntelligentDriver, "the driver; `room` plays no part")
+    length: float = setting(4.5, "of the gap that vehicles fill, between their centres, where boxes do not tell, m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "length")
+
+    @property
+    def time_constant(self) -> float:
+        return self.driver.time_constant
+
+    @property
+    def alone(self) -> FloatArray:
+        return np.array(self.length)
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
+
+    def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+        filled = (nodes.length[target] + nodes.length[source]) / 2
+        return np.where(filled > 0, filled, self.length)
+
+    def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
+        distance, u = _direction(other[..., :2] - own[..., :2])
+        v, w = ((u * state[..., 2:]).sum(axis=-1) for state in (own, other))
+        f = smooth_acceleration(self.driver, v, distance - given, w)
+        along = u[..., :, None] * u[..., None, :]
+        turn = (np.eye(2) - along) / distance[..., None, None]  # du / dd
+        by_turn = f.by_speed[..., None] * own[..., 2:] + f.by_leader[..., None] * other[..., 2:]
+        gradient = (turn @ by_turn[..., None])[..., 0] + f.by_gap[..., None] * u
+        by_d = u[..., :, None] * gradient[..., None, :] + f.value[..., None, None] * turn
+        by_own = np.concatenate([-by_d, f.by_speed[..., None, None] * along], axis=-1)
+        by_other = np.concatenate([by_d, f.by_leader[..., None, None] * along], axis=-1)
+        return Accelerations(f.value[..., None] * u, by_own, by_other)
+
+
+@dataclass(frozen=True)
+class SocialForce:
+    """A pedestrian keeps away from another, or from a wall: from the nearest point of the source's outline."""
+
+    strength: float = setting(2.0, "A: acceleration at the distance `reach`, m/s^2")
+    falloff: float = setting(0.5, "B: distance over which it falls to a third, m")
+    reach: float = setting(0.6, "sum of two radii, m; from a wall, one")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "strength", "falloff", "reach")
+
+    @property
+    def time_constant(self) -> float:
+        return 1.0
+
+    @property
+    def alone(self) -> FloatArray:
+        return np.zeros((1, 4))
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(POSITION + VELOCITY) and source.has(POSITION)
+
+    def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+        """(E, k, 4) pieces of the outlines, both ends from the source's position; the last one repeated."""
+        lines = {j: nodes.outline[j] - nodes.position[j] for j in set(source.tolist()) if j in nodes.outline}
+        pieces = {j: np.concatenate([line[:-1], line[1:]], axis=1) for j, line in lines.items()}
+        most = max((len(ends) for ends in pieces.values()), default=1)
+        padded = {j: ends[np.minimum(np.arange(most), len(ends) - 1)] for j, ends in pieces.items()}
+        return np.array([padded.get(j, np.zeros((most, 4))) for j in source.tolist()]).reshape(len(source), most, 4)
+
+    def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
+        apart, beside = nearest_offset(own[..., :2] - other[..., :2], given)
+        distance, away = _direction(apart)
+        force = self.strength * np.exp((self.reach - distance) / self.falloff)[..., None, None]
+        along = away[..., :, None] * away[..., None, :]
+        turn = np.where(beside[..., None, None], 0.0, (np.eye(2) - along) / distance[..., None, None])
+        by_position = force * (turn - along / self.falloff)
+        by_own = np.concatenate([by_position, np.zeros_like(by_position)], axis=-1)
+        return Accelerations(force[..., 0] * away, by_own, -by_own)
+
+
+def nearest_offset(offset: FloatArray, pieces: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """From the nearest point of pieces of lines (..., k, 4) to offset (..., 2), and whether it is within a piece."""
+    start, step = pieces[..., :2], pieces[..., 2:] - pieces[..., :2]
+    squared = (step**2).sum(axis=-1)
+    share = ((offset[..., None, :] - start) * step).sum(axis=-1) / np.where(squared > 0, squared, 1.0)
+    apart = offset[..., None, :] - start - np.clip(share, 0.0, 1.0)[..., None] * step
+    nearest = np.argmin((apart**2).sum(axis=-1), axis=-1)[..., None]
+    within = np.take_along_axis((share > 0) & (share < 1), nearest, axis=-1)[..., 0]
+    return np.take_along_axis(apart, nearest[..., None], axis=-2)[..., 0, :], within
+
+
+def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
+    """f (...), m/s^2, at speeds v, gaps s, m, and leaders' speeds w, with its derivatives."""
+    a = driver.acceleration
+    root = 2 * np.sqrt(a * driver.deceleration)
+    approach = v * driver.headway + v * (v - w) / root
+    wanted = driver.standstill_gap + np.logaddexp(0.0, approach)
+    gap = LEAST_GAP + np.logaddexp(0.0, s - LEAST_GAP)
+    share = wanted / gap
+    by_approach = 2 * a * share / gap * expit(approach)
+    G = a + driver.hardest
+    g = a * (v / driver.free_speed) ** 4 + a * share**2
+    slope = -((1 + (g / G) ** 4) ** -1.25)
+    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / driver.halt_time) / _HALT  # the halt
+    slope = slope * expit(above)
+    by_speed = slope * (4 * a * v**3 / driver.free_speed**4 + by_approach * (driver.headway + (2 * v - w) / root))
+    return Linearised(
+        np.asarray(_HALT * np.logaddexp(0.0, above) - v / driver.halt_time),
+        by_speed + (expit(above) - 1) / driver.halt_time,
+        slope * (-2 * a * share**2 / gap * expit(s - LEAST_GAP)),
+        slope * by_approach * -v / root,
+    )
+
+
+@cache
+def interaction(law: AccelerationLaw) -> NonlinearInteraction:
+    """The law for factors with keys (next, own, neighbours), states (p, v); stacks too."""
+    return NonlinearInteraction(partial(_predict, law), partial(_jacobians, law), name=type(law).__name__)
+
+
+def held(by_state: FloatArray, dt: float) -> FloatArray:
+    """What accelerations (..., 2, n) held over dt do to positions and velocities, (..., 4, n)."""
+    return np.concatenate([0.5 * dt * dt * by_state, dt * by_state], axis=-2)
+
+
+def _predict(law: AccelerationLaw, x: FloatArray, others: list[FloatArray], dt: float) -> FloatArray:
+    moved = x + dt * np.concatenate([x[..., 2:], np.zeros_like(x[..., 2:])], axis=-1)
+    for other in others:
+        moved = moved + held(law.accelerations(x, other, law.alone).value[..., None], dt)[..., 0]
+    return moved
+
+
+def _jacobians(
+    law: AccelerationLaw, x: FloatArray, others: list[FloatArray], dt: float
+) -> tuple[FloatArray, list[FloatArray]]:
+    own = np.broadcast_to(np.eye(4) + dt * np.eye(4, k=2), (*x.shape, 4))
+    by_others = []
+    for other in others:
+        _, by_own, by_other = law.accelerations(x, other, law.alone)
+        own = own + held(by_own, dt)
+        by_others.append(held(by_other, dt))
+    return own, by_others
+
+
+def _direction(d: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Length (...) and direction (..., 2) of vectors (..., 2)."""
+    length = np.maximum(np.hypot(d[..., 0], d[..., 1]), _NEAREST)
+    return length, d / length[..., None]

@@ -1,0 +1,84 @@
+r"""Two objects that are one: a truck and its trailer, a bicycle and its rider.
+
+    dv_i/dt += rate ( v_j - v_i + ( p_j - p_i - d_ij ) / tau ),    d_ij the offset at the start of the interval
+
+Edges go both ways: either takes on the other's velocity and keeps its place relative to it, so that whatever one of the
+two is seen to do, the other does as well. From one interval to the next the offset may turn with the pair.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.model.edge_rules import Pairs
+from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.settings import require_between, require_positive, setting, settings_group
+
+
+@dataclass(frozen=True)
+class RigidCoupling:
+    """A node keeps the velocity of another and its present place relative to it."""
+
+    time_constant: float = setting(1.0, "tau: time over which a change of the offset is made good, s; .inf for never")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "time_constant", infinite=True)
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+        p_j, v_j = (nodes.types[source[0]].index(names) for names in (POSITION, VELOCITY))
+        triples = no_triples(nodes, target, source)
+        triples.A_self[:, v_i, v_i] = -1.0
+        triples.A_self[:, v_i, p_i] = -1 / self.time_constant
+        triples.A_other[:, v_i, v_j] = 1.0
+        triples.A_other[:, v_i, p_j] = 1 / self.time_constant
+        triples.b[:, v_i] = -(nodes.position[source] - nodes.position[target]) / self.time_constant
+        return triples
+
+
+@dataclass(frozen=True)
+class Attached:
+    """Every object of some classes is attached to the nearest of some others that touches it and moves as it does."""
+
+    interaction: RigidCoupling = settings_group(RigidCoupling, "interaction function of the edges, which go both ways")
+    attached: tuple[str, ...] = setting(("trailer",), "classes of what is attached")
+    carriers: tuple[str, ...] = setting(("truck",), "classes of what it is attached to")
+    rate: float = setting(3.0, "strength of an edge, 1/s")
+    slack: float = setting(2.0, "largest distance between centres beyond half of both lengths, m")
+    heading_scale: float = setting(0.5, "sigma of the kernel on the difference of headings, rad; .inf for none")
+    speed_scale: float = setting(2.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate", "slack")
+        require_positive(self, "heading_scale", "speed_scale", infinite=True)
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        parts, carriers = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.attached, self.carriers))
+        if len(parts) == 0 or len(carriers) == 0:
+            return Pairs(parts[:0], carriers[:0], np.empty(0))
+        apart = _distance(nodes.position, parts, carriers) - (nodes.length[parts, None] + nodes.length[carriers]) / 2
+        turn = wrap_angle(nodes.heading[parts, None] - nodes.heading[carriers])
+        difference = _distance(nodes.velocity, parts, carriers)
+        exponent = (turn / self.heading_scale) ** 2 + (difference / self.speed_scale) ** 2
+        rate = np.where(apart <= self.slack, self.rate * np.exp(-exponent / 2), 0.0)
+        of_part, of_carrier = rate.argmax(axis=1), rate.argmax(axis=0)
+        rows = np.arange(len(parts))
+        mutual = (of_carrier[of_part] == rows) & (rate[rows, of_part] > 0)
+        a, b = parts[mutual], carriers[of_part[mutual]]
+        r = rate[rows, of_part][mutual]
+        return Pairs(np.concatenate([a, b]), np.concatenate([b, a]), np.concatenate([r, r]))
+
+
+def _distance(values: FloatArray, rows: IntArray, others: IntArray) -> FloatArray:
+    """(k, m) lengths of the differences of values (n, 2)."""
+    difference = values[rows, None] - values[others]
+    return np.hypot(difference[..., 0], difference[..., 1])

@@ -1,0 +1,1 @@
+"""Interactions with the road: stop lines, lanes, cones."""

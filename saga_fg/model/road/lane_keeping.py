@@ -1,0 +1,103 @@
+r"""Vehicles keep to the centre of their lane, and turn with it.
+
+    dv_i/dt += rate n ( w n.t(s + w lag) - n.v_i - n.(p_i - f) / tau )
+
+with s the place of vehicle i along the lane j, f the nearest point of the centre line, n the normal there, t the
+direction of the lane, and w the vehicle's speed: its sideways velocity relaxes to that of the lane `lag` seconds ahead,
+about what the relaxation lags behind (1 / rate), and its offset is made good within tau. f moves with the lane's own
+state.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.model.cone_geometry import ConeGeometry, anticipated
+from saga_fg.model.edge_rules import VEHICLES, Pairs
+from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
+from saga_fg.model.node import NodeType
+from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
+from saga_fg.numerics.polyline import direction_at, feet, on_it
+from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.types.road_map import LANE
+
+PUSHED = 0.5  # m aside, from which cones decide and no longer the lane
+
+
+@dataclass(frozen=True)
+class KeepLane:
+    """Attraction to the centre line of a lane and to its direction; the source is the lane."""
+
+    offset_time: float = setting(3.0, "tau: time over which an offset from the centre is made good, s; .inf for never")
+    lag: float = setting(0.5, "time that vehicles look ahead along the lane, s")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "offset_time", infinite=True)
+        require_between(self, 0, math.inf, "lag")
+
+    def applies(self, target: NodeType, source: NodeType) -> bool:
+        return target.has(POSITION + VELOCITY) and source.has(POSITION)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
+        p_j = nodes.types[source[0]].index(POSITION)
+        triples = no_triples(nodes, target, source)
+        for lane in np.unique(source).tolist():
+            rows = np.flatnonzero(source == lane)
+            centre, mine = nodes.outline[lane], target[rows]
+            at = feet(centre, nodes.position[mine])
+            n = np.stack([-at.direction[:, 1], at.direction[:, 0]], axis=-1)
+            speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[mine], at.direction), 0.0)
+            ahead = direction_at(centre, at.s + speed * self.lag)
+            across, e = n[:, :, None] * n[:, None, :], rows[:, None, None]
+            triples.A_self[e, v_i[:, None], v_i] = -across
+            triples.A_self[e, v_i[:, None], p_i] = -across / self.offset_time
+            triples.A_other[e, v_i[:, None], p_j] = across / self.offset_time
+            foot = np.einsum("ei,ei->e", at.point - nodes.position[lane], n)
+            sideways = speed * np.einsum("ei,ei->e", ahead, n) + foot / self.offset_time
+            triples.b[rows[:, None], v_i] = n * sideways[:, None]
+        return triples
+
+
+@dataclass(frozen=True)
+class InLane:
+    """A vehicle that drives along a lane of the map, within its borders, keeps it."""
+
+    interaction: KeepLane = settings_group(KeepLane, "interaction function of the edges")
+    rate: float = setting(2.0, "strength of an edge, 1/s")
+    drift_scale: float = setting(0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    cones: ConeGeometry | None = settings_group(
+        lambda: None, "who is pushed out of the lane by cones does not keep it; null: cones play no part"
+    )
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "rate")
+        require_positive(self, "drift_scale", infinite=True)
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        able = of_classes(nodes.label, self.classes)
+        if self.cones is not None:
+            aside = anticipated(nodes, self.classes, self.cones) - nodes.position
+            able &= np.hypot(*aside.T) < PUSHED
+        vehicles = np.flatnonzero(able)
+        targets, sources, rates = [vehicles[:0]], [vehicles[:0]], [np.empty(0)]
+        u = unit(nodes.heading[vehicles])
+        for lane in np.flatnonzero(nodes.label == LANE).tolist() if len(vehicles) else ():
+            at = feet(nodes.outline[lane], nodes.position[vehicles])
+            along = np.einsum("ei,ei->e", at.direction, u)
+            inside = (np.abs(at.e) <= nodes.width[lane] / 2) & (along > 0) & on_it(nodes.outline[lane], at.s)
+            drift = _across(nodes.velocity[vehicles], at.direction)
+            mine = vehicles[inside]
+            targets.append(mine)
+            sources.append(np.full(len(mine), lane, dtype=np.int64))
+            rates.append(self.rate * np.exp(-((drift[inside] / self.drift_scale) ** 2) / 2))
+        return Pairs(np.concatenate(targets), np.concatenate(sources), np.concatenate(rates))
+
+
+def _across(velocity: FloatArray, direction: FloatArray) -> FloatArray:
+    """Components (n,) of velocities (n, 2) to the left of directions (n, 2)."""
+    return np.asarray(direction[:, 0] * velocity[:, 1] - direction[:, 1] * velocity[:, 0])

@@ -1,0 +1,1 @@
+"""Arrays, geometry, assignment: the numerics that know nothing of tracking."""

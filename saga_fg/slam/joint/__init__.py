@@ -1,0 +1,26 @@
+"""The vehicle in the graph: its path and the objects around it, estimated together."""
+
+from saga_fg.slam.joint.batch import estimate_jointly
+from saga_fg.slam.joint.estimate import JointEstimate, ObjectStates
+from saga_fg.slam.joint.landmarks import Observations
+from saga_fg.slam.joint.lanes import lane_key
+from saga_fg.slam.joint.odometry import Odometry, OdometryNoise
+from saga_fg.slam.joint.online import OnlineEstimator, OnlineStep
+from saga_fg.slam.joint.online_estimate import OnlineEstimate, estimate_online
+from saga_fg.slam.joint.settings import JointSettings, LaneSettings
+
+__all__ = [
+    "JointEstimate",
+    "JointSettings",
+    "LaneSettings",
+    "ObjectStates",
+    "Observations",
+    "Odometry",
+    "OdometryNoise",
+    "OnlineEstimate",
+    "OnlineEstimator",
+    "OnlineStep",
+    "estimate_jointly",
+    "estimate_online",
+    "lane_key",
+]

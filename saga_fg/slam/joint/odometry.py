@@ -1,0 +1,114 @@
+"""Odometry: what a vehicle believes it moved between moments, and how well it knows.
+
+Per interval of dt s and d m, an increment a_T_b has independent noise
+
+    heading      turn_noise^2 dt                     roll, pitch   tilt_noise^2 dt
+    translation  distance_noise^2 d + time_noise^2 dt,  every direction
+
+and three slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, which start as
+N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.odometry`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors import ERROR_DIM
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances
+from saga_fg.numerics.geometry import checked_transform, inverse_transform
+from saga_fg.settings import require_positive, setting
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """How good an odometry is: standard deviations."""
+
+    turn_noise: float = setting(0.01, "heading, rad after one second")
+    tilt_noise: float = setting(0.001, "roll and pitch, which gravity tells, rad after one second")
+    distance_noise: float = setting(0.03, "translation, m after one metre")
+    time_noise: float = setting(0.01, "translation, m after one second")
+    scale: float = setting(0.02, "scale of distances at the start")
+    scale_drift: float = setting(0.002, "change of the scale after one second")
+    bias: float = setting(0.005, "bias of the yaw rate at the start, rad/s")
+    bias_drift: float = setting(0.0005, "change of the bias after one second, rad/s")
+    course: float = setting(0.01, "direction of travel against the axes in which objects are seen, at the start, rad")
+    course_drift: float = setting(0.0003, "change of that after one second, rad")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "turn_noise", "tilt_noise", "distance_noise", "time_noise")
+        require_positive(self, "scale", "scale_drift", "bias", "bias_drift", "course", "course_drift")
+
+    def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
+        """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
+
+        Rows: rotation (rad), translation in the frame of the earlier pose (m), change of scale, of bias (rad/s), of
+        course (rad).
+        """
+        tilt, turn = self.tilt_noise**2 * dt, self.turn_noise**2 * dt
+        shift = self.distance_noise**2 * distance + self.time_noise**2 * dt
+        slow = (self.scale_drift**2 * dt, self.bias_drift**2 * dt, self.course_drift**2 * dt)
+        variances = np.stack([tilt, tilt, turn, shift, shift, shift, *slow], axis=1)
+        return np.asarray(variances[:, :, None] * np.eye(6 + ERROR_DIM))
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """timestamps (n,) s, strictly increasing; a_T_b (n - 1, 4, 4): each pose in the frame of the one before.
+
+    covariances: (n - 1, 6, 6) of the increments where the device states them, as scan registration does: (rotation
+    vector, translation) in the frame of the later pose, rad^2, m^2; None where `OdometryNoise` is all that is known.
+    Raises `InputError` for times that do not increase, increments that are not rigid, and covariances that are none.
+    """
+
+    timestamps: FloatArray
+    a_T_b: FloatArray
+    covariances: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        timestamps = checked("timestamps", self.timestamps, (None,))
+        if not len(timestamps) or (np.diff(timestamps) <= 0).any():
+            raise InputError("timestamps: expected at least one, strictly increasing")
+        increments = checked("a_T_b", self.a_T_b, (len(timestamps) - 1, 4, 4))
+        for k, increment in enumerate(increments):
+            checked_transform(f"a_T_b[{k}]", increment)
+        if self.covariances is not None:
+            covariances = checked_covariances("covariances", self.covariances, len(increments), 6)
+            object.__setattr__(self, "covariances", covariances)
+        object.__setattr__(self, "timestamps", timestamps)
+        object.__setattr__(self, "a_T_b", increments)
+
+    @classmethod
+    def of(cls, timestamps: ArrayLike, world_T_ego: ArrayLike) -> Self:
+        """The increments of a path (n, 4, 4)."""
+        poses = checked("world_T_ego", world_T_ego, (None, 4, 4))
+        return cls(np.asarray(timestamps, dtype=np.float64), inverse_transform(poses[:-1]) @ poses[1:])
+
+    def __len__(self) -> int:
+        """The number of moments."""
+        return len(self.timestamps)
+
+    @property
+    def dt(self) -> FloatArray:
+        """(n - 1,) s"""
+        return np.diff(self.timestamps)
+
+    @property
+    def distance(self) -> FloatArray:
+        """(n - 1,) m"""
+        return np.asarray(np.linalg.norm(self.a_T_b[:, :3, 3], axis=1))
+
+    def path(self, start: ArrayLike | None = None) -> FloatArray:
+        """World_T_ego (n, 4, 4): the increments one after the other from `start` (4, 4), by default the identity."""
+        poses = [np.eye(4) if start is None else checked_transform("start", start)]
+        for increment in self.a_T_b:
+            poses.append(poses[-1] @ increment)
+        return np.stack(poses)
+
+    def select(self, rows: IntArray) -> Self:
+        """The odometry between some of the moments, by increasing rows."""
+        return type(self).of(self.timestamps[rows], self.path()[rows])

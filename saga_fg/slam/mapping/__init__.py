@@ -1,0 +1,5 @@
+"""Maps of landmarks: which observation is of which, and their joint estimate with the poses."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,108 @@
+"""Factor providers of a drive among landmarks: the pose by measured motions, and what is seen from it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from factors import ResidualFactor, ResidualFactors, Robust, Solution, between_factor, pose, pose_prior_factor
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
+from saga_fg.graph.factor_checks import Factor
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+
+
+def pose_key(epoch: int) -> int:
+    """Key of the vehicle's pose at an epoch."""
+    return key_of(EGO_POSE, 0, epoch)
+
+
+def landmark_key(number: int) -> int:
+    """Key of a landmark."""
+    return key_of(LANDMARK, number, None)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredMotion:
+    """The next pose by its motion since the one before, a_T_b; the first one by a prior, world_T_pose.
+
+    measured: (d + 1, d + 1); covariance (k, k) of its tangent; start: the pose to begin with, by default as measured
+    """
+
+    measured: FloatArray
+    covariance: FloatArray
+    start: FloatArray | None = None
+    name: str = "odometry"
+
+    def factors(self, view: GraphView) -> Additions:
+        key, state = pose_key(view.epoch), pose("measured", self.measured)
+        if view.epoch == 0:
+            factor = pose_prior_factor(key, self.measured, self.covariance)
+        else:
+            last = pose_key(view.epoch - 1)
+            factor, state = between_factor(last, key, self.measured, self.covariance), view.state(last).compose(state)
+        if self.start is not None:
+            state = pose("start", self.start)
+        return Additions([NewVariable(EGO_POSE, 0, state, label="vehicle")], [factor])
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Observations whose landmarks are known: by epoch, each with the number of its landmark.
+
+    A landmark begins when it is first seen, at its state in `start`; all factors come with the last of these epochs and
+    under its number, so that those of a kind are linearised together. robust: a loss for those that are not GTSAM's.
+    """
+
+    seen: Mapping[int, Sequence[tuple[int, Observation]]]
+    start: Mapping[int, Any]
+    robust: Robust | None = None
+    name: str = "landmarks"
+
+    def factors(self, view: GraphView) -> Additions:
+        kinds = {number: observation.kind for number, observation in self.seen.get(view.epoch, ())}
+        new = [
+            NewVariable(LANDMARK, n, self.start[n], static=True, label=kind.name, type=kind.variable)
+            for n, kind in kinds.items()
+            if landmark_key(n) not in view.variables
+        ]
+        last = max(self.seen, default=None)
+        return Additions(new, named={last: sighting_factors(self.seen, self.robust)} if last == view.epoch else {})
+
+    def landmarks(self, solution: Solution | GraphSolution, confirm: int = 1) -> list[Landmark]:
+        """The landmarks by number, where a solution has them; confirm: observations that make one certain."""
+        kinds, counts = dict[int, LandmarkType](), Counter[int]()
+        for number, observation in (one for now in self.seen.values() for one in now):
+            kinds[number] = observation.kind
+            counts[number] += 1
+        found = []
+        for n, kind in sorted(kinds.items()):
+            state, covariance = kind.variable.read(solution.values, landmark_key(n)), solution.marginal(landmark_key(n))
+            found.append(Landmark(n, kind, state, covariance, counts[n], counts[n] >= confirm))
+        return found
+
+
+def sighting_factors(
+    seen: Mapping[int, Sequence[tuple[int, Observation]]], robust: Robust | None = None
+) -> list[Factor]:
+    """The factors of observations as in `Sightings`, those of a kind together."""
+    by_kind: dict[LandmarkType, list[tuple[list[int], Observation]]] = {}
+    for epoch, now in seen.items():
+        for number, observation in now:
+            row = [pose_key(epoch), landmark_key(number)]
+            by_kind.setdefault(observation.kind, []).append((row, observation))
+    factors: list[Factor] = []
+    for kind, alike in by_kind.items():
+        rows = np.array([row for row, _ in alike], dtype=np.int64)
+        observed, covariances = (np.stack([getattr(z, name) for _, z in alike]) for name in ("value", "covariance"))
+        made = kind.factors(rows, observed, covariances)
+        factors += made if isinstance(made, Sequence) else [made]
+    if robust is None:
+        return factors
+    ours = ResidualFactor | ResidualFactors
+    return [replace(one, robust=robust) if isinstance(one, ours) else one for one in factors]

@@ -1,0 +1,89 @@
+"""A start for pose-graph optimisation that needs no guess: rotations first, then positions, each a linear problem.
+
+Rotations, relaxed to matrices and anchored at R_0 = 1 (chordal relaxation):
+
+    min  sum_e  kappa_e || R_second - R_first R_e ||_F^2,      kappa_e = k_R / tr(Sigma_R,e)
+
+then each is replaced by the nearest rotation (polar decomposition). With these, the positions:
+
+    min  sum_e  tau_e || t_second - t_first - R_first t_e ||^2,    tau_e = d / tr(Sigma_t,e)
+
+Source: L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniques for 3D SLAM: a survey on rotation
+estimation and its use in pose graph optimization", ICRA 2015; the weights are those of SE-Sync (Rosen et al., IJRR
+2019). Both systems are sparse and solved directly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.slam.pose_graph.graph import PoseGraph
+
+
+def chordal_poses(graph: PoseGraph) -> FloatArray:
+    """Poses (N, d + 1, d + 1) from the measurements alone; the first keeps its place.
+
+    Raises `InputError` for a graph that is not connected.
+    """
+    d = graph.dim
+    apart = graph.components() != 0
+    if apart.any():
+        raise InputError(f"pose {int(graph.ids[apart][0])}: expected measurements that connect it with the first pose")
+    covariance = np.linalg.inv(graph.information)
+    turn = np.trace(covariance[:, graph.rotation, graph.rotation], axis1=1, axis2=2)
+    shift = np.trace(covariance[:, graph.translation, graph.translation], axis1=1, axis2=2)
+    poses = np.tile(np.eye(d + 1), (len(graph), 1, 1))
+    poses[:, :d, :d] = _rotations(graph, (2 * d - 3) / turn)
+    poses[:, :d, d] = _positions(graph, poses[:, :d, :d], d / shift)
+    return np.asarray(graph.world_T_pose[0] @ poses)
+
+
+def nearest_rotations(matrices: FloatArray) -> FloatArray:
+    """The rotations (N, d, d) nearest to matrices (N, d, d) in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(matrices)
+    sign = np.ones(U.shape[:2])
+    sign[:, -1] = np.linalg.det(U @ Vt)
+    return np.asarray((U * sign[:, None, :]) @ Vt)
+
+
+def _rotations(graph: PoseGraph, weight: FloatArray) -> FloatArray:
+    """With X_i = R_i^T the residual of an edge is X_second - R_e^T X_first, for each column of X alike."""
+    d, n, m = graph.dim, len(graph), len(graph.first)
+    R = graph.first_T_second[:, :d, :d]
+    edge = np.arange(m)
+    blocks = np.concatenate([-R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape)])
+    A = _block_matrix(np.concatenate([edge, edge]), np.concatenate([graph.first, graph.second]), blocks, (m, n))
+    X = _anchored(A, np.repeat(weight, d), np.zeros((m * d, d)), np.eye(d))
+    return nearest_rotations(X.reshape(n, d, d).swapaxes(1, 2))
+
+
+def _positions(graph: PoseGraph, R: FloatArray, weight: FloatArray) -> FloatArray:
+    d, n, m = graph.dim, len(graph), len(graph.first)
+    edge = np.arange(m)
+    blocks = np.concatenate([-np.ones((m, 1, 1)), np.ones((m, 1, 1))])
+    A = _block_matrix(np.concatenate([edge, edge]), np.concatenate([graph.first, graph.second]), blocks, (m, n))
+    moved = (R[graph.first] @ graph.first_T_second[:, :d, d:])[:, :, 0]
+    return _anchored(A, weight, moved, np.zeros((1, d)))
+
+
+def _block_matrix(row: IntArray, column: IntArray, blocks: FloatArray, shape: tuple[int, int]) -> csc_array:
+    """The sparse matrix of square blocks (K, b, b) at these block rows and columns."""
+    b = blocks.shape[1]
+    rows = np.broadcast_to(row[:, None, None] * b + np.arange(b)[:, None], blocks.shape)
+    columns = np.broadcast_to(column[:, None, None] * b + np.arange(b), blocks.shape)
+    entries = (blocks.ravel(), (rows.ravel(), columns.ravel()))
+    return coo_array(entries, shape=(shape[0] * b, shape[1] * b)).tocsc()
+
+
+def _anchored(A: csc_array, weight: FloatArray, b: FloatArray, anchor: FloatArray) -> FloatArray:
+    """x minimising sum_i weight_i (A x - b)_i^2 with its first rows fixed at `anchor`."""
+    fixed, free = A[:, : len(anchor)], A[:, len(anchor) :]
+    if free.shape[1] == 0:
+        return anchor
+    weighted = free.T @ diags_array(weight / weight.max())
+    x = splu((weighted @ free).tocsc()).solve(np.asarray(weighted @ (b - fixed @ anchor)))
+    return np.concatenate([anchor, x])

@@ -1,0 +1,104 @@
+"""A pose graph: poses, and what was measured between pairs of them.
+
+    first_T_second = world_T_first^-1 world_T_second,     measured with information Omega
+
+    E = 1/2 sum_e || log( measured_e^-1 first_T_second ) ||^2_Omega_e
+
+The tangent lies in the second pose's own frame, m and rad, ordered as in GTSAM: (x, y, heading) in the plane, (rotation
+vector, translation) in space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
+
+_ORTHONORMAL = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """Poses in the plane (d = 2) or in space (d = 3), and measurements between them.
+
+    ids             (N,) unique, of the poses
+    world_T_pose    (N, d + 1, d + 1) a first guess of the poses
+    first, second   (M,) rows of the poses between which was measured
+    first_T_second  (M, d + 1, d + 1) the measurements
+    information     (M, k, k) of the tangent, k = 3 or 6; positive definite
+
+    Raises `InputError` where these do not fit together, or a rotation is none.
+    """
+
+    ids: IntArray
+    world_T_pose: FloatArray
+    first: IntArray
+    second: IntArray
+    first_T_second: FloatArray
+    information: FloatArray
+
+    def __post_init__(self) -> None:
+        ids = checked_ids("ids", self.ids)
+        size = np.asarray(self.world_T_pose).shape[-1:]
+        if size not in ((3,), (4,)):
+            raise InputError(f"world_T_pose: expected 3 x 3 or 4 x 4 transforms, got shape {size}")
+        d = size[0] - 1
+        first, second = checked_rows("first", self.first), checked_rows("second", self.second, len(self.first))
+        for name, rows in (("first", first), ("second", second)):
+            if ((rows < 0) | (rows >= len(ids))).any():
+                raise InputError(f"{name}: expected rows of the {len(ids)} poses, from 0")
+        if (first == second).any():
+            raise InputError(f"second[{int(np.argmax(first == second))}]: expected another pose than the first")
+        poses = _checked_transforms("world_T_pose", self.world_T_pose, len(ids), d)
+        between = _checked_transforms("first_T_second", self.first_T_second, len(first), d)
+        information = checked_covariances("information", self.information, len(first), 3 * (d - 1))
+        for name, array in (
+            ("ids", ids), ("world_T_pose", poses), ("first", first), ("second", second),
+            ("first_T_second", between), ("information", information),
+        ):  # fmt: skip
+            object.__setattr__(self, name, array)
+
+    @property
+    def rotation(self) -> slice:
+        """Where the rotation sits in the tangent."""
+        return slice(2, 3) if self.dim == 2 else slice(0, 3)
+
+    @property
+    def translation(self) -> slice:
+        """Where the translation sits in the tangent."""
+        return slice(0, 2) if self.dim == 2 else slice(3, 6)
+
+    @property
+    def dim(self) -> int:
+        """2 in the plane, 3 in space."""
+        return int(self.world_T_pose.shape[-1]) - 1
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def at(self, world_T_pose: FloatArray) -> PoseGraph:
+        """The same graph with its poses elsewhere."""
+        return PoseGraph(self.ids, world_T_pose, self.first, self.second, self.first_T_second, self.information)
+
+    def components(self) -> IntArray:
+        """Which connected part each pose belongs to, (N,), numbered from 0 in the order of their first poses."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        ones = np.ones(len(self.first))
+        _, label = connected_components(coo_array((ones, (self.first, self.second)), shape=(len(self), len(self))))
+        _, first_row, part = np.unique(label, return_index=True, return_inverse=True)
+        return np.asarray(np.argsort(np.argsort(first_row))[part], dtype=np.int64)
+
+
+def _checked_transforms(name: str, value: FloatArray, count: int, d: int) -> FloatArray:
+    T = checked(name, value, (count, d + 1, d + 1))
+    R = T[:, :d, :d]
+    skew = np.abs(R @ R.swapaxes(1, 2) - np.eye(d)).max(axis=(1, 2), initial=0.0)
+    bad = (skew > _ORTHONORMAL) | (np.linalg.det(R) < 0) | (T[:, d] != np.eye(d + 1)[d]).any(axis=1)
+    if bad.any():
+        raise InputError(f"{name}[{int(np.argmax(bad))}]: expected a rigid transform (orthonormal rotation)")
+    return T

@@ -1,0 +1,1 @@
+"""Values that go through the pipeline: boxes, frames of detections, sensors, road maps, tracks, datasets."""

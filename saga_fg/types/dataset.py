@@ -1,0 +1,114 @@
+"""The dataset protocol: scenes, and in each the frames of detections, the poses and, where there is one, the truth.
+
+A new dataset is one class with `scenes` and `scene(name)`; everything downstream (tracking, evaluation, export)
+works on `Scene`s alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, checked, checked_labels
+from saga_fg.numerics.geometry import checked_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Annotations:
+    """Ground truth of one moment, in world coordinates.
+
+    id       (N,) names of the objects, unique within the moment and constant over the scene
+    boxes         label, position, size, yaw, velocity (NaN where unknown)
+    visible  (N,) whether some sensor could see the object; occluded objects are False
+    """
+
+    id: StrArray
+    boxes: Boxes
+    visible: BoolArray
+
+    def __post_init__(self) -> None:
+        n = len(self.boxes)
+        ids = checked_labels("id", self.id, n)
+        if len(np.unique(ids)) != n:
+            raise InputError("id: expected unique object ids within one moment")
+        visible = np.asarray(self.visible)
+        if visible.shape != (n,) or (n and visible.dtype != np.bool_):
+            raise InputError(f"visible: expected {n} booleans, got {visible.dtype} {visible.shape}")
+        object.__setattr__(self, "id", ids)
+        object.__setattr__(self, "visible", visible.astype(bool))
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One recording.
+
+    name          unique within the dataset
+    timestamps    (K,) s, strictly increasing: the moments at which tracks are wanted
+    world_T_ego   (K, 4, 4) pose of the vehicle at these moments
+    tokens        K names the dataset gives to these moments ("" where it has none)
+    frames        of all sensors, in order of time
+    ground_truth  K annotations, or None
+
+    Raises `InputError` for times that repeat or run backwards, and for lengths that differ.
+    """
+
+    name: str
+    timestamps: FloatArray
+    world_T_ego: FloatArray
+    tokens: tuple[str, ...]
+    frames: Sequence[Frame]
+    ground_truth: Sequence[Annotations] | None = None
+
+    def __post_init__(self) -> None:
+        timestamps = checked("timestamps", self.timestamps, (None,))
+        step = np.diff(timestamps)
+        if (step <= 0).any():
+            k = int(np.argmax(step <= 0)) + 1
+            what = "repeats" if step[k - 1] == 0 else "runs backwards"
+            raise InputError(
+                f"scene {self.name}: timestamps[{k}]: expected increasing times, time {what} at {timestamps[k]:.6f} s"
+            )
+        poses = checked("world_T_ego", self.world_T_ego, (len(timestamps), 4, 4))
+        for k, pose in enumerate(poses):
+            checked_transform(f"scene {self.name}: world_T_ego[{k}]", pose)
+        for name, column in (("tokens", self.tokens), ("ground_truth", self.ground_truth)):
+            if column is not None and len(column) != len(timestamps):
+                raise InputError(f"scene {self.name}: {name}: expected {len(timestamps)} entries, got {len(column)}")
+        times = np.array([frame.timestamp for frame in self.frames])
+        if (np.diff(times) < 0).any():
+            k = int(np.argmax(np.diff(times) < 0)) + 1
+            raise InputError(
+                f"scene {self.name}: frames[{k}]: expected frames in order of time, {times[k]:.6f} s comes late"
+            )
+        object.__setattr__(self, "timestamps", timestamps)
+        object.__setattr__(self, "world_T_ego", poses)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The names of the sensors that speak in this scene, sorted."""
+        return tuple(sorted({frame.sensor for frame in self.frames}))
+
+
+class Dataset(Protocol):
+    """A collection of scenes, read one at a time."""
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The names of the scenes."""
+        ...
+
+    def scene(self, name: str) -> Scene:
+        """Read one scene; raises `InputError` for an unknown name or a broken record."""
+        ...

@@ -1,0 +1,187 @@
+"""What a sensor says: `Detection`, a table of them (`Detections`), and a `Frame`, one message of one sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import checked_transform
+from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
+from saga_fg.types.ego_measurements import EgoMeasurements
+from saga_fg.types.road_map import RoadMap
+
+Coordinates = Literal["world", "ego", "sensor"]
+NAN = float("nan")
+LATEST = 1e11  # s; the year 5138 where the epoch is 1970, and more than any clock in finer units shows today
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One detected object. NaN stands for "not measured" in size, yaw, velocity and range rate.
+
+    position: centre (x, y, z), m; size: (length, width, height), m; yaw: rad about z; velocity: (vx, vy), m/s over
+    ground; score: the detector's confidence, any finite number (probability or logit: see the sensor's model);
+    range_rate: m/s, see `Detections`.
+    """
+
+    label: str
+    position: tuple[float, float, float]
+    size: tuple[float, float, float] = (NAN, NAN, NAN)
+    yaw: float = NAN
+    velocity: tuple[float, float] = (NAN, NAN)
+    score: float = 1.0
+    range_rate: float = NAN
+
+    def __post_init__(self) -> None:
+        Detections.of([self])
+
+
+@dataclass(frozen=True, eq=False)
+class Detections(Columns):
+    """N detections as columns: `boxes`, their `score` (N,) and `range_rate` (N,). Iterating gives `Detection`s.
+
+    A range rate (m/s; NaN, as by default: not measured) is what a radar says of motion: the component of the velocity
+    *over ground* along the horizontal line of sight from the sensor, positive when the object moves away. Where the
+    radar gives it relative to itself, add the component of the sensor's own velocity along that line first.
+    """
+
+    boxes: Boxes
+    score: FloatArray
+    range_rate: FloatArray = field(default_factory=lambda: np.array(NAN))  # a single number serves all
+
+    def __post_init__(self) -> None:
+        n = len(self.boxes)
+        object.__setattr__(self, "score", checked("score", self.score, (n,)))
+        rate = np.full(n, self.range_rate) if np.ndim(self.range_rate) == 0 else self.range_rate
+        rate = checked("range_rate", rate, (n,), "finite-or-nan")
+        if (np.abs(rate) > MAX_SPEED).any():
+            row = int(np.argmax(np.abs(rate) > MAX_SPEED))
+            raise InputError(f"range_rate[{row}]: expected numbers within {MAX_SPEED:g}, got {rate[row]:g}")
+        object.__setattr__(self, "range_rate", rate)
+
+    @classmethod
+    def of(cls, detections: Sequence[Detection]) -> Self:
+        """The table of some `Detection`s. Raises `InputError` for anything else."""
+        rows = detections = list(detections) if isinstance(detections, Iterable) else [detections]
+        odd = next((type(d).__name__ for d in rows if not isinstance(d, Detection)), None)
+        if odd is not None:
+            raise InputError(f"detections: expected a list of Detection, got {odd}; for arrays there is Boxes.of")
+        boxes = Boxes.of(
+            [d.label for d in detections],
+            [d.position for d in detections],
+            [d.size for d in detections],
+            [d.yaw for d in detections],
+            [d.velocity for d in detections],
+        )
+        n = len(detections)
+        rate = checked("range_rate", [d.range_rate for d in detections], (n,), "finite-or-nan")
+        return cls(boxes, checked("score", [d.score for d in detections], (n,)), rate)
+
+    @classmethod
+    def empty(cls) -> Self:
+        return cls(Boxes.empty(), np.empty(0))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """The rows of all parts, one after the other."""
+        return super().concatenate(parts) if parts else cls.empty()
+
+    def __getitem__(self, row: int) -> Detection:
+        b = self.boxes
+        return Detection(
+            label=str(b.label[row]),
+            position=tuple(b.position[row].tolist()),
+            size=tuple(b.size[row].tolist()),
+            yaw=float(b.yaw[row]),
+            velocity=tuple(b.velocity[row].tolist()),
+            score=float(self.score[row]),
+            range_rate=float(self.range_rate[row]),
+        )
+
+    def __iter__(self) -> Iterator[Detection]:
+        return (self[row] for row in range(len(self)))
+
+    def transformed(self, target_T_source: FloatArray) -> Self:
+        """The detections in target coordinates."""
+        return type(self)(self.boxes.transformed(target_T_source), self.score, self.range_rate)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One message of one sensor: everything it detected at `timestamp`. An empty frame says "looked, saw nothing".
+
+    timestamp    s, any epoch, the same for all sensors of a scene
+    sensor       the sensor's name, e.g. "lidar"
+    detections   boxes in `coordinates`: "world", "ego" (vehicle) or "sensor"
+    world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world" and no range rate
+                 was measured, or `ego` is there to estimate it from
+    token        the dataset's own name of the record, "" if none
+    road_map     what is known of the road from now on, besides what earlier frames brought; None: nothing new
+    ego          what the vehicle measured of itself, for factor providers (`saga_fg.providers`)
+
+    Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
+    that is not rigid or beyond all places.
+    """
+
+    timestamp: float
+    sensor: str
+    detections: Detections
+    world_T_ego: FloatArray | None = None
+    coordinates: Coordinates = "world"
+    token: str = ""
+    road_map: RoadMap | None = None
+    ego: EgoMeasurements | None = None
+
+    def __post_init__(self) -> None:
+        timestamp = finite_seconds(self.timestamp)
+        if abs(timestamp) > LATEST:
+            raise InputError(f"timestamp: expected seconds, got {timestamp:g}: milli-, micro- or nanoseconds?")
+        object.__setattr__(self, "timestamp", timestamp)
+        if not isinstance(self.sensor, str) or not self.sensor:
+            raise InputError(f"sensor: expected a name, got {self.sensor!r}")
+        if not isinstance(self.detections, Detections):
+            raise InputError(f"detections: expected Detections, got {type(self.detections).__name__}")
+        if self.coordinates not in get_args(Coordinates):
+            raise InputError(
+                f"coordinates: expected one of {', '.join(get_args(Coordinates))}, got {self.coordinates!r}"
+            )
+        if self.ego is not None and not isinstance(self.ego, EgoMeasurements):
+            raise InputError(f"ego: expected EgoMeasurements, got {type(self.ego).__name__}")
+        if self.world_T_ego is not None:
+            pose = checked_transform("world_T_ego", self.world_T_ego)
+            if (np.abs(pose[:3, 3]) > MAX_POSITION).any():
+                place = pose[:3, 3].tolist()
+                raise InputError(f"world_T_ego: expected a place within {MAX_POSITION:g} m, got {place}")
+            object.__setattr__(self, "world_T_ego", pose)
+        elif self.ego is not None:
+            return
+        elif self.coordinates != "world":
+            raise InputError(
+                f"world_T_ego: expected a pose, since the detections are in {self.coordinates} coordinates"
+            )
+        elif np.isfinite(self.detections.range_rate).any():
+            raise InputError(
+                "world_T_ego: expected a pose, since range_rate is along the line of sight from the sensor"
+            )
+
+    def __len__(self) -> int:
+        return len(self.detections)
+
+
+def finite_seconds(timestamp: Any) -> float:
+    """A timestamp as a finite number of seconds, or `InputError`."""
+    try:
+        seconds = float(timestamp)
+    except (TypeError, ValueError, OverflowError):
+        seconds = NAN
+    if not math.isfinite(seconds):
+        got = "a larger one" if isinstance(timestamp, int) else repr(timestamp)[:40]
+        raise InputError(f"timestamp: expected a finite number of seconds, got {got}")
+    return seconds

@@ -1,0 +1,281 @@
+r"""Sensors: all that a sensor contributes to the filter is what it observes, how well, where, and when.
+
+    z = H x + v,   v ~ N(0, R)
+    R = s(score)^2 ( position^2 I + (range_noise r)^2 u u^T + (bearing_noise r)^2 n n^T )
+
+with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. A radar besides
+measures the range rate u . velocity, with the variance (s(score) range_rate)^2. A score means
+something else for every detector and class; its calibration makes it a probability that compares (Platt 1999),
+
+    P(the detection is true) = 1 / (1 + exp(-(offset + slope logit(score)))).
+
+The motion of the world never depends on which sensor speaks, so a new sensor is a few lines of configuration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
+from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
+from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+from saga_fg.types.by_class import DEFAULT, class_values
+from saga_fg.types.frame import LATEST, Detections, Frame
+
+LEAST_PROBABILITY = 1e-3  # of a detection, and of its being none
+_LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Standard deviations of what a sensor measures of a class of objects."""
+
+    position: float = setting(0.3, "standard deviation of a position, every direction, m")
+    range_noise: float = setting(0.0, "standard deviation along the line of sight, m per m of range")
+    bearing_noise: float = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
+    velocity: float = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
+    range_rate: float = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
+    low_score: float = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
+    told_scale: float = setting(1.0, "factor on the standard deviation that is told of a track's position")
+    told_low_score: float = setting(0.0, "it grows by the factor 1 + told_low_score * (1 - probability); > -1")
+    shared_error: float = setting(0.0, "standard deviation of what all detections of an object err alike, m")
+    shared_low_score: float = setting(0.0, "it grows by the factor 1 + shared_low_score * (1 - probability)")
+    yaw: float = setting(0.2, "standard deviation of the heading, rad")
+    height: float = setting(0.2, "standard deviation of the centre's height, m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "position", "velocity", "range_rate", "yaw", "height", "told_scale")
+        require_between(self, 0, math.inf, "range_noise", "bearing_noise", "low_score")
+        require_between(self, 0, math.inf, "shared_error", "shared_low_score")
+        require_between(self, -0.99, math.inf, "told_low_score")
+
+
+@dataclass(frozen=True)
+class ScoreCalibration:
+    """How the scores of a class become probabilities: straight on the logit."""
+
+    slope: float = setting(1.0, "change of the logit of the probability with the logit of the score")
+    offset: float = setting(0.0, "logit of the probability at a score of one half")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, math.inf, "slope")
+        require_between(self, -math.inf, math.inf, "offset")
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """What a sensor can see, in its own frame."""
+
+    min_azimuth: float = setting(-np.pi, "rad, from straight ahead, left positive")
+    max_azimuth: float = setting(np.pi, "rad")
+    max_range: float = setting(80.0, "m")
+
+    def __post_init__(self) -> None:
+        require_positive(self, "max_range", infinite=True)
+        require_between(self, -math.inf, math.inf, "min_azimuth", "max_azimuth")
+        if self.max_azimuth < self.min_azimuth:
+            raise InputError(
+                f"max_azimuth: expected at least min_azimuth {self.min_azimuth:g}, got {self.max_azimuth:g}"
+            )
+
+    def holds(self, distance: FloatArray, azimuth: FloatArray) -> BoolArray:
+        """Which places (N,), m and rad, lie in it; one that is not known (NaN) does."""
+        middle, half = (self.min_azimuth + self.max_azimuth) / 2, (self.max_azimuth - self.min_azimuth) / 2
+        aside = np.abs(wrap_angle(azimuth - middle))
+        return np.asarray(~(distance > self.max_range) & ~(aside > half + 1e-9))
+
+
+@dataclass(frozen=True)
+class Extrinsics:
+    """Pose of the sensor on the vehicle, ego_T_sensor, for detections given in sensor coordinates."""
+
+    x: float = setting(0.0, "m ahead")
+    y: float = setting(0.0, "m to the left")
+    z: float = setting(0.0, "m up")
+    yaw: float = setting(0.0, "rad")
+
+    @property
+    def ego_T_sensor(self) -> FloatArray:
+        """(4, 4)"""
+        return yaw_transform(self.x, self.y, self.z, self.yaw)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor's model."""
+
+    noise: Mapping[str, NoiseModel] = field(
+        default_factory=lambda: {DEFAULT: NoiseModel()},
+        metadata={"comment": "by class; the entry named default serves all others"},
+    )
+    use_velocity: bool = setting(True, "take in the velocity, or the range rate, where one was measured")
+    max_speed: float = setting(150.0, "velocities and range rates beyond this are errors and are not taken in, m/s")
+    detection_probability: float = setting(0.9, "chance that a visible object in the field of view is detected")
+    class_detection: Mapping[str, float] = settings_group(dict, "that chance by class, where it differs")
+    score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
+    calibration: Mapping[str, ScoreCalibration] = settings_group(
+        lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
+    )
+    class_accuracy: float = setting(
+        0.9, "chance that the class of a detection is the true one, else one of its group (tracker.class_groups)"
+    )
+    confusion: Mapping[str, Mapping[str, float]] = settings_group(
+        dict,
+        "by true class, how often objects are taken for each class, their own among them, as counts or shares; in "
+        "place of class_accuracy",
+    )
+    colour_accuracy: float = setting(0.9, "chance that the colour reported of a traffic light is the true one")
+    clutter_area: float | None = setting(
+        None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
+    )
+    births: Literal["alone", "confirmed"] = setting(
+        "alone", "whether a track born of its detections counts at once, or when other evidence has confirmed it"
+    )
+    field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
+    extrinsics: Extrinsics = settings_group(Extrinsics, "where it sits, for detections in sensor coordinates")
+    time_offset: float = setting(0.0, "added to the sensor's timestamps to get the time of measurement, s")
+
+    def __post_init__(self) -> None:
+        require_between(self, 0, 1, "detection_probability", "colour_accuracy")
+        if not 0 < self.class_accuracy < 1:
+            raise InputError(f"class_accuracy: expected a chance inside 0 to 1, got {self.class_accuracy!r}")
+        for label, taken_for in self.confusion.items():
+            if not all(0 <= share < math.inf for share in taken_for.values()) or sum(taken_for.values()) == 0:
+                raise InputError(f"confusion.{label}: expected shares >= 0, some above, got {dict(taken_for)!r}")
+            if label not in taken_for:
+                raise InputError(f"confusion.{label}: expected {label} among the classes it is taken for")
+        for label, chance in self.class_detection.items():
+            if not 0 <= chance <= 1:
+                raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")
+        require_between(self, -LATEST, LATEST, "time_offset")
+        require_positive(self, "max_speed", infinite=True)
+        if self.clutter_area is not None:
+            require_positive(self, "clutter_area", infinite=True)
+        require_one_of(self, "score", ("probability", "logit"))
+        require_one_of(self, "births", ("alone", "confirmed"))
+
+    def logit(self, score: FloatArray) -> FloatArray:
+        """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""
+        raw = np.asarray(score, dtype=np.float64)
+        if self.score == "probability":
+            p = np.clip(raw, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+            return np.asarray(np.log(p / (1 - p)))
+        return np.clip(raw, -_LARGEST_LOGIT, _LARGEST_LOGIT)
+
+    def probability(self, score: FloatArray, label: StrArray) -> FloatArray:
+        """The detector's scores (N,) of objects of these classes (N,) as probabilities in [0.001, 0.999]."""
+        return self.calibrated(self.logit(score), label)
+
+    def calibrated(self, logit: FloatArray, label: StrArray) -> FloatArray:
+        """The probabilities (N,) of scores with these logits (N,) before calibration."""
+        slope, offset = class_values(self.calibration, ScoreCalibration, label, "slope", "offset")
+        p = 1 / (1 + np.exp(-np.clip(offset + slope * logit, -50, 50)))
+        return np.asarray(np.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
+
+    def detection_chance(self, label: StrArray) -> FloatArray:
+        """(N,) chance that a visible object of each class in the field of view is detected."""
+        occurring, index = distinct(label)
+        chance = [self.class_detection.get(c, self.detection_probability) for c in occurring]
+        return np.array(chance, dtype=np.float64)[index]
+
+    def confusion_among(self, group: Sequence[str]) -> FloatArray:
+        """A (k, k): the chance that an object of each class of a group (rows) is taken for each (columns)."""
+        k = len(group)
+        A = np.full((k, k), (1 - self.class_accuracy) / max(k - 1, 1))
+        np.fill_diagonal(A, self.class_accuracy)
+        for row, label in enumerate(group):
+            if label in self.confusion:
+                A[row] = [max(self.confusion[label].get(other, 0.0), LEAST_PROBABILITY) for other in group]
+        return np.asarray(A / A.sum(axis=1, keepdims=True))
+
+    def deviations(self, label: StrArray, *names: str) -> FloatArray:
+        """(k, N) the noise parameters of these names, of the class of each label (N,)."""
+        return class_values(self.noise, NoiseModel, label, *names)
+
+    def position_covariance(
+        self, label: StrArray, position: FloatArray, probability: FloatArray, origin: FloatArray
+    ) -> FloatArray:
+        """R (N, 2, 2), m^2, of positions (N, 2) seen from `origin` (2,), the sensor's place, all in one frame.
+
+        Where each has an origin (N, 2) of its own that is the position itself, range and bearing add no noise.
+        """
+        offset = position - origin
+        own, along, across, low_score = self.deviations(label, "position", "range_noise", "bearing_noise", "low_score")
+        # along and across the line of sight u: (a r u)(a r u)^T + (b r n)(b r n)^T = b^2 r^2 I + (a^2 - b^2) r^2 u u^T
+        along, across, factor = along**2, across**2, _score_factor(low_score, probability)
+        isotropic = factor * (own**2 + across * np.einsum("ni,ni->n", offset, offset))
+        rays = (factor * (along - across))[:, None, None] * (offset[:, :, None] * offset[:, None, :])
+        return np.asarray(isotropic[:, None, None] * np.eye(2) + rays)
+
+    def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
+        """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
+
+        Where the sensor stood is unknown (None), so is the range, and its part of the noise is left out.
+        """
+        label, position = detections.boxes.label, detections.boxes.position[:, :2]
+        probability = self.probability(detections.score, label)
+        return self.position_covariance(label, position, probability, position if origin is None else origin)
+
+    def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
+        """R (N, 2, 2), (m/s)^2."""
+        deviation, low_score = self.deviations(label, "velocity", "low_score")
+        variance = deviation**2 * _score_factor(low_score, probability)
+        return np.asarray(variance[:, None, None] * np.eye(2))
+
+    def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
+        """(N,), (m/s)^2."""
+        deviation, low_score = self.deviations(label, "range_rate", "low_score")
+        return np.asarray(deviation**2 * _score_factor(low_score, probability))
+
+    def told(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What is told of positions (N,): the factor on their deviations, and the shared error, m."""
+        scale, shared, scale_growth, shared_growth = self.deviations(
+            label, "told_scale", "shared_error", "told_low_score", "shared_low_score"
+        )
+        doubt = 1 - probability
+        return scale * (1 + scale_growth * doubt), shared * (1 + shared_growth * doubt)
+
+    def in_world(self, frame: Frame) -> Detections:
+        """The detections of a frame of this sensor, in world coordinates; `InputError` where nobody knows the pose."""
+        if frame.coordinates == "world":
+            return frame.detections
+        if frame.world_T_ego is None:
+            raise InputError("world_T_ego: expected a pose, since nothing estimates it (tracker.ego.estimated)")
+        ego_T_source = self.extrinsics.ego_T_sensor if frame.coordinates == "sensor" else np.eye(4)
+        return frame.detections.transformed(frame.world_T_ego @ ego_T_source)
+
+    def origin(self, frame: Frame) -> FloatArray | None:
+        """Where the sensor stood (2,), world, m; None where the pose is unknown."""
+        if frame.world_T_ego is None:
+            return None
+        return np.asarray((frame.world_T_ego @ self.extrinsics.ego_T_sensor)[:2, 3])
+
+    def sees(self, position: FloatArray, world_T_ego: FloatArray | None) -> BoolArray:
+        """Which positions (N, 2), world, lie in the field of view; all of them where the pose is unknown."""
+        if world_T_ego is None:
+            return np.ones(len(position), dtype=bool)
+        return self.field_of_view.holds(*self.polar(position, world_T_ego))
+
+    def polar(self, position: FloatArray, world_T_ego: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Range (N,), m, and azimuth (N,), rad, of positions (N, 2), world, NaN where the pose is unknown."""
+        if world_T_ego is None:
+            return np.full(len(position), np.nan), np.full(len(position), np.nan)
+        sensor_T_world = inverse_transform(world_T_ego @ self.extrinsics.ego_T_sensor)
+        local = position @ sensor_T_world[:2, :2].T + sensor_T_world[:2, 3]
+        return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
+
+
+def _score_factor(low_score: FloatArray, probability: FloatArray) -> FloatArray:
+    """(N,) what a score below 1 multiplies a variance by."""
+    return np.asarray((1 + low_score * (1 - probability)) ** 2)
+
+
+def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:
+    """The model of a sensor: its own, else the one named default, else the plain one."""
+    return sensors.get(name) or sensors.get(DEFAULT) or Sensor()

@@ -1,0 +1,109 @@
+"""What a tracker says: the `Track`s of one moment, as a table (`Tracks`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_ids
+from saga_fg.types.boxes import Boxes
+
+
+@dataclass(frozen=True)
+class Track:
+    """One tracked object at one moment, in world coordinates: a row of `Tracks` (units and frames there)."""
+
+    id: int
+    label: str
+    position: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float
+    velocity: tuple[float, float]
+    score: float
+    position_covariance: FloatArray
+    velocity_covariance: FloatArray
+    coasting: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """All tracks of one moment, as columns, in world coordinates.
+
+    timestamp            s
+    id                   (N,)       unique, never reused within a run
+    boxes                           label, position, size, yaw, velocity (filtered)
+    score                (N,)       confidence, comparable within a run
+    position_covariance  (N, 2, 2)  of the horizontal position, m^2
+    velocity_covariance  (N, 2, 2)  (m/s)^2
+    coasting             (N,)       seconds since the last detection, 0 when just updated
+    """
+
+    timestamp: float
+    id: IntArray
+    boxes: Boxes
+    score: FloatArray
+    position_covariance: FloatArray
+    velocity_covariance: FloatArray
+    coasting: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.boxes)
+        for name, array in (
+            ("id", checked_ids("id", self.id, n)),
+            ("score", checked("score", self.score, (n,))),
+            ("position_covariance", checked("position_covariance", self.position_covariance, (n, 2, 2))),
+            ("velocity_covariance", checked("velocity_covariance", self.velocity_covariance, (n, 2, 2))),
+            ("coasting", checked("coasting", self.coasting, (n,))),
+        ):
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def empty(cls, timestamp: float) -> Self:
+        none = np.empty(0)
+        return cls(
+            timestamp,
+            np.empty(0, dtype=np.int64),
+            Boxes.empty(),
+            none,
+            np.empty((0, 2, 2)),
+            np.empty((0, 2, 2)),
+            none,
+        )
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __getitem__(self, row: int) -> Track:
+        b = self.boxes
+        return Track(
+            id=int(self.id[row]),
+            label=str(b.label[row]),
+            position=tuple(b.position[row].tolist()),
+            size=tuple(b.size[row].tolist()),
+            yaw=float(b.yaw[row]),
+            velocity=tuple(b.velocity[row].tolist()),
+            score=float(self.score[row]),
+            position_covariance=self.position_covariance[row],
+            velocity_covariance=self.velocity_covariance[row],
+            coasting=float(self.coasting[row]),
+        )
+
+    def __iter__(self) -> Iterator[Track]:
+        return (self[row] for row in range(len(self)))
+
+    def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
+        """The tracks of a mask, of row indices or of a slice."""
+        boxes = self.boxes.select(rows)
+        i = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
+        return type(self)(
+            self.timestamp,
+            self.id[i],
+            boxes,
+            self.score[i],
+            self.position_covariance[i],
+            self.velocity_covariance[i],
+            self.coasting[i],
+        )

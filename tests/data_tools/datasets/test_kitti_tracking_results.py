@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kitti_example import write_sequence
+
+from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.kitti import KittiTracking, read_kitti_labels, write_kitti_results
+from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
+from saga_fg import Boxes, InputError, Scene, Tracks
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> KittiTracking:
+    return KittiTracking(write_sequence(tmp_path / "kitti"), ground_truth=True)
+
+
+def tracks(boxes: Boxes, score: float = 0.5) -> Tracks:
+    n = len(boxes)
+    none = np.zeros((n, 2, 2))
+    return Tracks(0.0, np.arange(n) + 3, boxes, np.full(n, score), none, none, np.zeros(n))
+
+
+def truth_as_tracks(scene: Scene) -> list[Tracks]:
+    assert scene.ground_truth is not None
+    return [tracks(moment.boxes) for moment in scene.ground_truth]
+
+
+def car(position: tuple[float, float, float], label: str = "car", yaw: float = 0.0, height: float = 1.5) -> Tracks:
+    return tracks(Boxes.of([label], [position], [(4, 1.6, height)], [yaw]))
+
+
+def test_the_official_layout(data: KittiTracking, tmp_path: Path) -> None:
+    scene = data.scene("0007")
+    moments = [car((11, 2, 1)), Tracks.empty(0.1), Tracks.empty(0.2)]
+    write_kitti_results(tmp_path / "out", data, [(scene, moments)])
+    (line,) = (tmp_path / "out" / "0007.txt").read_text().splitlines()
+    fields = line.split()
+    assert fields[:5] == ["0", "3", "Car", "0", "0"]
+    alpha, *numbers = map(float, fields[5:])
+    assert alpha == pytest.approx(-np.pi / 2 - np.arctan2(-2, 10), abs=1e-6)
+    # x from -2.8 to -1.2, y from 0.25 to 1.75, the front at z = 8
+    expected_bbox = [600 - 700 * 2.8 / 8, 180 + 700 * 0.25 / 12, 600 - 700 * 1.2 / 12, 180 + 700 * 1.75 / 8]
+    np.testing.assert_allclose(numbers[:4], expected_bbox, atol=1e-4)
+    np.testing.assert_allclose(numbers[4:], [1.5, 1.6, 4, -2, 1.75, 10, -np.pi / 2, 0.5], atol=1e-6)
+
+
+def test_the_table_beside_the_results_has_all_tracks_in_world_coordinates(data: KittiTracking, tmp_path: Path) -> None:
+    scene = data.scene("0007")
+    behind = car((-30, 2, 1))  # not in the image
+    write_kitti_results(tmp_path / "out", data, [(scene, [behind, car((11, 2, 1)), Tracks.empty(0.2)])])
+    assert len(read_kitti_labels(tmp_path / "out" / "0007.txt")) == 1
+    rows = read_tracks(tmp_path / "out" / TRACK_TABLE)
+    assert rows.scene.tolist() == ["0007", "0007"]
+    assert rows.timestamp.tolist() == scene.timestamps[:2].tolist()
+    np.testing.assert_array_equal(rows.boxes.position, [[-30, 2, 1], [11, 2, 1]])
+    np.testing.assert_array_equal(rows.position_covariance, np.zeros((2, 2, 2)))
+
+
+def test_labels_to_the_world_and_back(data: KittiTracking, tmp_path: Path) -> None:
+    scene = data.scene("0007")
+    write_kitti_results(tmp_path / "out", data, [(scene, truth_as_tracks(scene))])
+    written = read_kitti_labels(tmp_path / "out" / "0007.txt")
+    labels = read_kitti_labels(tmp_path / "kitti" / "training" / "label_02" / "0007.txt")
+    labels = labels.select(labels.track_id >= 0)
+    assert written.frame.tolist() == labels.frame.tolist()
+    assert written.type.tolist() == labels.type.tolist()
+    np.testing.assert_allclose(written.boxes.size, labels.boxes.size, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(written.boxes.location, labels.boxes.location, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(written.boxes.rotation_y, labels.boxes.rotation_y, rtol=0, atol=1e-6)
+
+
+def test_only_what_shows_is_written(data: KittiTracking, tmp_path: Path) -> None:
+    moments = [car((-20, 2, 1)), car((11, 60, 1)), car((11, 2, 1))]  # behind, far to the left, ahead
+    write_kitti_results(tmp_path / "out", data, [(data.scene("0007"), moments)])
+    assert read_kitti_labels(tmp_path / "out" / "0007.txt").frame.tolist() == [2]
+
+
+def test_sequence_without_tracks_is_an_empty_file(data: KittiTracking, tmp_path: Path) -> None:
+    write_kitti_results(tmp_path / "out", data, [(data.scene("0007"), [Tracks.empty(0.0)] * 3)])
+    assert (tmp_path / "out" / "0007.txt").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("moments", "message"),
+    [
+        ([car((11, 2, 1))], "expected tracks for 3 frames, got 1"),
+        ([car((11, 2, 1), "bus")] * 3, "frame 0: unknown class 'bus'"),
+        ([car((11, 2, 1), yaw=np.nan)] * 3, "frame 0: track 3: expected a known size and heading"),
+        ([car((11, 2, 1), height=np.nan)] * 3, "frame 0: track 3: expected a known size and heading"),
+    ],
+)
+def test_tracks_that_cannot_be_written(
+    data: KittiTracking, tmp_path: Path, moments: list[Tracks], message: str
+) -> None:
+    with pytest.raises(InputError, match=f"out: sequence 0007: {message}"):
+        write_kitti_results(tmp_path / "out", data, [(data.scene("0007"), moments)])
+    assert not (tmp_path / "out").exists()

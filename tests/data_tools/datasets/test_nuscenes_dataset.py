@@ -1,0 +1,313 @@
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nuscenes_example import SAMPLES, START, Tables, box, results, tables, write_results, write_tables
+
+from data_tools.datasets.nuscenes import NuScenes
+from saga_fg import Dataset, InputError
+from saga_fg.numerics.geometry import yaw_of
+
+
+def dataset(tmp_path: Path, content: Tables | None = None, found: Any = None, **options: Any) -> NuScenes:
+    write_tables(tmp_path, content)
+    path = write_results(tmp_path / "found.json", found)
+    options = {"scenes": ["scene-0103"]} | options
+    return NuScenes(tmp_path, "v1.0-mini", {"lidar": path}, **options)
+
+
+def test_scene_has_times_poses_and_tokens(tmp_path: Path) -> None:
+    data: Dataset = dataset(tmp_path)
+    scene = data.scene("scene-0103")
+    assert data.scenes == ("scene-0103",)
+    assert scene.tokens == ("a0", "a1", "a2")
+    np.testing.assert_allclose(scene.timestamps, START * 1e-6 + np.array([0, 0.5, 1]), rtol=0, atol=1e-6)
+    # the pose of the LIDAR_TOP keyframe: neither the camera's nor the sweep's
+    np.testing.assert_array_equal(scene.world_T_ego[:, :3, 3], [[0, 0, 0], [5, 0, 0], [10, 0, 0]])
+    np.testing.assert_allclose(yaw_of(scene.world_T_ego[:, :3, :3]), np.pi / 2)
+    assert scene.ground_truth is None
+
+
+def test_frames_hold_the_detections_of_each_sample(tmp_path: Path) -> None:
+    scene = dataset(tmp_path).scene("scene-0103")
+    assert [(frame.token, frame.sensor, len(frame)) for frame in scene.frames] == [
+        ("a0", "lidar", 1),
+        ("a1", "lidar", 0),
+        ("a2", "lidar", 2),
+    ]
+    assert [frame.timestamp for frame in scene.frames] == scene.timestamps.tolist()
+    (car,) = scene.frames[0].detections
+    assert car.label == "car"
+    assert car.position == (100.0, 50.0, 1.0)
+    assert car.size == (4.0, 2.0, 1.5)  # length, width, height
+    assert car.yaw == pytest.approx(np.pi / 2)
+    assert np.isnan(car.velocity).all()
+    assert car.score == 0.5
+    last = scene.frames[2].detections
+    assert last.boxes.label.tolist() == ["car", "traffic_cone"]
+    np.testing.assert_array_equal(last.boxes.velocity, [[3, -1], [np.nan, np.nan]])
+    np.testing.assert_array_equal(scene.frames[2].world_T_ego, scene.world_T_ego[2])
+    assert scene.frames[2].coordinates == "world"
+
+
+@pytest.mark.parametrize("velocity", [None, [float("nan")] * 2, "absent"])
+def test_velocity_may_be_unknown(tmp_path: Path, velocity: Any) -> None:
+    found = results()
+    found["a0"][0]["velocity"] = velocity
+    if velocity == "absent":
+        del found["a0"][0]["velocity"]
+    scene = dataset(tmp_path, found=found).scene("scene-0103")
+    assert np.isnan(scene.frames[0].detections.boxes.velocity).all()
+
+
+def test_two_sensors_speak_at_each_sample(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    lidar = write_results(tmp_path / "l.json")
+    camera = write_results(tmp_path / "c.json", {"a1": [box("a1")]}, {"use_camera": True})
+    data = NuScenes(tmp_path, "v1.0-mini", {"lidar": lidar, "camera": camera}, ["scene-0103"])
+    assert [(f.token, f.sensor) for f in data.scene("scene-0103").frames] == [
+        ("a0", "lidar"),
+        ("a1", "lidar"),
+        ("a1", "camera"),
+        ("a2", "lidar"),
+    ]
+    assert data.meta.use_camera
+    assert data.meta.use_lidar
+    assert not data.meta.use_map
+
+
+def test_sample_that_is_not_listed_gets_no_frame_and_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        data = dataset(tmp_path, scenes=list(SAMPLES))
+        scene = data.scene("scene-0061")
+    assert [frame.token for frame in scene.frames] == ["b0"]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{tmp_path / 'found.json'}: lists 4 of 5 samples, the others get no frame"
+    ]
+
+
+def test_ground_truth(tmp_path: Path) -> None:
+    truth = dataset(tmp_path, ground_truth=True).scene("scene-0103").ground_truth
+    assert truth is not None
+    assert [moment.id.tolist() for moment in truth] == [["i-car", "i-ped"], ["i-car"], ["i-car", "i-ped"]]
+    assert truth[0].boxes.label.tolist() == ["car", "pedestrian"]
+    assert [moment.visible.tolist() for moment in truth] == [[True, True], [False], [True, True]]
+    np.testing.assert_array_equal(truth[0].boxes.size[0], [4.0, 2.0, 1.5])
+    np.testing.assert_allclose(truth[0].boxes.yaw, np.pi / 2)
+    np.testing.assert_allclose(truth[0].boxes.velocity, [[6, 0], [1, 0]], rtol=1e-6)  # one-sided
+    np.testing.assert_allclose(truth[1].boxes.velocity, [[8, 2]], rtol=1e-6)  # central
+    np.testing.assert_allclose(truth[2].boxes.velocity, [[10, 4], [1, 0]], rtol=1e-6)
+
+
+def test_no_velocity_over_a_long_gap(tmp_path: Path) -> None:
+    content = tables()
+    for k, sample in enumerate(content["sample"][:3]):
+        sample["timestamp"] = START + 1_600_000 * k
+    content["sample"][1]["timestamp"] -= 200_000  # 1.4 s and 1.8 s: one side too long, 3.2 s over both
+    truth = dataset(tmp_path, content, ground_truth=True).scene("scene-0103").ground_truth
+    assert truth is not None
+    known = [np.isfinite(moment.boxes.velocity[:, 0]).tolist() for moment in truth]
+    assert known == [[True, False], [False], [False, False]]
+
+
+def test_scenes_default_to_all_of_the_tables(tmp_path: Path) -> None:
+    assert dataset(tmp_path, scenes=None).scenes == ("scene-0103", "scene-0061")
+
+
+def test_scene_without_boxes_in_every_frame_is_fine(tmp_path: Path) -> None:
+    scene = dataset(tmp_path, found={"a0": [], "a1": [], "a2": []}).scene("scene-0103")
+    assert [len(frame) for frame in scene.frames] == [0, 0, 0]
+
+
+# Broken tables: what is changed, and the one line that says so.
+
+
+def change(table: str, row: int, **values: Any) -> Callable[[Tables], None]:
+    return lambda content: content[table][row].update(values)
+
+
+def drop(table: str, row: int, field: str | None = None) -> Callable[[Tables], None]:
+    def apply(content: Tables) -> None:
+        if field is None:
+            del content[table][row]
+        else:
+            del content[table][row][field]
+
+    return apply
+
+
+BROKEN_TABLES = [
+    (change("sample", 1, timestamp=START), r"sample\.json: record a1: timestamp: .* time repeats at"),
+    (change("sample", 2, timestamp=START - 1), r"sample\.json: record a2: timestamp: .* time runs backwards at"),
+    (change("sample", 1, timestamp="x"), r"record a1: timestamp: expected a whole number of microseconds, got 'x'"),
+    (change("sample", 1, timestamp=10**400), r"record a1: timestamp: expected a whole number"),
+    (change("sample", 1, token="a0"), r"sample\.json: record a0: expected every token once, it occurs again"),
+    (change("sample", 1, next="zz"), r"sample\.json: scene scene-0103: expected a sample 'zz', there is none"),
+    (change("sample", 1, next="a0"), r"sample\.json: scene scene-0103: expected 3 samples, the chain goes on"),
+    (change("sample", 1, next=""), r"sample\.json: scene scene-0103: expected 3 samples, got 2"),
+    (change("sample", 1, next=None), r"sample\.json: record 1: next: expected a string, got None"),
+    (change("scene", 0, name="scene-0061"), r"scene\.json: name: expected unique scene names, got 'scene-0061'"),
+    (change("scene", 0, nbr_samples="3"), r"scene\.json: scene scene-0103: nbr_samples: expected a number, got '3'"),
+    (drop("scene", 0, "name"), r"scene\.json: record 0 \(scene-0103\): field 'name' is missing"),
+    (drop("sample", 1, "timestamp"), r"sample\.json: record 1 \(a1\): field 'timestamp' is missing"),
+    (change("sensor", 0, channel="TOP"), r"sample_data\.json: sample a\d: expected a LIDAR_TOP keyframe"),
+    (drop("ego_pose", 3), r"ego_pose\.json: expected pose 'p-a1-0' of sample a1, there is none"),
+    (change("ego_pose", 3, rotation=[1, 1, 0, 0]), r"ego_pose\.json: record p-a1-0: rotation\[0\]: expected a unit"),
+    (change("ego_pose", 3, rotation=[1, 0]), r"ego_pose\.json: record p-a1-0: rotation: expected shape"),
+    (change("ego_pose", 3, translation=["x"]), r"ego_pose\.json: record p-a1-0: translation: expected three numbers"),
+    (change("ego_pose", 3, translation=[1, float("nan"), 0]), r"ego_pose\.json: record p-a1-0: pose\[1, 3\]: expec"),
+    (change("instance", 0, category_token="zz"), r"instance\.json: record i-car: expected a category, 'zz' is none"),
+    (change("sample_annotation", 0, instance_token="zz"), r"sample a1: instance_token: expected an instance, 'zz'"),
+    (change("sample_annotation", 0, size=[1, 2]), r"sample a1, instance i-car: expected 3, 3 and 4 numbers"),
+    (change("sample_annotation", 0, size=[1, 2, "x"]), r"sample a1, instance i-car: expected 3, 3 and 4 numbers"),
+    (change("sample_annotation", 0, size=[1, 0, 1]), r"scene scene-0103: size\[0\]: expected positive"),
+    (change("sample_annotation", 0, rotation=[2, 0, 0, 0]), r"scene scene-0103: rotation\[0\]: expected a unit quat"),
+    (change("sample_annotation", 0, sample_token="a0"), r"sample a0: id: expected unique object ids"),
+]
+
+
+@pytest.mark.parametrize(("apply", "message"), BROKEN_TABLES, ids=[message[:40] for _, message in BROKEN_TABLES])
+def test_broken_table(tmp_path: Path, apply: Callable[[Tables], None], message: str) -> None:
+    content = tables()
+    apply(content)
+    with pytest.raises(InputError, match=message) as caught:
+        dataset(tmp_path, content, ground_truth=True)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("table", list(tables()))
+def test_missing_table(tmp_path: Path, table: str) -> None:
+    write_tables(tmp_path)
+    (tmp_path / "v1.0-mini" / f"{table}.json").unlink()
+    with pytest.raises(InputError, match=rf"v1\.0-mini/{table}\.json: missing table '{table}'"):
+        NuScenes(tmp_path, "v1.0-mini", {}, ground_truth=True)
+
+
+@pytest.mark.parametrize("table", ["scene", "sample", "ego_pose", "sample_data"])
+def test_truncated_table(tmp_path: Path, table: str) -> None:
+    write_tables(tmp_path)
+    path = tmp_path / "v1.0-mini" / f"{table}.json"
+    path.write_text(path.read_text()[:-20])
+    with pytest.raises(InputError, match=rf"{table}\.json: character \d+: "):
+        NuScenes(tmp_path, "v1.0-mini", {})
+
+
+def test_table_that_is_no_list_of_objects(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    (tmp_path / "v1.0-mini" / "scene.json").write_text("[7]")
+    with pytest.raises(InputError, match=r"scene\.json: record 0: expected an object with fields name, "):
+        NuScenes(tmp_path, "v1.0-mini", {})
+
+
+def test_annotations_are_read_only_when_asked_for(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    (tmp_path / "v1.0-mini" / "sample_annotation.json").unlink()
+    assert NuScenes(tmp_path, "v1.0-mini", {}).scene("scene-0103").ground_truth is None
+
+
+def test_wrong_version_names_those_present(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    with pytest.raises(InputError, match=r"v1\.0-trainval: expected the folder .*versions there: v1\.0-mini"):
+        NuScenes(tmp_path, "v1.0-trainval", {})
+
+
+def test_unknown_scene_suggests_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"scene\.json: unknown scene 'scene-0013'; did you mean 'scene-0103'"):
+        dataset(tmp_path, scenes=["scene-0013"])
+    with pytest.raises(InputError, match="unknown scene 'scene-0061'"):
+        dataset(tmp_path).scene("scene-0061")  # in the tables, but not chosen
+
+
+# Broken detections.
+
+BROKEN_BOXES = [
+    ({"translation": [1, float("nan"), 0]}, r"translation: expected three finite numbers in m, got \[1\.0, nan,"),
+    ({"translation": [1, float("inf"), 0]}, r"translation: expected three finite numbers in m, got \[1\.0, inf,"),
+    ({"translation": [1, 2]}, r"translation: expected 3 numbers, got '\[1, 2\]'"),
+    ({"translation": "here"}, r"translation: expected 3 numbers, got 'here'"),
+    ({"size": [2, -4, 1]}, r"size: expected positive width, length, height in m, got \[2\.0, -4\.0, 1\.0\]"),
+    ({"size": [2, 0, 1]}, r"size: expected positive"),
+    ({"size": [2, None, 1]}, r"size: expected 3 numbers"),
+    ({"size": [2, float("nan"), 1]}, r"size: expected positive"),
+    ({"rotation": [1, 1, 0, 0]}, r"rotation: expected a unit quaternion \(w, x, y, z\), got \[1\.0, 1\.0, 0"),
+    ({"rotation": [float("nan"), 0, 0, 0]}, r"rotation: expected a unit quaternion"),
+    ({"velocity": [float("inf"), 0]}, r"velocity: expected finite numbers, or NaN for unknown"),
+    ({"velocity": [1]}, r"velocity: expected 2 numbers"),
+    ({"detection_score": float("nan")}, r"detection_score: expected a finite number, got nan"),
+    ({"detection_score": "high"}, r"detection_score: expected a number, got 'high'"),
+    ({"detection_name": "cra"}, r"detection_name: unknown class 'cra'; did you mean 'car'"),
+    ({"detection_name": 3}, r"detection_name: expected a string, got 3"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), BROKEN_BOXES, ids=[message[:40] for _, message in BROKEN_BOXES])
+def test_broken_box_names_file_sample_box_and_field(tmp_path: Path, values: dict[str, Any], message: str) -> None:
+    found = results()
+    found["a2"][1].update(values)
+    with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: {message}") as caught:
+        dataset(tmp_path, found=found)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("field", ["translation", "size", "rotation", "detection_name", "detection_score"])
+def test_box_without_a_field(tmp_path: Path, field: str) -> None:
+    found = results()
+    del found["a2"][1][field]
+    with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: field '{field}' is missing"):
+        dataset(tmp_path, found=found)
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        ({"a0": [], "xyz": []}, r"sample xyz: expected samples of the tables, they hold no such sample"),
+        ({"b0": []}, r"expected detections of scene scene-0103, the file lists none of its samples"),
+        ({"a0": {}}, r"sample a0: expected a list of boxes, got '\{\}'"),
+        ({"a0": [3]}, r"sample a0: box 0: expected an object, got 3"),
+        ({"a0": [box("a1")]}, r"sample a0: sample_token: expected the sample's own, got 'a1'"),
+        ([], r"character \d+: expected '\{'"),
+    ],
+)
+def test_broken_results(tmp_path: Path, found: Any, message: str) -> None:
+    with pytest.raises(InputError, match=rf"found\.json: {message}"):
+        dataset(tmp_path, found=found)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"meta": {}}', "expected a field 'results'"),
+        ('{"meta": 1, "results": {}}', "meta: expected an object"),
+        ('{"meta": {}, "results": {"a0": [], "a0": []}}', "sample a0: expected each sample once"),
+        ('{"meta": {}, "results": {"a0": [{"samp', "character 31: broken or truncated JSON"),
+        ("", r"character 0: expected '\{', the file ends"),
+    ],
+)
+def test_broken_result_file(tmp_path: Path, text: str, message: str) -> None:
+    write_tables(tmp_path)
+    path = tmp_path / "found.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"found\.json: {message}"):
+        NuScenes(tmp_path, "v1.0-mini", {"lidar": path})
+
+
+def test_missing_detection_file(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    with pytest.raises(InputError, match=r"none\.json: cannot be read: No such file"):
+        NuScenes(tmp_path, "v1.0-mini", {"lidar": tmp_path / "none.json"})
+
+
+def test_scene_that_a_sensor_never_saw(tmp_path: Path) -> None:
+    write_tables(tmp_path)
+    path = write_results(tmp_path / "found.json", {"a0": []})
+    data = NuScenes(tmp_path, "v1.0-mini", {"lidar": path})  # no scene was asked for yet
+    assert len(data.scene("scene-0103").frames) == 1
+    with pytest.raises(InputError, match="expected detections of scene scene-0061"):
+        data.scene("scene-0061")

@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from data_tools.files.atomic_files import (
+    atomic_directory,
+    atomic_file,
+    check_writable,
+    check_writable_folder,
+    remove_leftovers,
+    write_bytes,
+    write_text,
+)
+from saga_fg.errors import InputError
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_half(path: Path, exception: type[BaseException]) -> None:
+    with atomic_file(path) as file:
+        file.write(b"half")
+        raise exception
+
+
+def fill_half(path: Path) -> None:
+    with atomic_directory(path) as folder:
+        (folder / "old").write_text("half")
+        raise KeyboardInterrupt
+
+
+def test_file_is_written_whole_and_replaced_whole(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    write_text(path, "first é")
+    write_bytes(path, b"second")
+    assert path.read_bytes() == b"second"
+    assert names(tmp_path) == ["out.txt"]
+
+
+@pytest.mark.parametrize("exception", [KeyboardInterrupt, RuntimeError, SystemExit])
+def test_interrupted_file_leaves_the_earlier_one(tmp_path: Path, exception: type[BaseException]) -> None:
+    path = tmp_path / "out.txt"
+    write_text(path, "earlier")
+    with pytest.raises(exception):
+        write_half(path, exception)
+    assert path.read_text() == "earlier"
+    assert names(tmp_path) == ["out.txt"]
+
+
+def test_new_file_has_ordinary_permissions(tmp_path: Path) -> None:
+    write_text(tmp_path / "ours", "")
+    (tmp_path / "plain").write_text("")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_links_survive(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    write_text(tmp_path / "link", "text")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "target").read_text() == "text"
+
+
+def test_a_name_of_greatest_length(tmp_path: Path) -> None:
+    write_text(tmp_path / ("n" * 255), "text")
+    with pytest.raises(InputError, match="not writable"):
+        write_text(tmp_path / ("n" * 256), "text")
+
+
+def test_output_path_that_is_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected the name of a file to write, this is a folder"):
+        write_text(tmp_path, "x")
+
+
+def test_output_path_that_is_a_device() -> None:
+    with pytest.raises(InputError, match="no regular file"):
+        write_text("/dev/null", "x")
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("output", [atomic_file, atomic_directory])
+def test_folder_that_is_missing_or_a_file(tmp_path: Path, output) -> None:
+    (tmp_path / "file").write_text("")
+    for parent, reason in (("missing", "does not exist"), ("file", "is not a folder")):
+        with (
+            pytest.raises(InputError, match=f"not writable: the folder .*{parent} {reason}"),
+            output(tmp_path / parent / "out"),
+        ):
+            pytest.fail("the block must not run")
+
+
+@pytest.mark.parametrize("output", [atomic_file, atomic_directory])
+def test_folder_without_permission(tmp_path: Path, output, monkeypatch: pytest.MonkeyPatch) -> None:
+    # permission bits do not bind root, who may well run the tests: refuse as the system would
+    def refuse(self: Path, *args: object, **kwargs: object) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with (
+        pytest.raises(InputError, match=r"out: not writable: Permission denied; expected a folder"),
+        output(tmp_path / "out"),
+    ):
+        pytest.fail("the block must not run")
+
+
+def test_full_disk_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="out: not written: No space left"), atomic_file(tmp_path / "out"):
+        raise OSError(28, "No space left on device")
+    assert names(tmp_path) == []
+
+
+def test_directory_appears_when_complete(tmp_path: Path) -> None:
+    final = tmp_path / "out"
+    with atomic_directory(final) as folder:
+        (folder / "sub").mkdir()
+        (folder / "sub" / "a").write_text("a")
+        assert not final.exists()
+    assert (final / "sub" / "a").read_text() == "a"
+    assert names(tmp_path) == ["out"]
+
+
+def test_directory_with_files_keeps_the_others(tmp_path: Path) -> None:
+    final = tmp_path / "out"
+    (final / "sub").mkdir(parents=True)
+    (final / "old").write_text("old")
+    (final / "sub" / "a").write_text("old")
+    with atomic_directory(final) as folder:
+        (folder / "sub").mkdir()
+        (folder / "sub" / "a").write_text("new")
+        (folder / "b").write_text("new")
+    assert (final / "old").read_text() == "old"
+    assert (final / "sub" / "a").read_text() == "new"
+    assert (final / "b").read_text() == "new"
+    assert names(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_interrupted_directory_leaves_nothing(tmp_path: Path, exists: bool) -> None:
+    final = tmp_path / "out"
+    if exists:
+        final.mkdir()
+        (final / "old").write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        fill_half(final)
+    assert names(tmp_path) == (["out"] if exists else [])
+    assert not exists or (final / "old").read_text() == "old"
+
+
+def test_directory_path_that_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="expected the name of a folder"), atomic_directory(tmp_path / "out"):
+        pytest.fail("the block must not run")
+
+
+def test_other_os_errors_pass(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "out"):
+        (tmp_path / "elsewhere").read_text()
+
+
+def test_a_path_is_checked_before_long_work(tmp_path: Path) -> None:
+    check_writable(tmp_path / "new.json")
+    assert list(tmp_path.iterdir()) == []
+    for path in (tmp_path, tmp_path / "missing" / "new.json"):
+        with pytest.raises(InputError, match=path.name):
+            check_writable(path)
+
+
+def test_so_is_a_folder(tmp_path: Path) -> None:
+    check_writable_folder(tmp_path / "new")
+    (tmp_path / "there").mkdir()
+    check_writable_folder(tmp_path / "there")
+    (tmp_path / "file").touch()
+    assert names(tmp_path) == ["file", "there"]
+    assert names(tmp_path / "there") == []
+    for path in (tmp_path / "missing" / "new", tmp_path / "file"):
+        with pytest.raises(InputError, match=str(path)):
+            check_writable_folder(path)
+
+
+def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:
+    for name in (".a.csv.0123456789ab.tmp", "a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"):
+        (tmp_path / name).touch()
+    (tmp_path / ".folder.0123456789ab.tmp").mkdir()
+    (tmp_path / ".folder.0123456789ab.tmp" / "inside").touch()
+    remove_leftovers(tmp_path, "b.csv")
+    assert (tmp_path / ".a.csv.0123456789ab.tmp").exists()
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"}

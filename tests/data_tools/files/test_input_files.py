@@ -1,0 +1,125 @@
+"""What cannot be read, or would never end, is refused by every reader in one line that names it."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from data_tools import read_detections
+from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.kitti.labels import read_kitti_labels
+from data_tools.datasets.nuscenes import read_tracking_results
+from data_tools.datasets.plaza import read_plaza
+from data_tools.datasets.victoria_park import read_victoria_park
+from data_tools.export.labels import read_label_table
+from data_tools.files.input_files import open_bytes, read_text
+from data_tools.files.json_stream import open_json, parsed_json
+from data_tools.files.remote_files import expanded
+from data_tools.lidar import read_scan
+from data_tools.pose_graphs import read_g2o
+from data_tools.trajectories import read_kitti_poses, read_tum_poses
+from saga_fg import InputError
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "a.csv": read_detections,
+    "a.ndjson": read_detections,
+    "a.npz": read_detections,
+    "tracks.csv": read_tracks,
+    "labels.ndjson": read_label_table,
+    "results.json": read_tracking_results,
+    "0000.txt": read_kitti_labels,
+    "a.g2o": read_g2o,
+    "park.txt": read_victoria_park,
+    "P_DR.txt": read_plaza,
+    "poses.txt": read_kitti_poses,
+    "a.tum": read_tum_poses,
+    "a.bin": read_scan,
+    "a.pcd.bin": read_scan,
+    "a.pcd": read_scan,
+    "a.ply": read_scan,
+    "a.npy": read_scan,
+    "b.npz": read_scan,
+    "list.txt": lambda path: expanded([str(path)]),
+}
+
+
+@pytest.fixture(autouse=True)
+def _bounded() -> Iterator[None]:
+    """A reader that waits for ever, or fills the memory, fails its test instead of the machine."""
+
+    def give_up(*_: object) -> None:
+        raise TimeoutError("the reader waits, or reads on and on")
+
+    before, limits = signal.signal(signal.SIGALRM, give_up), resource.getrlimit(resource.RLIMIT_DATA)
+    signal.alarm(20)
+    resource.setrlimit(resource.RLIMIT_DATA, (8 << 30, limits[1]))
+    yield
+    signal.alarm(0)
+    resource.setrlimit(resource.RLIMIT_DATA, limits)
+    signal.signal(signal.SIGALRM, before)
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+def circle(path: Path) -> None:
+    path.symlink_to(path)
+
+
+HOSTILE = {
+    pipe: "expected a regular file, this is a pipe",
+    device: "expected a regular file, this is a device",
+    folder: "expected a regular file, this is a folder",
+    circle: "Too many levels of symbolic links",
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("make", HOSTILE)
+def test_what_is_no_file_is_refused(tmp_path: Path, name: str, make: Callable[[Path], None]) -> None:
+    path = tmp_path / name
+    make(path)
+    with pytest.raises(InputError) as caught:
+        READERS[name](path)
+    assert str(caught.value) == f"{path}: cannot be read: {HOSTILE[make]}"
+
+
+def test_a_name_with_a_zero_byte() -> None:
+    with pytest.raises(InputError, match="cannot be read: embedded null"):
+        open_bytes("a\0b")
+
+
+def test_links_to_files_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("text")
+    (tmp_path / "b").symlink_to("a")
+    assert read_text(tmp_path / "b") == "text"
+    with open_json(tmp_path / "b") as file:
+        assert file.read() == "text"
+
+
+@pytest.mark.parametrize("text", ["[" * 5000, '{"a": ' * 5000, "[1", b"\xff"])
+def test_json_that_is_broken_or_too_deep(text: str | bytes) -> None:
+    with pytest.raises(InputError, match=r"^here: broken or truncated JSON: "):
+        parsed_json(text, "here")
+
+
+@pytest.mark.parametrize("value", ["9" * 4000, "1" * 101])
+def test_long_numbers_in_text_tables(tmp_path: Path, value: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" + f"1 0 0 {value} 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(InputError, match=r"poses\.txt: line 2: expected values of at most 100 characters, got '"):
+        read_kitti_poses(path)

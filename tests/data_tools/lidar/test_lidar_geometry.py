@@ -1,0 +1,201 @@
+"""Ground, walls, poles, curbs and objects, found in scans of a street whose every piece is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from data_tools.lidar import (
+    EdgeSettings,
+    Scan,
+    detect_clusters,
+    extract_curbs,
+    extract_poles,
+    extract_walls,
+    fit_ground,
+    fit_plane,
+    segment_ground,
+    straight_edges,
+)
+from data_tools.lidar.clusters import l_shape_heading
+from data_tools.lidar.components import connected_from_above
+from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
+from data_tools.simulator.street import KERB, SENSOR_HEIGHT, street
+from saga_fg.errors import InputError
+from saga_fg.numerics.geometry import transform_points, yaw_transform
+from saga_fg.types.boxes import Boxes
+
+FINE = ScannerSettings(rings=48, columns=1000)
+NO_POLES = np.empty((0, 4))
+
+
+def seen(world: StandingWorld, seed: int = 0, pose: np.ndarray | None = None) -> Scan:
+    pose = yaw_transform(0.0, 0.0, SENSOR_HEIGHT, 0.0) if pose is None else pose
+    return simulate_scan(world, pose, np.random.default_rng(seed), FINE)
+
+
+def boxes(*rows: tuple[float, ...]) -> Boxes:
+    """x, y, z, length, width, height, yaw of each."""
+    table = np.array(rows)
+    return Boxes.of(["thing"] * len(rows), table[:, :3], table[:, 3:6], table[:, 6], np.zeros((len(rows), 2)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ground_is_what_lies_at_height_zero(seed: int) -> None:
+    points = seen(street(seed), seed).points
+    ground = segment_ground(points)
+    height = points[:, 2] + SENSOR_HEIGHT
+    assert np.mean(ground.is_ground[np.abs(height) < 0.08]) > 0.99
+    assert np.mean(ground.is_ground[height > 0.5]) < 0.02  # far houses, whose feet are hidden
+    near = np.hypot(points[:, 0], points[:, 1]) < 30
+    assert np.median(np.abs(ground.height - height)[near]) < 0.05
+
+
+def test_ground_follows_a_slope() -> None:
+    """A road that rises by 8 % from 15 m on: no line of sight knows it in advance."""
+    scan = seen(StandingWorld(Boxes.empty(), NO_POLES))
+    points = scan.points.copy()
+    points[:, 2] += 0.08 * np.maximum(points[:, 0] - 15.0, 0.0)
+    ground = segment_ground(points)
+    assert np.mean(ground.is_ground[np.abs(points[:, 0]) < 40]) > 0.98
+    assert not len(segment_ground(np.empty((0, 3))).height)
+
+
+def test_the_ground_plane_is_known_within_its_covariance() -> None:
+    squares = []
+    for seed in range(5):
+        points = seen(street(seed), seed).points
+        plane = fit_ground(points[segment_ground(points).is_ground])
+        assert plane is not None
+        n, d = plane.coefficients[:3], plane.coefficients[3]
+        off = np.array([n[0], n[1], d - SENSOR_HEIGHT])
+        squares.append(float(off @ np.linalg.solve(plane.covariance, off)))
+        assert abs(d - SENSOR_HEIGHT) < 0.02
+    assert np.mean(squares) < 3 * 2  # of three degrees of freedom, on the safe side
+    assert fit_ground(np.zeros((3, 3))) is None
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_plane_faces_the_sensor_and_holds_its_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    d = rng.uniform(1.0, 30.0)
+    u = np.linalg.svd(normal[None])[2][1:]
+    points = -d * normal + rng.uniform(-5, 5, (40, 2)) @ u
+    plane = fit_plane(points, 0.01)
+    np.testing.assert_allclose(plane.coefficients, [*normal, d], atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_are_the_fronts_of_houses(seed: int) -> None:
+    """Each wall lies on a side of a house; distances and directions are off by no more than the covariance says."""
+    world = street(seed)
+    points = seen(world, seed).points
+    walls = extract_walls(points[~segment_ground(points).is_ground])
+    assert len(walls) >= 4
+    houses = world.boxes.select(world.boxes.label == "house")
+    fronts = np.concatenate([(houses.position - houses.size / 2)[:, 1], (houses.position + houses.size / 2)[:, 1]])
+    along = [wall for wall in walls if abs(wall.coefficients[1]) > 0.98 and np.ptp(wall.extent[:, 0]) > 6]
+    assert len(along) >= 3
+    squares = []
+    for wall in along:
+        nx, ny, nz, d = wall.coefficients
+        error = d - np.abs(fronts)[np.argmin(np.abs(fronts + np.sign(ny) * d))]
+        off = np.array([nx, nz, error])
+        squares.append(float(off @ np.linalg.solve(wall.covariance, off)))
+    assert np.median(squares) < 7.8  # 95 % of a chi-square of three degrees of freedom
+
+
+def test_poles_are_found_where_they_stand() -> None:
+    poles = np.array([[10.0, 4.0, 0.1, 4.0], [-8.0, 6.0, 0.15, 3.0], [15.0, -7.0, 0.2, 5.0]])
+    world = StandingWorld(boxes((5.0, -5.0, 0.75, 4.4, 1.8, 1.5, 0.0), (0.0, 14.0, 3.0, 30.0, 2.0, 6.0, 0.0)), poles)
+    squares = []
+    for seed in range(4):
+        points = seen(world, seed).points
+        ground = segment_ground(points)
+        found = extract_poles(points, ground.height, extract_walls(points[~ground.is_ground]))
+        assert len(found) == 3
+        for place in poles[:, :2]:
+            nearest = min(found, key=lambda pole: float(np.linalg.norm(pole.foot[:2] - place)))
+            off = nearest.foot[:2] - place
+            assert np.linalg.norm(off) < 0.12
+            squares.append(float(off @ np.linalg.solve(nearest.covariance, off)))
+    assert np.mean(squares) < 3 * 2
+    assert extract_poles(np.empty((0, 3)), np.empty(0)) == []
+
+
+def test_curbs_are_the_edges_of_the_road() -> None:
+    world = StandingWorld(
+        boxes((0.0, 8.0, 0.07, 80.0, 8.0, 0.14, 0.0), (0.0, -9.0, 0.07, 80.0, 8.0, 0.14, 0.0)), NO_POLES
+    )
+    points = seen(world).points
+    curbs = extract_curbs(points, segment_ground(points).height)
+    ahead = curbs[np.abs(curbs[:, 0]) < 6]
+    assert len(ahead) > 20
+    off = np.minimum(np.abs(ahead[:, 1] - 4.0), np.abs(ahead[:, 1] + 5.0))
+    assert np.mean(off < 0.4) > 0.9
+    flat = seen(StandingWorld(Boxes.empty(), NO_POLES)).points
+    assert len(extract_curbs(flat, segment_ground(flat).height)) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_parked_cars_are_found_as_boxes(seed: int) -> None:
+    world = street(seed)
+    pose = yaw_transform(4.0, 0.0, SENSOR_HEIGHT, 0.1)
+    found = detect_clusters(seen(world, seed, pose).points)
+    cars = world.boxes.select((world.boxes.label == "car") & (np.abs(world.boxes.position[:, 0] - 4.0) < 20))
+    places = transform_points(pose, found.boxes.position)[found.boxes.label == "car"]
+    distance = np.linalg.norm(cars.position[:, None, :2] - places[None, :, :2], axis=2)
+    assert np.mean(distance.min(axis=1) < 1.0) >= 0.8
+    assert ((found.score > 0) & (found.score <= 1)).all()
+    assert not len(detect_clusters(np.empty((0, 3))))
+
+
+@given(st.floats(0.0, np.pi / 2 - 0.01), st.integers(0, 1000))
+def test_the_heading_of_an_l_is_that_of_its_sides(yaw: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    long, short = rng.uniform(0, 4.4, 80), rng.uniform(0, 1.8, 40)
+    l_shape = np.concatenate([np.column_stack([long, np.zeros(80)]), np.column_stack([np.zeros(40), short])])
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = (l_shape + rng.normal(0, 0.01, l_shape.shape)) @ np.array([[c, s], [-s, c]])
+    difference = (l_shape_heading(turned) - yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    assert abs(difference) < np.radians(4)
+
+
+def test_parts_are_joined_across_cells_and_apart_beyond() -> None:
+    chain = np.array([[0.1, 0.1, 0], [0.4, 0.4, 5], [0.7, 0.1, 0], [3.0, 0.1, 0], [-5.0, -5.0, 0]])
+    part = connected_from_above(chain, 0.3)
+    assert part[0] == part[1] == part[2]
+    assert len(set(part.tolist())) == 3
+    assert not len(connected_from_above(np.empty((0, 3)), 0.3))
+
+
+def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        settings = EdgeSettings(noise=0.05, bias=0.05, width=0.3)
+        points = np.column_stack([np.arange(-8.0, 9.0, 0.5), np.full(34, 4.0), np.full(34, -1.7)])
+        points[:, 1] += rng.normal(0, 0.1, 34) + np.interp(points[:, 0], [-8, 8.5], rng.normal(0, settings.bias, 2))
+        stray = np.column_stack([rng.uniform(-8, 8, 12), rng.uniform(-10, 0, 12), np.full(12, -1.7)])
+        turn = yaw_transform(yaw=rng.uniform(-3, 3))
+        (edge, *_) = straight_edges(transform_points(turn, np.concatenate([points, stray])), 1, settings)
+        off = transform_points(turn.T, edge.ends)[:, 1] - 4.0
+        squares.append(off @ np.linalg.solve(edge.covariance, off) / 2)
+    assert 0.5 < np.mean(squares) < 1.5
+    assert straight_edges(np.empty((0, 3)), 2) == []
+    with pytest.raises(InputError, match="points"):
+        EdgeSettings(points=2)  # which every line fits
+    assert straight_edges(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
+
+
+def test_kerbs_of_a_simulated_street_are_straight_edges() -> None:
+    for seed in range(3):
+        points = seen(street(seed, kerbs=True), seed).points
+        edges = straight_edges(extract_curbs(points, segment_ground(points).height), 2)
+        assert edges
+        for edge in edges:
+            np.testing.assert_allclose(np.abs(edge.ends[:, 1]), KERB, atol=0.35)

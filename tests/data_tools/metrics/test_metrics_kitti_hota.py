@@ -1,0 +1,142 @@
+"""HOTA on KITTI judges what the benchmark judges: cases by hand, and trackeval's own reading of the same files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_tools.datasets.kitti.labels import read_kitti_labels
+from data_tools.metrics import HotaFigures, KittiTrackingSequence, kitti_hota_figures
+
+trackeval = pytest.importorskip("trackeval")
+
+CAR = (100.0, 100.0, 180.0, 150.0)
+
+
+def line(
+    frame: int, id_: int, type_: str, bbox: tuple[float, ...], seen: tuple[int, int] = (0, 0), x: float = 0.0
+) -> str:
+    corners = " ".join(f"{value:.2f}" for value in bbox)
+    return f"{frame} {id_} {type_} {seen[0]} {seen[1]} 0 {corners} 1.5 1.8 4.2 {x:.2f} 1.6 20 0"
+
+
+def sequence(folder: Path, truth: list[str], found: list[str]) -> KittiTrackingSequence:
+    objects = []
+    for name, lines in (("truth", truth), ("found", [f"{each} 0.9" for each in found])):
+        (folder / name).write_text("\n".join(lines) + "\n")
+        objects.append(read_kitti_labels(folder / name))
+    return KittiTrackingSequence(*objects)
+
+
+def figures(folder: Path, truth: list[str], found: list[str], label: str = "car") -> HotaFigures:
+    cars = [line(k, 1, label.capitalize(), CAR) for k in range(4)]
+    return kitti_hota_figures([sequence(folder, cars + truth, cars + found)], label)
+
+
+ELSEWHERE = (400.0, 100.0, 480.0, 150.0)
+IGNORED = {
+    "a van": ([line(0, 2, "Van", ELSEWHERE)], ELSEWHERE),
+    "truncated": ([line(0, 2, "Car", ELSEWHERE, (1, 0))], ELSEWHERE),
+    "hidden": ([line(0, 2, "Car", ELSEWHERE, (0, 3))], ELSEWHERE),
+    "small": ([], (400.0, 100.0, 440.0, 124.9)),
+    "nobody cares": ([line(0, -1, "DontCare", (390.0, 90.0, 445.0, 160.0))], ELSEWHERE),
+}
+
+
+@pytest.mark.parametrize("case", IGNORED)
+def test_what_the_benchmark_does_not_ask_for_is_neither_found_nor_false(tmp_path: Path, case: str) -> None:
+    truth, box = IGNORED[case]
+    for found in ([], [line(0, 9, "Car", box)]):
+        result = figures(tmp_path, truth, found)
+        assert (result.fp, result.fn, result.hota) == (0, 0, pytest.approx(1.0))
+
+
+@pytest.mark.parametrize(
+    ("truth", "box"),
+    [
+        ([line(0, 2, "Van", ELSEWHERE)], (430.0, 100.0, 510.0, 150.0)),  # beside the van
+        ([line(0, -1, "DontCare", (445.0, 90.0, 490.0, 160.0))], ELSEWHERE),  # less than half of it
+        ([line(1, -1, "DontCare", (390.0, 90.0, 490.0, 160.0))], ELSEWHERE),  # in another frame
+        ([], (400.0, 100.0, 440.0, 125.1)),
+    ],
+)
+def test_a_box_with_nothing_to_excuse_it_is_false(tmp_path: Path, truth: list[str], box: tuple[float, ...]) -> None:
+    assert figures(tmp_path, truth, [line(0, 9, "Car", box)]).fp == 1
+
+
+def test_largely_hidden_objects_are_asked_for_and_small_ones_too(tmp_path: Path) -> None:
+    truth = [line(0, 2, "Car", ELSEWHERE, (0, 2)), line(0, 3, "Car", (600.0, 100.0, 640.0, 120.0))]
+    assert figures(tmp_path, truth, []).fn == 2
+
+
+def test_persons_who_sit_go_with_pedestrians(tmp_path: Path) -> None:
+    found = [line(0, 9, "Pedestrian", ELSEWHERE)]
+    for name in ("Person", "Person_sitting"):
+        assert figures(tmp_path, [line(0, 2, name, ELSEWHERE)], found, "pedestrian").fp == 0
+
+
+def test_in_space_the_same_objects_are_judged(tmp_path: Path) -> None:
+    truth = [line(0, 1, "Car", CAR), line(0, 2, "Van", ELSEWHERE, x=10.0)]
+    found = [line(0, 7, "Car", CAR, x=1.0), line(0, 9, "Car", ELSEWHERE, x=14.0)]
+    both = sequence(tmp_path, truth, found)
+    for similarity in ("bev_iou", "iou_3d"):
+        result = kitti_hota_figures([both], "car", similarity)
+        assert result.fp + result.fn == 0
+        assert result.motp == pytest.approx(3.2 / 5.2)
+
+
+def traffic(seed: int) -> tuple[list[str], list[str]]:
+    """Boxes that drift through the image, with all that is not judged, and what a poor tracker makes of them."""
+    rng = np.random.default_rng(seed)
+    truth, found = [], []
+    places, speeds = rng.uniform((0, 100), (1100, 250), (12, 2)), rng.normal(0, 6, (12, 2))
+    sizes, types = rng.uniform((20, 15), (120, 70), (12, 2)), rng.choice(["Car", "Car", "Van", "Pedestrian"], 12)
+    for k in range(25):
+        for n in range(12):
+            corner = places[n] + k * speeds[n]
+            box = (*corner, *(corner + sizes[n]))
+            if rng.random() < 0.9:
+                truth.append(line(k, n, types[n], box, (int(rng.random() < 0.1), int(rng.integers(0, 4)))))
+            if rng.random() < 0.8:
+                moved = np.array(box) + rng.normal(0, 4, 4)
+                type_ = "Car" if types[n] != "Pedestrian" else "Pedestrian"
+                found.append(line(k, 100 + n + 20 * (rng.random() < 0.05), type_, tuple(moved)))
+        area = rng.uniform((0, 80), (900, 150))
+        truth.append(line(k, -1, "DontCare", (*area, area[0] + 250, area[1] + 100)))
+        clutter = rng.uniform((0, 80), (1100, 250))
+        found.append(line(k, 500 + k, "Car", (*clutter, *(clutter + rng.uniform(15, 90, 2)))))
+    return truth, found
+
+
+def test_figures_are_those_of_trackeval_itself(tmp_path: Path) -> None:
+    sequences, true_folder, found_folder = [], tmp_path / "gt" / "label_02", tmp_path / "trackers" / "t" / "data"
+    for folder in (true_folder, found_folder):
+        folder.mkdir(parents=True)
+    (tmp_path / "gt" / "evaluate_tracking.seqmap.training").write_text("0000 empty 0 25\n0001 empty 0 25\n")
+    for seed in range(2):
+        truth, found = traffic(seed)
+        sequences.append(sequence(tmp_path, truth, found))
+        (tmp_path / "truth").rename(true_folder / f"{seed:04d}.txt")
+        (tmp_path / "found").rename(found_folder / f"{seed:04d}.txt")
+    config = {
+        "GT_FOLDER": str(tmp_path / "gt"),
+        "TRACKERS_FOLDER": str(tmp_path / "trackers"),
+        "OUTPUT_FOLDER": str(tmp_path),
+        "TRACKERS_TO_EVAL": ["t"],
+        "SPLIT_TO_EVAL": "training",
+        "CLASSES_TO_EVAL": ["car", "pedestrian"],
+        "PRINT_CONFIG": False,
+    }
+    dataset, metric = trackeval.datasets.Kitti2DBox(config), trackeval.metrics.HOTA()
+    for label in ("car", "pedestrian"):
+        each = {}
+        for name in ("0000", "0001"):
+            data = dataset.get_preprocessed_seq_data(dataset.get_raw_seq_data("t", name), label)
+            each[name] = metric.eval_sequence(data)
+        expected, mine = metric.combine_sequences(each), kitti_hota_figures(sequences, label)
+        assert 0.1 < mine.hota < 0.95
+        np.testing.assert_allclose(mine.hota_at, expected["HOTA"], rtol=1e-12)
+        for name, value in (("DetA", mine.deta), ("AssA", mine.assa), ("LocA", mine.loca)):
+            assert value == pytest.approx(np.mean(expected[name]), rel=1e-12)

@@ -1,0 +1,143 @@
+"""What sensors report has the statistics their settings promise, within 4 standard errors of a fixed seed's draw."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_tools.simulator.sensors import detection_probability, in_view, observe
+from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Detections
+
+POSE = yaw_transform(800.0, 400.0, 0.0, 2.0)
+CENTRED = replace(lidar(), position=(0.0, 0.0, 1.8))
+
+
+def cars(ego_positions: FloatArray) -> Boxes:
+    """Cars at horizontal places (N, 2) in the vehicle's frame, at 5 m/s, in world coordinates."""
+    n = len(ego_positions)
+    position = np.column_stack([ego_positions, np.full(n, 0.8)])
+    boxes = Boxes.of(
+        ["car"] * n, position, np.tile([4.5, 1.8, 1.6], (n, 1)), np.full(n, 0.3), np.tile([5.0, 0.0], (n, 1))
+    )
+    return boxes.transformed(POSE)
+
+
+def detections(sensor: SensorSettings, boxes: Boxes, share: float = 1.0, frames: int = 200) -> list[Detections]:
+    rng = np.random.default_rng(7)
+    return [observe(sensor, POSE, boxes, np.full(len(boxes), share), rng) for _ in range(frames)]
+
+
+def within(value: float, expected: float, standard_error: float) -> bool:
+    return abs(value - expected) < 4 * standard_error
+
+
+@pytest.mark.parametrize("distance", [10.0, 40.0])
+@pytest.mark.parametrize("sensor", [lidar(), camera()], ids=["lidar", "camera"])
+def test_errors_along_and_across_the_line_of_sight(sensor: SensorSettings, distance: float) -> None:
+    sensor = replace(sensor, position=(0.0, 0.0, 1.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
+    bearing = 0.5
+    place = distance * np.array([[np.cos(bearing), np.sin(bearing)]])
+    truth = cars(place)
+    found = Detections(
+        Boxes.concatenate([d.boxes for d in detections(sensor, truth, frames=3000)]), np.full(3000, 0.5)
+    ).boxes
+    error = found.position - truth.position
+    u = np.array([np.cos(bearing + 2.0), np.sin(bearing + 2.0)])
+    along, across = error[:, :2] @ u, error[:, :2] @ np.array([-u[1], u[0]])
+    for sample, (base, slope) in ((along, sensor.range_noise), (across, sensor.bearing_noise)):
+        sigma = base + slope * distance
+        assert within(sample.mean(), 0.0, sigma / math.sqrt(3000))
+        assert within(sample.std(), sigma, sigma / math.sqrt(6000))
+    assert within(error[:, 2].std(), sensor.height_noise, sensor.height_noise / math.sqrt(6000))
+    assert within((found.yaw - truth.yaw).std(), sensor.yaw_noise, sensor.yaw_noise / math.sqrt(6000))
+    assert within(np.log(found.size / truth.size).std(), sensor.size_noise, sensor.size_noise / math.sqrt(18000))
+    if sensor.velocity_noise is None:
+        assert np.isnan(found.velocity).all()
+    else:
+        velocity_error = found.velocity - truth.velocity
+        assert within(velocity_error.std(), sensor.velocity_noise, sensor.velocity_noise / math.sqrt(12000))
+
+
+@pytest.mark.parametrize(("share", "distance"), [(1.0, 10.0), (0.25, 10.0), (0.1, 10.0), (1.0, 59.0)])
+def test_the_rate_of_misses(share: float, distance: float) -> None:
+    sensor = replace(CENTRED, clutter_rate=0.0)
+    angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
+    boxes = cars(distance * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    count = sum(map(len, detections(sensor, boxes, share)))
+    ramp = min(max((share - 0.15) / 0.2, 0.0), 1.0)
+    p = 0.97 * ramp / (1 + math.exp((distance - 60.0) / 6.0))
+    assert detection_probability(sensor, np.array([distance]), np.array([share]))[0] == pytest.approx(p)
+    assert within(count / 10_000, p, math.sqrt(p * (1 - p) / 10_000) + 1e-12)
+
+
+def test_the_rate_of_clutter_and_where_it_falls() -> None:
+    sensor = replace(camera(), position=(0.0, 0.0, 1.5), clutter_rate=2.5)
+    found = detections(sensor, Boxes.empty(), frames=4000)
+    counts = np.array([len(d) for d in found])
+    assert within(counts.mean(), 2.5, math.sqrt(2.5 / 4000))
+    assert within(counts.var(), 2.5, 2.5 * math.sqrt(2.4 / 4000))  # Poisson: variance of the sample variance
+    everything = Boxes.concatenate([d.boxes for d in found])
+    assert in_view(sensor, POSE, everything.position).all()
+    distance = np.linalg.norm(everything.position[:, :2] - POSE[:2, 3], axis=1)
+    near = (distance < sensor.max_range / 2).mean()
+    assert within(near, 0.25, math.sqrt(0.25 * 0.75 / len(distance)))  # evenly over the area
+
+
+def test_nothing_is_seen_outside_the_field_of_view() -> None:
+    sensor = replace(camera(), position=(0.0, 0.0, 1.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
+    half = sensor.field_of_view / 2
+    bearing = np.array([0.0, half - 0.05, -half + 0.05, half + 0.05, -half - 0.05, np.pi])
+    boxes = cars(30.0 * np.stack([np.cos(bearing), np.sin(bearing)], axis=1))
+    assert in_view(sensor, POSE, boxes.position).tolist() == [True, True, True, False, False, False]
+    counts = [len(d) for d in detections(sensor, boxes, frames=20)]
+    assert counts == [3] * 20
+    far = cars(np.array([[sensor.max_range + 1.0, 0.0]]))
+    assert not any(map(len, detections(sensor, far, frames=20)))
+
+
+@pytest.mark.parametrize("sensor", [lidar(), camera()], ids=["lidar", "camera"])
+def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> None:
+    boxes = cars(np.array([[15.0, 0.0], [30.0, 5.0]]))
+    true = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes)])
+    hidden = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes, 0.3)])
+    false = np.concatenate([d.score for d in detections(sensor, Boxes.empty(), frames=400)])
+    assert ((true > 0) & (true < 1)).all()
+    assert true.mean() > hidden.mean() > false.mean()
+    better = (true[:, None] > false[None, :]).mean()
+    assert 0.85 < better < 0.999  # area under the ROC curve
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"rate": 0.0}, "rate: expected a positive number"),
+        ({"field_of_view": 7.0}, "field_of_view: expected an angle"),
+        ({"detection_probability": 1.2}, "detection_probability: expected a share"),
+        ({"hidden_share": 0.6}, "clear_share: expected more than hidden_share"),
+    ],
+)
+def test_settings_without_sense_are_refused(change: dict[str, float], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        replace(lidar(), **change)
+
+
+def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() -> None:
+    sensor = replace(radar(), position=(0.0, 0.0, 0.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
+    bearing, noise = 0.5, sensor.range_rate_noise
+    assert noise is not None
+    truth = cars(30.0 * np.array([[np.cos(bearing), np.sin(bearing)]]))
+    found = detections(sensor, truth, frames=3000)
+    error = np.concatenate([d.range_rate for d in found]) - 5.0 * math.cos(bearing)
+    assert within(error.mean(), 0.0, noise / math.sqrt(3000))
+    assert within(error.std(), noise, noise / math.sqrt(6000))
+    assert all(np.isnan(d.boxes.size).all() and np.isnan(d.boxes.yaw).all() for d in found)
+    false = detections(replace(sensor, clutter_rate=5.0), Boxes.empty())
+    assert np.abs(np.concatenate([d.range_rate for d in false])).max() < 6 * noise

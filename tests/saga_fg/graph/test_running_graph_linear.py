@@ -1,0 +1,80 @@
+"""Law 1 of the running graph: what is linear equals the textbook, whatever comes and goes and however time runs."""
+
+import numpy as np
+import pytest
+from estimator_programs import Predict, TextbookEstimator, Update, births, random_program
+from graph_estimator import GraphEstimator
+from random_graphs import CAR, CONE, random_graph
+
+from saga_fg.estimators import Measurements
+from saga_fg.model.discretisation import discretise
+
+LAGS = [pytest.param(0.0, id="filter"), pytest.param(1.0, id="lag"), pytest.param(None, id="all")]
+USUAL = (0.02, 0.1, 0.37, 0.5, 1.2)
+MILLISECONDS = (1e-3, 0.05, 1.0)
+
+
+def largest_errors(program, estimator):
+    """Of means in posterior sigmas, of joint and of single covariances relative, after every operation."""
+    textbook = TextbookEstimator()
+    errors = np.zeros(3)
+    for operation in program:
+        operation.run(textbook)
+        operation.run(estimator)
+        nodes = textbook.nodes.tolist()
+        assert sorted(estimator.nodes) == sorted(nodes)
+        if not nodes:
+            continue
+        P = textbook.joint_covariance(nodes)
+        mean = (estimator.joint_mean(nodes) - textbook.joint_mean(nodes)) / np.sqrt(np.diag(P))
+        joint = np.linalg.norm(estimator.joint_covariance(nodes) - P) / np.linalg.norm(P)
+        own = [(estimator.covariance(node), textbook.covariance([node])[0]) for node in nodes]
+        single = max(np.linalg.norm(mine - its) / np.linalg.norm(its) for mine, its in own)
+        errors = np.maximum(errors, [np.abs(mean).max(), joint, single])
+    return errors
+
+
+@pytest.mark.parametrize("lag", LAGS)
+@pytest.mark.parametrize("seed", range(10))
+def test_random_programs_agree_with_the_textbook(seed, lag):
+    """Births, deaths, misses, several sensors, graphs that change, nodes of four kinds."""
+    mean, joint, single = largest_errors(
+        random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), GraphEstimator(lag)
+    )
+    assert mean < (1e-9 if lag == 0.0 else 5e-9)
+    assert joint < 1e-9
+    assert single < 1e-8  # iSAM2's marginals have one digit less
+
+
+@pytest.mark.parametrize("lag", LAGS)
+@pytest.mark.parametrize("seed", range(10))
+def test_milliseconds_beside_seconds(seed, lag):
+    """With constant velocity. The noise of constant acceleration falls with the fifth power of the interval."""
+    program = random_program(np.random.default_rng(seed), moments=9, intervals=MILLISECONDS, kinds=(CAR, CONE))
+    mean, joint, single = largest_errors(program, GraphEstimator(lag))
+    assert max(mean, joint, single) < 1e-9
+
+
+def test_a_long_program_does_not_drift_away():
+    program = random_program(np.random.default_rng(100), moments=60, kinds=(CAR, CONE), intervals=USUAL, density=0.15)
+    mean, joint, single = largest_errors(program, GraphEstimator(0.0))
+    assert max(mean, joint, single) < 1e-9
+
+
+def test_many_nodes_that_hang_together():
+    """Eliminated by Cholesky, which keeps half the digits."""
+    rng, ids = np.random.default_rng(5), list(range(25))
+    program = [births(rng, ids, CAR)]
+    for _ in range(5):
+        seen = np.array(ids)[rng.random(25) < 0.6]
+        measured = Measurements(seen, 10 * rng.normal(size=(len(seen), 2)), np.eye(2, 4), 0.2 * np.eye(2))
+        program += [Predict(discretise(random_graph(rng, (CAR,) * 25, ids, 0.2), 0.3)), Update(measured)]
+    estimator, textbook = GraphEstimator(0.0), TextbookEstimator()
+    for operation in program:
+        operation.run(textbook)
+        operation.run(estimator)
+    assert estimator.smoother.graph().elimination == "cholesky"
+    P = textbook.joint_covariance(ids)
+    assert np.abs((estimator.joint_mean(ids) - textbook.joint_mean(ids)) / np.sqrt(np.diag(P))).max() < 1e-7
+    assert np.linalg.norm(estimator.joint_covariance(ids) - P) < 1e-7 * np.linalg.norm(P)
+    assert np.linalg.norm(estimator.covariance(7) - textbook.covariance([7])[0]) < 1e-6

@@ -1,0 +1,234 @@
+"""The running graph as a value: keys that can be read back, names, snapshots, exchange and marginalisation."""
+
+import pickle
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import SolverSettings, gaussian_factor, marginal_moments, pose_prior_factor, prior_factor
+from pipelines.bench.drawn_traffic import draw_traffic, providers
+from saga_fg.estimators import BatchSmoother, IncrementalSmoother, RelinearisationSettings
+from saga_fg.graph import (
+    EGO_POSE,
+    LANDMARK,
+    MAP_NODE,
+    OBJECT,
+    Additions,
+    GraphError,
+    KeyId,
+    Kind,
+    NewVariable,
+    SceneFactorGraph,
+    key_id,
+    key_of,
+)
+from saga_fg.graph.keys import LARGEST, described
+
+
+class Once:
+    """Adds something in the first frame, and nothing later."""
+
+    def __init__(self, additions, name="once"):
+        self.additions, self.name, self.asked = additions, name, []
+
+    def factors(self, view):
+        self.asked.append(view)
+        return self.additions if len(self.asked) == 1 else Additions()
+
+
+@pytest.mark.parametrize("epoch", [0, 1, 34, LARGEST, None])
+@pytest.mark.parametrize("number", [0, 12, LARGEST])
+def test_keys_can_be_read_back(number, epoch):
+    kinds = (OBJECT, EGO_POSE, LANDMARK, MAP_NODE, Kind("beacon", "B"))
+    for kind in kinds:
+        assert key_id(key_of(kind, number, epoch)) == KeyId(kind.letter, number, epoch)
+    assert len({key_of(kind, number, epoch) for kind in kinds}) == len(kinds)
+
+
+def test_keys_in_words_and_those_that_are_none():
+    assert described(key_of(OBJECT, 12, 34)) == "object 12 of epoch 34"
+    assert described(key_of(LANDMARK, 3, None)) == "landmark 3"
+    assert described(17) == "variable 17"
+    for number in (-1, LARGEST + 1, 1.5, True):
+        with pytest.raises(GraphError, match="object: expected id to be a whole number"):
+            key_of(OBJECT, number, 0)
+    with pytest.raises(GraphError, match="expected a key made by key_of"):
+        key_id(17)
+    with pytest.raises(GraphError, match="expected one letter"):
+        Kind("wall", "wa")
+
+
+def driven(lag=None, frames=6, seed=2):
+    scene = draw_traffic(np.random.default_rng(seed), frames=frames, cars=3, pedestrians=2)
+    smoother = IncrementalSmoother(providers(scene), lag=lag)
+    for moment in scene.moments[:-1]:
+        smoother.step(moment.time)
+    return scene, smoother
+
+
+@pytest.mark.parametrize("lag", [None, 0.3])
+def test_a_pickled_graph_goes_on_as_the_smoother_itself(lag):
+    scene, smoother = driven(lag)
+    again = IncrementalSmoother(providers(scene), lag=lag)
+    again.restore(pickle.loads(pickle.dumps(smoother.snapshot())))
+    for one in (smoother, again):
+        one.step(scene.moments[-1].time)
+    assert again.graph().variables.keys() == smoother.graph().variables.keys()
+    for key, variable in smoother.graph().variables.items():
+        P = smoother.covariance(key)
+        way = variable.type.local(smoother.state(key), again.state(key))
+        assert np.abs(way / np.sqrt(np.diag(P))).max() < 2e-3
+        np.testing.assert_allclose(again.covariance(key), P, rtol=0.02, atol=1e-3 * np.abs(P).max())
+
+
+def test_a_snapshot_does_not_change_when_the_smoother_goes_on():
+    scene, smoother = driven(0.3)
+    snapshot, solution = smoother.snapshot(), smoother.solution()
+    key = next(key for key, one in snapshot.variables.items() if one.kind == EGO_POSE)
+    names, pose = [str(factor) for factor in snapshot.factors()], snapshot.state(key)
+    P = solution.covariance([key])
+    smoother.step(scene.moments[-1].time)
+    assert [str(factor) for factor in snapshot.factors()] == names
+    assert snapshot.state(key).equals(pose, 0.0)
+    np.testing.assert_array_equal(solution.covariance([key]), P)
+    np.testing.assert_allclose(solution.marginal(key), P, rtol=1e-6)
+
+
+def test_the_graph_is_the_one_that_runs():
+    """Factor for factor what iSAM2 holds, by name; and its minimum is the estimate."""
+    _, smoother = driven()
+    graph = smoother.graph()
+    assert sum(1 for _ in graph.factors()) == sum((slots >= 0).sum() for slots in smoother._engine.slots.values())
+    said = [str(factor) for factor in graph.factors()]
+    assert "PriorFactorPose2 on vehicle 0 at 0.00 s (provider odometry)" in said
+    assert any(text.startswith("SmoothDriver interactions on car 1 at ") for text in said)
+    before = graph.values
+    solution = graph.copy().solve(SolverSettings(tolerance=1e-8))
+    for key, variable in graph.variables.items():
+        sigma = np.sqrt(np.diag(smoother.covariance(key)))
+        way = variable.type.local(variable.type.read(before, key), variable.type.read(solution.values, key))
+        assert np.abs(way / sigma).max() < 1e-3
+
+
+def test_covariances_are_those_of_levenberg_marquardt_in_gtsams_coordinates():
+    """Poses among them, which have moved away from their base."""
+    _, smoother = driven()
+    solution = smoother.graph().copy().solve(SolverSettings(tolerance=1e-8))
+    keys = list(smoother.graph().variables)[-6:]
+    expected = marginal_moments(solution.linear, keys, "qr")[1]
+    np.testing.assert_allclose(smoother.joint_covariance(keys), expected, rtol=1e-2, atol=1e-4 * np.abs(expected).max())
+    for key in keys:
+        (start,) = (sum(smoother.graph().variable(k).dim for k in keys[: keys.index(key)]),)
+        own = expected[start : start + smoother.graph().variable(key).dim][
+            :, start : start + smoother.graph().variable(key).dim
+        ]
+        np.testing.assert_allclose(smoother.covariance(key), own, rtol=1e-2, atol=1e-4 * np.abs(own).max())
+        np.testing.assert_allclose(solution.marginal(key), own, rtol=1e-6, atol=1e-9)
+
+
+def test_a_pose_far_from_its_base_is_where_its_factors_say():
+    """Half a turn and metres off its first value: the increments' coordinates are bent there."""
+    far = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.3, 2.0), np.array([3.0, -2.0, 1.0]))
+    P = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]) ** 2
+    key = key_of(EGO_POSE, 0, 0)
+    new = NewVariable(EGO_POSE, 0, gtsam.Pose3())
+    smoother = IncrementalSmoother([Once(Additions([new], [pose_prior_factor(key, far.matrix(), P)]))])
+    smoother.step(0.0)
+    assert smoother.state(key).equals(far, 1e-9)
+    np.testing.assert_allclose(smoother.covariance(key), P, atol=1e-8)
+
+
+def test_a_filter_knows_its_interval_when_it_is_extended():
+    """The epoch before has left by then."""
+    smoother, later = IncrementalSmoother(lag=0.0), Once(Additions())
+    for time in (1.0, 1.5):
+        smoother.step(time)
+    smoother.extend([later])
+    assert later.asked[0].dt == 0.5
+
+
+def test_factors_under_a_name_take_each_others_place():
+    key = key_of(OBJECT, 1, 0)
+    near, far = (prior_factor(key, [x], [[1.0]]) for x in (1.0, 5.0))
+    smoother = IncrementalSmoother(lag=None)
+    smoother.step(0.0, [Once(Additions([NewVariable(OBJECT, 1, np.zeros(1))], [near], {"more": [near]}), "a")])
+    assert smoother.state(key) == pytest.approx([1.0])
+    smoother.extend([Once(Additions(named={"more": [far]}), "b")])  # another provider's name is another name
+    assert smoother.state(key) == pytest.approx([7 / 3])
+    smoother.extend([Once(Additions(named={"more": [far]}), "a")])
+    assert smoother.state(key) == pytest.approx([11 / 3])
+    smoother.extend([Once(Additions(named={"more": []}), "a"), Once(Additions(named={"more": []}), "b")])
+    assert smoother.state(key) == pytest.approx([1.0])
+    assert sum(1 for _ in smoother.graph().factors()) == 1
+
+
+def test_what_leaves_stays_in_what_it_told_of_others():
+    graph = SceneFactorGraph()
+    graph.advance(0.0)
+    a, b = graph.add_variables("test", [NewVariable(OBJECT, n, np.zeros(2)) for n in (1, 2)])
+    factors = [prior_factor(a, [1.0, 2.0], np.eye(2)), gaussian_factor([a, b], [np.eye(2), -np.eye(2)], [3.0, 0.0])]
+    graph.add_factors("test", [*factors, prior_factor(b, np.zeros(2), np.eye(2))])
+    expected = graph.copy().solve()
+    graph.marginalise([a])
+    assert list(graph.variables) == [b]
+    found = graph.solve()
+    np.testing.assert_allclose(found.values.atVector(b), expected.values.atVector(b), atol=1e-9)
+    np.testing.assert_allclose(found.covariance([b]), expected.covariance([b]), atol=1e-9)
+    assert [factor.kind for factor in graph.factors()] == ["linear factor", "marginal"]
+    with pytest.raises(GraphError, match="object 1 of epoch 0 is not in the graph"):
+        graph.marginalise([a])
+
+
+def test_providers_see_what_is_there():
+    new = NewVariable(OBJECT, 1, np.ones(2), label="car")
+    static = NewVariable(LANDMARK, 4, np.zeros(2), static=True)
+    keys = key_of(OBJECT, 1, 0), key_of(LANDMARK, 4, None)
+    first = Once(Additions([new, static], [prior_factor(key, np.ones(2), 4 * np.eye(2)) for key in keys]))
+    smoother, later = IncrementalSmoother([first], lag=None), Once(Additions())
+    smoother.step(1.0)
+    smoother.step(1.5)
+    smoother.extend([later])
+    (view,) = later.asked
+    assert (view.epoch, view.time, view.dt) == (1, 1.5, 0.5)
+    assert view.now(OBJECT) == {}
+    assert [str(one) for one in (*view.before(OBJECT).values(), *view.static(LANDMARK).values())] == [
+        "car 1 at 1.00 s",
+        "landmark 4",
+    ]
+    assert set(view.variables) == set(keys)
+    assert view.state(keys[0]).tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(view.covariance(keys[0]), 4 * np.eye(2))
+
+
+def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
+    """So that relinearisation is what the equality with Levenberg-Marquardt rests on."""
+    scene = draw_traffic(np.random.default_rng(2), frames=6, cars=3, pedestrians=2)
+    once = IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e9))
+    _, smoother = driven()
+    for moment in scene.moments[:-1]:
+        once.step(moment.time)
+    off = [
+        np.abs(one.type.local(smoother.state(key), once.state(key)) / np.sqrt(np.diag(smoother.covariance(key)))).max()
+        for key, one in smoother.graph().variables.items()
+    ]
+    assert max(off) > 0.01
+
+
+def test_noise_of_a_millisecond_is_noise(one_bus_for_a_millisecond):
+    """That of constant acceleration falls with the fifth power of the interval, but no direction is without."""
+    kinds = [factor.provider for factor in one_bus_for_a_millisecond.graph().factors()]
+    assert sorted(kinds) == ["births", "interactions"]
+
+
+@pytest.fixture
+def one_bus_for_a_millisecond():
+    from random_graphs import BUS
+
+    from saga_fg import SceneGraph
+    from saga_fg.model.discretisation import discretise
+
+    smoother = BatchSmoother()
+    smoother.add([1], np.zeros((1, 6)), np.eye(6)[None])
+    smoother.predict(discretise(SceneGraph([1], (BUS,)), 1e-3))
+    return smoother

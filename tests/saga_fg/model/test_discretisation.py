@@ -1,0 +1,384 @@
+"""Discretisation: the classical one without edges, second order against the joint exponential, stable for any dt."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
+from random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, interaction_edges, node_table, random_graph, random_types
+
+from saga_fg import Edges, InputError, SceneGraph
+from saga_fg.model.discretisation import discretise, joint_generator
+from saga_fg.model.edge_rules import NodeTable
+from saga_fg.model.interactions import CarFollowing, SharedVelocity
+
+seeds = st.integers(0, 2**32 - 1)
+intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))
+
+
+def van_loan(G, Qc, dt):
+    """exp(G dt) and int_0^dt exp(G s) Qc exp(G^T s) ds (Van Loan 1978), over steps short enough for exp(-G s)."""
+    D = len(G)
+    doublings = max(0, int(np.ceil(np.log2(max(1e-300, np.linalg.norm(G) * dt)))))
+    h = dt / 2**doublings
+    block = scipy.linalg.expm(np.block([[-G, Qc], [np.zeros((D, D)), G.T]]) * h)
+    F, Q = block[D:, D:].T, block[D:, D:].T @ block[:D, D:]
+    for k in range(doublings):
+        F = scipy.linalg.expm(G * h * 2**k)
+        Q = Q + F @ Q @ F.T
+    return scipy.linalg.expm(G * dt), Q
+
+
+def exact(graph, dt):
+    """F, b, Q of the joint system, its neighbours' neighbours and all."""
+    G, c, Qc = joint_generator(graph)
+    D = len(G)
+    affine = scipy.linalg.expm(np.block([[G, c[:, None]], [np.zeros((1, D + 1))]]) * dt)
+    return affine[:D, :D], affine[:D, D], van_loan(G, Qc, dt)[1]
+
+
+def dense(transition):
+    return transition.F_matrix.toarray(), transition.b, transition.Q_matrix.toarray()
+
+
+def in_order_of_components(graph, names, matrix):
+    """The sub-matrix of the named components of all nodes that have them."""
+    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
+    places = [offsets[k] + t.index((name,))[0] for name in names for k, t in enumerate(graph.types) if t.has((name,))]
+    return matrix[np.ix_(places, places)]
+
+
+# without edges
+
+
+@given(intervals)
+def test_constant_velocity_in_closed_form(dt):
+    F, b, Q = dense(discretise(SceneGraph.of([4], CAR), dt))
+    eye, q = np.eye(2), 1.5
+    assert np.allclose(F, np.block([[eye, dt * eye], [0 * eye, eye]]), rtol=1e-13, atol=0)
+    assert np.allclose(Q, q * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], eye), rtol=1e-12, atol=1e-300)
+    assert not b.any()
+
+
+@given(intervals)
+def test_constant_acceleration_in_closed_form(dt):
+    F, _, Q = dense(discretise(SceneGraph.of([4], BUS), dt))
+    eye, q = np.eye(2), 0.4
+    one_axis = [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
+    assert np.allclose(F, np.kron([[1, dt, dt**2 / 2], [0, 1, dt], [0, 0, 1]], eye), rtol=1e-12, atol=1e-300)
+    assert np.allclose(Q, q * np.kron(one_axis, eye), rtol=1e-11, atol=1e-300)
+
+
+@pytest.mark.parametrize("dt", [1e-6, 0.05, 0.7, 5.0, 40.0])
+@pytest.mark.parametrize("node_type", [CAR, BUS, TRAM, CONE, POLE], ids=lambda t: t.name)
+def test_every_type_without_edges_is_the_matrix_exponential(node_type, dt):
+    F, _, Q = dense(discretise(SceneGraph.of([0, 1], node_type), dt))
+    F_one, Q_one = van_loan(node_type.generator, node_type.diffusion, dt)
+    assert np.allclose(F, scipy.linalg.block_diag(F_one, F_one), rtol=1e-11, atol=1e-14)
+    assert np.allclose(Q, scipy.linalg.block_diag(Q_one, Q_one), rtol=1e-9, atol=1e-12 * Q_one.max(initial=0))
+
+
+@given(seeds, intervals)
+def test_rate_zero_is_exactly_no_edges(seed, dt):
+    rng = np.random.default_rng(seed)
+    types = random_types(rng, 5)
+    graph = random_graph(rng, types, max_rate=0.0)
+    with_edges, without = dense(discretise(graph, dt)), dense(discretise(graph.without_edges(), dt))
+    for a, b in zip(with_edges, without, strict=True):
+        assert np.array_equal(a, b)
+
+
+def test_no_nodes():
+    transition = discretise(SceneGraph([], ()), 0.5)
+    F, b, Q = dense(transition)
+    assert F.shape == Q.shape == (0, 0)
+    assert b.shape == (0,)
+    assert joint_generator(SceneGraph([], ()))[0].shape == (0, 0)
+
+
+@pytest.mark.parametrize("dt", [-0.1, np.nan, np.inf, -np.inf, 1e13, 1e300])
+def test_an_interval_that_is_none_is_refused(dt):
+    with pytest.raises(InputError, match="dt: expected a finite number of seconds from 0"):
+        discretise(SceneGraph.of([0], CAR), dt)
+
+
+# with edges, against the exponential of the joint generator
+
+
+@given(seeds)
+def test_dt_zero_is_standing_still(seed):
+    rng = np.random.default_rng(seed)
+    F, b, Q = dense(discretise(random_graph(rng, random_types(rng, 6)), 0.0))
+    assert np.array_equal(F, np.eye(len(F)))
+    assert not b.any()
+    assert not Q.any()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_half_the_interval_is_a_quarter_of_the_error(seed):
+    """The mean map F x + b against exp(G dt): first order in the coupling, so that the error is O(dt^2)."""
+    rng = np.random.default_rng(seed)
+    graph = random_graph(rng, random_types(rng, 6))
+    error_F, error_b, error_Q = [], [], []
+    for dt in (0.02, 0.01, 0.005):
+        for errors, ours, reference in zip(
+            (error_F, error_b, error_Q), dense(discretise(graph, dt)), exact(graph, dt), strict=True
+        ):
+            errors.append(np.linalg.norm(ours - reference))
+    for errors in (error_F, error_b):
+        assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
+        assert errors[1] / errors[2] == pytest.approx(4, rel=0.05)
+    assert error_Q[0] / error_Q[1] > 3.8
+    assert error_Q[1] / error_Q[2] > 3.8
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_two_half_steps_with_frozen_edges_agree_with_one_to_second_order(seed):
+    rng = np.random.default_rng(seed)
+    graph = random_graph(rng, random_types(rng, 6))
+    differences = []
+    for dt in (0.02, 0.01, 0.005):
+        F, b, Q = dense(discretise(graph, dt))
+        F_half, b_half, Q_half = dense(discretise(graph, dt / 2))
+        differences.append(
+            [
+                np.linalg.norm(F_half @ F_half - F),
+                np.linalg.norm(F_half @ b_half + b_half - b),
+                np.linalg.norm(F_half @ Q_half @ F_half.T + Q_half - Q),
+            ]
+        )
+    for mean_map, affine, _ in (np.divide(differences[k], differences[k + 1]) for k in (0, 1)):
+        assert mean_map == pytest.approx(4, rel=0.1)
+        assert affine == pytest.approx(4, rel=0.1)
+    assert all(np.divide(differences[0], differences[1]) > 3.8)
+
+
+@given(seeds, st.floats(0.01, 20))
+def test_leaders_that_nothing_acts_on_make_the_step_exact(seed, dt):
+    """What is left out is how the neighbours are acted on; where nothing acts on them, nothing is left out."""
+    rng = np.random.default_rng(seed)
+    types = random_types(rng, 6)
+    full = random_graph(rng, types)
+    groups = []
+    for g in full.edges:
+        keep = (g.target < 3) & (g.source >= 3)
+        groups.append(
+            Edges(
+                g.interaction, g.target[keep], g.source[keep], g.rate[keep], g.A_self[keep], g.A_other[keep], g.b[keep]
+            )
+        )
+    graph = SceneGraph(full.nodes, types, tuple(groups))
+    F, b, _ = dense(discretise(graph, dt))
+    F_exact, b_exact, _ = exact(graph, dt)
+    assert np.allclose(F, F_exact, rtol=1e-9, atol=1e-9 * max(1, np.abs(F_exact).max()))
+    assert np.allclose(b, b_exact, rtol=1e-9, atol=1e-9 * max(1, np.abs(b_exact).max()))
+
+
+@pytest.mark.parametrize("dt", [0.1, 3.0, 60.0])
+@pytest.mark.parametrize("target", MOVING, ids=lambda t: t.name)
+def test_a_leader_with_fading_acceleration(target, dt):
+    """exp(A_j s) is no polynomial here: the coupling is read off the exponential of a block matrix."""
+    rng = np.random.default_rng(5)
+    nodes = node_table(rng, (target, TRAM))
+    rows = np.array([0]), np.array([1])
+    edges = Edges("shared velocity", *rows, [0.8], *SharedVelocity().triples(nodes, *rows))
+    graph = SceneGraph(nodes.id, nodes.types, (edges,))
+    F, b, _ = dense(discretise(graph, dt))
+    F_exact, b_exact, _ = exact(graph, dt)
+    assert np.allclose(F, F_exact, rtol=1e-10, atol=1e-10)
+    assert np.allclose(b, b_exact, rtol=1e-10, atol=1e-10)
+
+
+@given(seeds, st.floats(0.01, 3))
+def test_the_diagonal_is_exact_along_a_nodes_own_share(seed, dt):
+    rng = np.random.default_rng(seed)
+    graph = random_graph(rng, random_types(rng, 5))
+    F, _, Q = dense(discretise(graph, dt))
+    G, _, _ = joint_generator(graph)
+    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
+    for k, node_type in enumerate(graph.types):
+        own = slice(offsets[k], offsets[k + 1])
+        F_own, Q_own = van_loan(G[own, own], node_type.diffusion, dt)
+        assert np.allclose(F[own, own], F_own, rtol=1e-9, atol=1e-11)
+        assert np.allclose(Q[own, own], Q_own, rtol=1e-8, atol=1e-10 * max(1e-9, np.abs(Q_own).max()))
+
+
+# structure
+
+
+@given(seeds, st.floats(1e-3, 10))
+def test_the_step_is_as_sparse_as_the_graph(seed, dt):
+    rng = np.random.default_rng(seed)
+    types = random_types(rng, 7)
+    graph = random_graph(rng, types, density=0.2)
+    transition = discretise(graph, dt)
+    pairs = [(int(i), int(j)) for blocks in transition.F for i, j in zip(blocks.target, blocks.source, strict=True)]
+    edges = {(int(i), int(j)) for group in graph.edges for i, j in zip(group.target, group.source, strict=True)}
+    assert len(pairs) == len(set(pairs)), "a pair occurs twice"
+    assert set(pairs) == edges | {(k, k) for k in range(len(types))}
+    noisy = [(int(i), int(j)) for blocks in transition.Q for i, j in zip(blocks.target, blocks.source, strict=True)]
+    assert sorted(noisy) == [(k, k) for k in range(len(types))]
+
+
+@given(seeds, intervals)
+def test_the_process_noise_is_symmetric_and_positive_semidefinite(seed, dt):
+    rng = np.random.default_rng(seed)
+    for blocks in discretise(random_graph(rng, random_types(rng, 5), arbitrary=False), dt).Q:
+        for Q in blocks.values:
+            assert np.array_equal(Q, Q.T)
+            scale = np.sqrt(np.diag(Q))
+            correlation = Q / np.where(scale > 0, scale, 1)[:, None] / np.where(scale > 0, scale, 1)
+            assert np.linalg.eigvalsh(correlation)[0] > -1e-10
+
+
+@given(seeds, st.floats(0.01, 5))
+def test_rules_that_choose_the_same_pair_are_added_up(seed, dt):
+    rng = np.random.default_rng(seed)
+    nodes = node_table(rng, (CAR, BUS, CAR))
+    target, source = np.array([0, 2]), np.array([1, 1])
+    first = SharedVelocity().triples(nodes, target, source)
+    second = CarFollowing().triples(nodes, target, source)
+    two = (
+        Edges("shared velocity", target, source, [0.3, 0.7], *first),
+        Edges("car-following", target[::-1], source[::-1], [0.5, 0.2], *(part[::-1] for part in second)),
+    )
+    one = Edges(
+        "both",
+        target,
+        source,
+        [1.0, 1.0],
+        *(np.multiply([0.3, 0.7], a.T).T + np.multiply([0.2, 0.5], b.T).T for a, b in zip(first, second, strict=True)),
+    )
+    for a, b in zip(
+        dense(discretise(SceneGraph(nodes.id, nodes.types, two), dt)),
+        dense(discretise(SceneGraph(nodes.id, nodes.types, (one,)), dt)),
+        strict=True,
+    ):
+        assert np.allclose(a, b, rtol=1e-11, atol=1e-11)
+
+
+@given(seeds, st.floats(0.01, 5))
+def test_the_order_of_the_nodes_does_not_matter(seed, dt):
+    rng = np.random.default_rng(seed)
+    graph = random_graph(rng, random_types(rng, 6))
+    order = rng.permutation(6)
+    place = np.argsort(order)
+    groups = tuple(
+        Edges(g.interaction, place[g.target], place[g.source], g.rate, g.A_self, g.A_other, g.b) for g in graph.edges
+    )
+    permuted = SceneGraph(graph.nodes[order], tuple(graph.types[k] for k in order), groups)
+    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
+    places = np.concatenate([np.arange(offsets[k], offsets[k + 1]) for k in order])
+    F, b, Q = dense(discretise(graph, dt))
+    F_permuted, b_permuted, Q_permuted = dense(discretise(permuted, dt))
+    assert np.allclose(F[np.ix_(places, places)], F_permuted, rtol=1e-12, atol=1e-12)
+    assert np.allclose(b[places], b_permuted, rtol=1e-12, atol=1e-12)
+    assert np.allclose(Q[np.ix_(places, places)], Q_permuted, rtol=1e-12, atol=1e-12)
+
+
+@given(seeds, st.floats(0.01, 5))
+def test_scaled_diffusion_is_scaled_noise(seed, dt):
+    rng = np.random.default_rng(seed)
+    graph = random_graph(rng, random_types(rng, 5))
+    scale = rng.uniform(0.1, 3, 5)
+    scaled = SceneGraph(graph.nodes, graph.types, graph.edges, scale)
+    F, b, Q = dense(discretise(graph, dt))
+    F_scaled, b_scaled, Q_scaled = dense(discretise(scaled, dt))
+    by_component = np.repeat(scale, graph.dims)
+    assert np.allclose(F_scaled, F, rtol=1e-12, atol=1e-13)
+    assert np.allclose(b_scaled, b, rtol=1e-12, atol=1e-13)
+    assert np.allclose(Q_scaled, by_component[:, None] * Q, rtol=1e-10, atol=1e-14)
+    assert np.allclose(
+        joint_generator(scaled)[2], by_component[:, None] * joint_generator(graph)[2], rtol=1e-12, atol=0
+    )
+
+
+# laws of the shipped interactions
+
+
+def consensus_graph(rng, types, max_rate, heading=None):
+    nodes = node_table(rng, types)
+    return SceneGraph(nodes.id, nodes.types, tuple(interaction_edges(rng, nodes, SharedVelocity(), 0.5, max_rate)))
+
+
+@given(seeds, intervals, st.floats(0, 100))
+def test_a_consensus_stays_a_consensus(seed, dt, max_rate):
+    rng = np.random.default_rng(seed)
+    types = random_types(rng, 6, (CAR, BUS, TRAM))
+    graph = consensus_graph(rng, types, max_rate)
+    x, moved = [], []
+    for node_type in types:
+        position = rng.normal(size=2)
+        rest = np.zeros(node_type.dim - 4)
+        x.append(np.concatenate([position, [3.0, -2.0], rest]))
+        moved.append(np.concatenate([position + dt * np.array([3.0, -2.0]), [3.0, -2.0], rest]))
+    transition = discretise(graph, dt)
+    assert np.allclose(transition.F_matrix @ np.concatenate(x), np.concatenate(moved), rtol=1e-9, atol=1e-9)
+    assert not transition.b.any()
+
+
+@given(seeds, intervals, st.floats(0, 1e3))
+def test_no_interval_makes_shared_velocity_unstable(seed, dt, max_rate):
+    """Velocities are averaged with weights that are not negative and sum to one."""
+    rng = np.random.default_rng(seed)
+    graph = consensus_graph(rng, random_types(rng, 7, (CAR,)), max_rate)
+    F = discretise(graph, dt).F_matrix.toarray()
+    everything = in_order_of_components(graph, ("x", "y", "vx", "vy"), F)
+    n = 14
+    assert np.array_equal(everything[:n, :n], np.eye(n))
+    assert not everything[n:, :n].any()
+    velocities = everything[n:, n:]
+    assert velocities.min() > -1e-12
+    assert np.allclose(velocities.sum(axis=1), 1, atol=1e-9)
+    assert np.abs(np.linalg.eigvals(velocities)).max() <= 1 + 1e-9
+
+
+@given(seeds, intervals, st.floats(0, 1e3))
+def test_no_interval_makes_shared_velocity_unstable_among_mixed_types(seed, dt, max_rate):
+    rng = np.random.default_rng(seed)
+    graph = consensus_graph(rng, random_types(rng, 7, MOVING), max_rate)
+    F = discretise(graph, dt).F_matrix.toarray()
+    velocities = in_order_of_components(graph, ("vx", "vy"), F)
+    assert np.abs(velocities).sum(axis=1).max() <= 1 + 1e-9
+    accelerations = in_order_of_components(graph, ("ax", "ay"), F)
+    assert np.abs(np.linalg.eigvals(accelerations)).max(initial=0) <= 1 + 1e-9
+
+
+def queue(n, heading, rate, gap=15.0, **law):
+    """n cars in a line, each following the one ahead, in formation; and their joint state."""
+    u = np.array([np.cos(heading), np.sin(heading)])
+    position = -gap * np.arange(n)[:, None] * u
+    velocity = np.tile(10.0 * u, (n, 1))
+    label = np.array(["car"] * n)
+    nodes = NodeTable(
+        np.arange(n), label, (CAR,) * n, position, velocity, np.full(n, heading), np.full(n, 4.0), np.ones(n)
+    )
+    target = np.arange(1, n)
+    interaction = CarFollowing(**law)
+    edges = Edges("car-following", target, target - 1, rate, *interaction.triples(nodes, target, target - 1))
+    return SceneGraph(nodes.id, nodes.types, (edges,)), np.concatenate([position, velocity], axis=1).ravel(), u
+
+
+@pytest.mark.parametrize("dt", [0.1, 1.0, 7.0, 100.0, 1000.0])
+@pytest.mark.parametrize("headway", [0.0, 1.0])
+def test_a_queue_in_formation_stays_in_formation(dt, headway):
+    graph, x, u = queue(6, 0.7, [0.1, 0.5, 1.0, 3.0, 20.0], headway=headway)
+    transition = discretise(graph, dt)
+    moved = (transition.F_matrix @ x + transition.b).reshape(6, 4)
+    expected = x.reshape(6, 4) + np.concatenate([np.tile(10.0 * dt * u, (6, 1)), np.zeros((6, 2))], axis=1)
+    assert np.allclose(moved, expected, rtol=1e-9, atol=1e-9 * max(1, dt))
+
+
+@pytest.mark.parametrize("dt", [0.1, 1.0, 7.0, 100.0, 1000.0])
+@pytest.mark.parametrize("rate", [0.2, 1.0, 20.0])
+def test_a_disturbed_queue_finds_its_formation_again(dt, rate):
+    """Whatever the interval, followers settle behind a steady leader: deviations from the formation die out."""
+    graph, _, u = queue(5, -0.4, np.full(4, rate))
+    F = discretise(graph, dt).F_matrix.toarray()
+    rng = np.random.default_rng(0)
+    deviation = np.zeros((5, 4))
+    deviation[1:, :2], deviation[1:, 2:] = rng.normal(size=(4, 1)) * u, rng.normal(size=(4, 1)) * u
+    later = np.linalg.matrix_power(F, max(20, int(1000 / dt))) @ deviation.ravel()
+    assert np.abs(later).max() < 1e-6 + 1e-8 * dt
+    along = in_order_of_components(graph, ("x", "y", "vx", "vy"), F)
+    assert np.isfinite(along).all()

@@ -1,0 +1,348 @@
+"""Edge rules: who is coupled with whom, and how strongly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from random_graphs import BUS, CAR, CONE
+
+from saga_fg import ConstantVelocity, InputError, NodeType
+from saga_fg.model.edge_information import News
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.numerics.geometry import yaw_transform
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def table(position, heading, speed=10.0, label="car", types=None):
+    """Nodes that move along their headings."""
+    position = np.asarray(position, dtype=float).reshape(-1, 2)
+    n = len(position)
+    heading, speed = np.broadcast_to(heading, n).astype(float), np.broadcast_to(speed, n)
+    return NodeTable(
+        id=np.arange(n) + 100,
+        label=np.broadcast_to(np.asarray(label, dtype=np.str_), n),
+        types=(CAR,) * n if types is None else tuple(types),
+        position=position,
+        velocity=np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=-1),
+        heading=heading,
+        length=np.full(n, 4.0),
+        velocity_variance=np.ones(n),
+    )
+
+
+def straight(n, gap=12.0, lateral=0.0, start=0.0, heading=0.0):
+    """n cars in a row, the first in front."""
+    along = start - gap * np.arange(n)
+    R = yaw_transform(yaw=heading)[:2, :2]
+    return np.stack([along, np.full(n, lateral)], axis=-1) @ R.T, np.full(n, heading)
+
+
+def bend(n, radius, gap=12.0, lateral=0.0, start=0.0):
+    """n cars on a left-hand bend (negative radius: right-hand), the first in front; lateral is to the left."""
+    angle = (start - gap * np.arange(n)) / radius
+    inner = radius - lateral
+    return np.stack([inner * np.sin(angle), radius - inner * np.cos(angle)], axis=-1), angle
+
+
+def joined(*roads):
+    return np.concatenate([p for p, _ in roads]), np.concatenate([h for _, h in roads])
+
+
+def edges(pairs):
+    """{target: {source: rate}}"""
+    result = {}
+    for i, j, rate in zip(pairs.target.tolist(), pairs.source.tolist(), pairs.rate.tolist(), strict=True):
+        result.setdefault(i, {})[j] = rate
+    return result
+
+
+def leaders(pairs):
+    assert len(set(pairs.target.tolist())) == len(pairs.target)
+    return dict(zip(pairs.target.tolist(), pairs.source.tolist(), strict=True))
+
+
+def random_traffic(rng, n=15):
+    return table(rng.uniform(-25, 25, (n, 2)), rng.normal(0, 0.5, n), rng.uniform(0, 15, n))
+
+
+# what neighbours have to tell
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0, 3.0])
+def test_an_edge_counts_as_its_source_would_as_a_measurement_of_the_target(spread):
+    nodes = table([[0.0, 0.0], [3.0, 0.0]], 0.0)
+    plain = Neighbours()
+    for s_i, s_j in ((0.1, 0.1), (9.0, 0.1), (0.1, 9.0)):
+        known = replace(nodes, velocity_variance=np.array([s_i, s_j]))
+        rate, full = edges(replace(plain, news=News(spread)).pairs(known)), edges(plain.pairs(known))
+        assert rate[0][1] == pytest.approx(full[0][1] * s_i / (s_i + s_j + spread**2))
+        assert rate[1][0] == pytest.approx(full[1][0] * s_j / (s_i + s_j + spread**2))
+
+
+def test_a_follower_listens_to_its_leader_once_nobody_sees_it():
+    rule, nodes = Following(news=News(1.0, unseen_acceleration=2.0)), table(*straight(2))
+    known = replace(nodes, velocity_variance=np.full(2, 0.1))
+    seen, hidden = (rule.pairs(replace(known, unseen=np.array([0.0, t]))).rate[0] for t in (0.0, 3.0))
+    full = Following().pairs(known).rate[0]
+    assert seen == pytest.approx(full * 0.1 / 1.2)
+    assert hidden == pytest.approx(full * 36.1 / 37.2)
+    both = rule.pairs(replace(known, unseen=np.array([3.0, 3.0]))).rate[0]  # what leads unseen is no surer
+    assert both == pytest.approx(full * 36.1 / 73.2)
+
+
+def test_of_two_certain_nodes_neither_learns():
+    nodes = replace(table([[0.0, 0.0], [3.0, 0.0]], 0.0), velocity_variance=np.zeros(2))
+    assert Neighbours(news=News(0.0)).pairs(nodes).rate.tolist() == [0.0, 0.0]
+
+
+# following
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.8, -2.5, np.pi])
+def test_in_a_straight_queue_each_follows_the_one_ahead(heading):
+    pairs = Following().pairs(table(*straight(6, heading=heading)))
+    assert leaders(pairs) == {k: k - 1 for k in range(1, 6)}
+    assert pairs.rate == pytest.approx(0.5 * np.exp(-((12.0 / 25.0) ** 2) / 2))
+
+
+@pytest.mark.parametrize("radius", [30.0, -30.0, 60.0, -200.0])
+def test_in_a_bend_too(radius):
+    nodes = table(*bend(6, radius, gap=10.0))
+    assert leaders(Following().pairs(nodes)) == {k: k - 1 for k in range(1, 6)}
+
+
+@pytest.mark.parametrize(
+    "road", [straight, lambda n, *where: bend(n, 80.0, *where), lambda n, *where: bend(n, -60.0, *where)]
+)
+def test_a_leader_is_taken_from_the_own_lane_though_another_car_is_nearer(road):
+    lane, gap = 3.5, 20.0
+    nodes = table(*joined(road(4, gap), road(4, gap, -lane, 8.0)))
+    found = leaders(Following().pairs(nodes))
+    assert {k: found[k] for k in (1, 2, 3)} == {1: 0, 2: 1, 3: 2}
+    assert {k: found[k] for k in (5, 6, 7)} == {5: 4, 6: 5, 7: 6}
+
+
+def test_a_car_in_the_next_lane_hardly_leads_and_one_two_lanes_away_never():
+    near = Following().pairs(table([(0, 0), (15, 3.5)], 0.0))
+    assert near.rate.max(initial=0) < 0.02 * Following().rate
+    assert len(Following().pairs(table([(0, 0), (15, 7.0)], 0.0)).target) == 0
+
+
+def test_nobody_follows_oncoming_crossing_or_distant_traffic():
+    oncoming = table([(0, 0), (15, 0)], [0.0, np.pi])
+    crossing = table([(0, 0), (15, 0)], [0.0, np.pi / 2])
+    distant = table([(0, 0), (41, 0)], 0.0)
+    for nodes in (oncoming, crossing, distant):
+        assert len(Following().pairs(nodes).target) == 0
+
+
+def test_only_the_named_classes_follow():
+    nodes = table(*straight(3), label=["car", "pedestrian", "truck"])
+    assert leaders(Following().pairs(nodes)) == {2: 0}
+    assert leaders(Following(classes=("pedestrian", "truck")).pairs(nodes)) == {2: 1}
+    assert len(Following(classes=()).pairs(nodes).target) == 0
+
+
+def test_the_rate_falls_with_distance_offset_and_turn():
+    def rate(x, y, heading):
+        return float(Following().pairs(table([(0, 0), (x, y)], [0.0, heading])).rate.max(initial=0))
+
+    rates = [rate(10, 0, 0), rate(20, 0, 0), rate(20, 1, 0), rate(20, 1, -0.3)]
+    assert rates == sorted(rates, reverse=True)
+    assert rate(20, 20 * np.tan(0.15), 0.3) == pytest.approx(0.5 * np.exp(-((20 / 25) ** 2 + (0.3 / 0.4) ** 2) / 2))
+
+
+# neighbours
+
+
+@given(seeds)
+def test_neighbours_are_pulled_at_the_rate_of_the_kernels(seed):
+    rule = Neighbours(max_degree=100)
+    nodes = random_traffic(np.random.default_rng(seed))
+    expected = {}
+    for i in range(len(nodes)):
+        for j in range(len(nodes)):
+            apart = np.linalg.norm(nodes.position[i] - nodes.position[j])
+            slow = min(np.linalg.norm(nodes.velocity[k]) for k in (i, j)) < 1.0
+            if i == j or apart > 20.0 or slow:
+                continue
+            turn = nodes.heading[i] - nodes.heading[j]
+            difference = np.linalg.norm(nodes.velocity[i] - nodes.velocity[j])
+            squares = (apart / 8.0) ** 2 + (turn / 0.4) ** 2 + (difference / 3.0) ** 2
+            expected.setdefault(i, {})[j] = pytest.approx(0.3 * np.exp(-squares / 2))
+    assert edges(rule.pairs(nodes)) == expected
+
+
+def test_headings_are_compared_across_the_seam():
+    nodes = table([(0, 0), (5, 0)], [np.pi - 0.05, -np.pi + 0.05])
+    assert Neighbours(speed_scale=np.inf).pairs(nodes).rate == pytest.approx(
+        0.3 * np.exp(-((5 / 8) ** 2 + (0.1 / 0.4) ** 2) / 2)
+    )
+
+
+@given(seeds, st.integers(0, 5))
+def test_at_most_the_strongest_edges_are_kept(seed, degree):
+    nodes = random_traffic(np.random.default_rng(seed))
+    every = edges(Neighbours(max_degree=100).pairs(nodes))
+    kept = edges(Neighbours(max_degree=degree).pairs(nodes))
+    for target, sources in every.items():
+        strongest = sorted(sources.values(), reverse=True)[:degree]
+        assert sorted(kept.get(target, {}).values(), reverse=True) == strongest
+        assert kept.get(target, {}).items() <= sources.items()
+
+
+@given(seeds, st.floats(-7, 7), st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)))
+def test_rules_know_no_place_and_no_direction(seed, turn, shift):
+    nodes = random_traffic(np.random.default_rng(seed), 12)
+    R = yaw_transform(yaw=turn)[:2, :2]
+    there = table(nodes.position @ R.T + np.array(shift), nodes.heading + turn, np.hypot(*nodes.velocity.T))
+    for rule in (Neighbours(), Following()):
+        here, moved = edges(rule.pairs(nodes)), edges(rule.pairs(there))
+        assert here.keys() == moved.keys()
+        for target, sources in here.items():
+            assert moved[target] == {j: pytest.approx(rate, rel=1e-6) for j, rate in sources.items()}
+
+
+@given(seeds)
+def test_the_order_of_the_nodes_does_not_matter_to_rules(seed):
+    rng = np.random.default_rng(seed)
+    nodes = random_traffic(rng, 12)
+    order = rng.permutation(12)
+    permuted = table(nodes.position[order], nodes.heading[order], np.hypot(*nodes.velocity[order].T))
+    for rule in (Neighbours(), Following()):
+        renamed = {
+            order[i]: {order[j]: pytest.approx(rate) for j, rate in sources.items()}
+            for i, sources in edges(rule.pairs(permuted)).items()
+        }
+        assert edges(rule.pairs(nodes)) == renamed
+
+
+# from rules to a graph
+
+
+class Ring:
+    """A user's rule: everybody is pulled by the next one, and the last by the first."""
+
+    interaction = SharedVelocity()
+
+    def __init__(self, rate=0.5):
+        self.rate = rate
+
+    def pairs(self, nodes):
+        n = len(nodes)
+        return Pairs(np.arange(n), (np.arange(n) + 1) % n, np.full(n, self.rate))
+
+
+class Fixed:
+    interaction = SharedVelocity()
+
+    def __init__(self, target, source, rate):
+        self.chosen = (target, source, rate)
+
+    def pairs(self, nodes):
+        return self.chosen
+
+
+def test_a_graph_of_several_rules_groups_edges_by_the_types_of_their_ends():
+    nodes = table(*straight(4), types=(CAR, BUS, BUS, CAR))
+    graph = build_graph(nodes, (Following(), Ring()))
+    assert graph.nodes.tolist() == [100, 101, 102, 103]
+    assert graph.edge_count == 3 + 4
+    for group in graph.edges:
+        assert len({(graph.types[i], graph.types[j]) for i, j in zip(group.target, group.source, strict=True)}) == 1
+        assert group.interaction in ("CarFollowing", "SharedVelocity")
+        following = group.interaction == "CarFollowing"
+        law = CarFollowing() if following else SharedVelocity()
+        assert np.array_equal(group.A_other, law.triples(nodes, group.target, group.source).A_other)
+
+
+def test_weak_edges_and_edges_between_types_that_do_not_fit_are_left_out():
+    nodes = table(*straight(3))
+    assert build_graph(nodes, (Ring(rate=1e-4),)).edge_count == 0
+    assert build_graph(nodes, (Ring(rate=1e-4),), min_rate=0).edge_count == 3
+    mixed = table(*straight(3), types=(CAR, CONE, CAR))
+    graph = build_graph(mixed, (Ring(),))
+    assert [(g.target.tolist(), g.source.tolist()) for g in graph.edges] == [([2], [0])]
+
+
+def test_what_interactions_explain_is_noise_no_more():
+    nodes = table(*straight(3))
+    plain = build_graph(nodes, (Following(), Ring(rate=0.5)))
+    assert plain.diffusion_scale.tolist() == [1.0, 1.0, 1.0]
+    explained = build_graph(nodes, (Following(), Ring(rate=0.5)), explained_noise=2.0)
+    total = np.zeros(3)
+    for group in plain.edges:
+        np.add.at(total, group.target, group.rate)
+    assert explained.diffusion_scale == pytest.approx(np.exp(-2.0 * total))
+    assert build_graph(nodes, (), explained_noise=2.0).diffusion_scale.tolist() == [1.0, 1.0, 1.0]
+    assert (build_graph(nodes, (Ring(rate=1e6),), explained_noise=1e6).diffusion_scale > 0).all()
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_too_few_nodes_for_an_edge(n):
+    nodes = table(*straight(n))
+    for rule in (Following(), Neighbours()):
+        assert len(rule.pairs(nodes).target) == 0
+    graph = build_graph(nodes, (Following(), Neighbours(), Ring()))
+    assert (len(graph), graph.edge_count) == (n, 0)
+
+
+def test_types_that_are_equal_but_not_the_same_object():
+    again = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
+    graph = build_graph(table(*straight(3), types=(CAR, again, CAR)), (Following(),))
+    assert graph.edge_count == 2
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        (([0, 3], [1, 1], [0.5, 0.5]), "edge rule Fixed: target: row 3 is outside 3 nodes"),
+        (([0], [-1], [0.5]), "edge rule Fixed: source: row -1 is outside 3 nodes"),
+        (([0], [1, 2], [0.5]), "edge rule Fixed: source: expected 1 entries, got 2"),
+        (([0.0], [1], [0.5]), "edge rule Fixed: target: expected a list of integers"),
+        (([0], [1], [np.nan]), r"edge rule Fixed: rate\[0\]: expected a finite number"),
+        (([0], [1], [0.5, 0.5]), r"edge rule Fixed: rate: expected shape \(1,\)"),
+        (([1], [1], [0.5]), "edges of SharedVelocity: node row 1 has an edge to itself"),
+    ],
+)
+def test_a_users_rule_that_makes_no_sense_is_named(chosen, message):
+    with pytest.raises(InputError, match=message):
+        build_graph(table(*straight(3)), (Fixed(*chosen),))
+
+
+def test_a_users_rule_may_return_plain_lists():
+    assert build_graph(table(*straight(3)), (Fixed([0], [1], [0.5]),)).edge_count == 1
+
+
+def test_parked_objects_are_coupled_once_it_is_known_that_they_stand():
+    nodes = replace(table(*straight(3, gap=8.0), speed=0.0), has_moved=np.array([False, False, True]))
+    rule = Neighbours(parked=True, speed_scale=0.5)
+    assert edges(rule.pairs(replace(nodes, velocity_variance=np.full(3, 0.01)))).keys() == {0, 1}
+    new = replace(nodes, velocity_variance=np.array([0.01, 25.0, 0.01]))
+    assert not edges(rule.pairs(new))
+    assert not edges(rule.pairs(replace(nodes, has_moved=None)))
+
+
+def test_who_leads_may_be_those_that_move_or_those_that_stand():
+    """Before a car stands a parked one, and before that drives another."""
+    nodes = table(*straight(3))
+    nodes = replace(nodes, has_moved=np.array([True, False, True]))
+    assert leaders(Following().pairs(nodes)) == {2: 1}
+    assert leaders(Following(leaders="moving").pairs(nodes)) == {2: 0}
+    assert leaders(Following(leaders="standing").pairs(nodes)) == {2: 1}
+    with pytest.raises(InputError, match="leaders: expected one of any, moving, standing"):
+        Following(leaders="parked")
+
+
+def test_who_creeps_in_a_jam_is_not_coupled_as_parked_objects_are():
+    rule, side_by_side = Neighbours(parked=True, speed_scale=0.5, rate=1.0), [[0.0, 0.0], [3.0, 0.0]]
+
+    def rates(speed):
+        known = {"has_moved": np.zeros(2, dtype=bool), "velocity_variance": np.full(2, 0.01)}
+        return rule.pairs(replace(table(side_by_side, 0.0, speed=speed), **known)).rate
+
+    assert rates(1.5).max() < 1e-3 < 0.5 < rates(0.1).min()

@@ -1,0 +1,93 @@
+"""Interaction functions of the running graph: what drivers and pedestrians do."""
+
+import numpy as np
+import pytest
+
+from factors.differences import stacked_differences
+from saga_fg import InputError
+from saga_fg.model.intelligent_driver import IntelligentDriver
+from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction, smooth_acceleration
+from saga_fg.model.road.stopping import SmoothStopping
+
+
+def test_the_round_corners_are_close_to_the_model_away_from_them():
+    driver = IntelligentDriver()
+    v, s, w = np.array([8.0, 10.0, 6.0]), np.array([15.0, 30.0, 20.0]), np.array([8.0, 9.0, 6.5])
+    np.testing.assert_allclose(smooth_acceleration(driver, v, s, w).value, driver.alone(v, s, w).value, atol=0.02)
+    assert smooth_acceleration(driver, np.array(15.0), np.array(0.1), np.array(0.0)).value > -driver.hardest - 0.01
+
+
+def test_nobody_drives_backwards_however_close_the_leader_stands():
+    law, x = interaction(SmoothDriver()), np.array([0.0, 0.0, 3.0, 0.0])
+    for _ in range(100):
+        x = law.predict(x, [np.array([5.5, 0.0, 0.0, 0.0])], 0.1)
+    assert 0.0 < x[0] < 2.0
+    assert abs(x[2]) < 0.05
+
+
+def test_a_follower_closes_up_to_the_gap_he_wants_and_no_farther():
+    law, leader = interaction(SmoothDriver()), np.array([100.0, 0.0, 8.0, 0.0])
+    x = np.array([20.0, 0.0, 8.0, 0.0])
+    for _ in range(1200):
+        x, leader = law.predict(x, [leader], 0.1), leader + np.array([0.8, 0.0, 0.0, 0.0])
+    assert x[2] == pytest.approx(8.0, abs=0.05)
+    assert 8.0 < leader[0] - x[0] - SmoothDriver().length < 14.0
+
+
+def test_pedestrians_push_each_other_away_and_stacks_are_the_same():
+    law, rng = interaction(SocialForce()), np.random.default_rng(0)
+    x, others = rng.normal(size=(5, 4)), [rng.normal(size=(5, 4)) for _ in range(2)]
+    together = law.predict(x, others, 0.2)
+    for k in range(5):
+        np.testing.assert_allclose(law.predict(x[k], [other[k] for other in others], 0.2), together[k])
+    here, there = np.zeros(4), np.array([0.5, 0.0, 0.0, 0.0])
+    assert law.predict(here, [there], 0.1)[2] < 0 < law.predict(there, [here], 0.1)[2]
+    assert np.isfinite(law.predict(here, [here], 0.1)).all()
+    assert law.predict(here, [], 0.1).tolist() == here.tolist()
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InputError, match="falloff"):
+        SocialForce(falloff=0.0)
+    with pytest.raises(InputError, match="length"):
+        SmoothDriver(length=-1.0)
+
+
+@pytest.mark.parametrize("law", [SmoothDriver(), SocialForce()], ids=["following", "repulsion"])
+def test_jacobians_are_the_derivatives(law):
+    rng, law = np.random.default_rng(1), interaction(law)
+    x, others = 4 * rng.normal(size=(6, 4)), [8 * rng.normal(size=(6, 4)) + 3]
+    F, (G,) = law.jacobians(x, others, 0.3)
+    expected = stacked_differences(lambda a, b: law.predict(a, [b], 0.3), [x, *others])
+    np.testing.assert_allclose(F, expected[0], atol=1e-7)
+    np.testing.assert_allclose(G, expected[1], atol=1e-7)
+
+
+PIECES = np.array([[-5.0, 0.0, 0.0, 1.0], [0.0, 1.0, 4.0, 0.0]])  # a wall with a corner
+GIVEN = {
+    "driver": (SmoothDriver(), np.array(4.0)),
+    "at a line": (SmoothStopping(), np.array([0.6, 0.8, -3.0])),
+    "standing": (SmoothDriver(IntelligentDriver(halt_time=0.3)), np.array(9.0)),
+    "wall": (SocialForce(), PIECES),
+}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_accelerations_and_their_derivatives(name):
+    """Beside a wall, past its ends, behind its corner; before a line; next to a leader."""
+    (law, given), rng = GIVEN[name], np.random.default_rng(2)
+    own, other = 4 * rng.normal(size=(40, 4)), rng.normal(size=(40, 4))
+    stacked = np.broadcast_to(given, (40, *given.shape))
+    _, by_own, by_other = law.accelerations(own, other, stacked)
+    expected = stacked_differences(lambda a, b: law.accelerations(a, b, stacked).value, [own, other])
+    np.testing.assert_allclose(by_own, expected[0], atol=1e-6 * max(1.0, np.abs(by_own).max()))
+    np.testing.assert_allclose(by_other, expected[1], atol=1e-6 * max(1.0, np.abs(by_own).max()))
+
+
+def test_a_wall_pushes_along_its_normal_and_from_its_end():
+    at, still = np.array([[-2.5, 2.5, 0, 0], [7.0, -4.0, 0, 0]]), np.zeros((2, 4))
+    a = SocialForce(falloff=5.0).accelerations(at, still, np.stack([PIECES, PIECES])).value
+    normal = np.array([-1.0, 5.0]) / np.sqrt(26)
+    np.testing.assert_allclose(a[0] / np.hypot(*a[0]), normal, atol=1e-12)
+    np.testing.assert_allclose(a[1] / np.hypot(*a[1]), [0.6, -0.8], atol=1e-12)
+    assert np.hypot(*a[1]) == pytest.approx(2.0 * np.exp((0.6 - 5.0) / 5.0))

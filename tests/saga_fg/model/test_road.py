@@ -1,0 +1,315 @@
+"""Lights, stop lines, lanes and cones: their laws, who heeds whom, and that each node type keeps to its own."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from road_scenes import bent_lane, queue, table, taper
+
+from saga_fg import InputError
+from saga_fg.model.cone_geometry import ConeGeometry, anticipated
+from saga_fg.model.edge_rules import Following, build_graph
+from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.rigid_coupling import Attached, RigidCoupling
+from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.lane_keeping import InLane, KeepLane
+from saga_fg.model.road.stopping import RedLight, Stopping
+from saga_fg.numerics.polyline import direction_at, feet
+from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
+from saga_fg.types.signal import COLOURS, SignalSettings, colour_updated
+
+
+def pull(nodes, rule):
+    """The acceleration (n, 2) of all nodes that the edges of a rule make at the present estimate."""
+    total = np.zeros((len(nodes), 2))
+    for edges in build_graph(nodes, [rule]).edges:
+        for k, (i, j) in enumerate(zip(edges.target.tolist(), edges.source.tolist(), strict=True)):
+            x_i, x_j = (state(nodes, row) for row in (i, j))
+            change = edges.rate[k] * (edges.A_self[k] @ x_i + edges.A_other[k] @ x_j + edges.b[k])
+            total[i] += change[nodes.types[i].index(("vx", "vy"))]
+    return total
+
+
+def state(nodes, row):
+    kind = nodes.types[row]
+    x = np.zeros(kind.dim)
+    x[kind.index(("x", "y"))] = nodes.position[row]
+    if kind.has(("vx", "vy")):
+        x[kind.index(("vx", "vy"))] = nodes.velocity[row]
+    return x
+
+
+# the light
+
+
+@given(belief=st.lists(st.floats(0.01, 1), min_size=3, max_size=3), dt=st.floats(0, 50), parts=st.integers(1, 5))
+def test_a_belief_is_predicted_over_any_interval_alike(belief, dt, parts):
+    """Chapman and Kolmogorov: in one step or in several; it stays a distribution and forgets what was seen."""
+    signals, p = SignalSettings(), np.array([belief]) / sum(belief)
+    once, often = signals.predicted(p, dt), p
+    for _ in range(parts):
+        often = signals.predicted(often, dt / parts)
+    assert np.allclose(once, often, atol=1e-9)
+    assert np.allclose(once.sum(), 1)
+    assert (once >= -1e-12).all()
+    assert np.allclose(signals.predicted(p, 1e4), signals.stationary, atol=1e-6)
+
+
+def test_colours_change_in_their_order():
+    signals = SignalSettings(red_duration=10, amber_duration=3, green_duration=12)
+    red = signals.predicted(np.array([[1.0, 0, 0]]), 0.01)[0]
+    assert red[COLOURS.index("green")] == pytest.approx(0.001, rel=0.01)
+    assert red[COLOURS.index("amber")] < 1e-5
+    assert np.allclose(signals.stationary, np.array([10, 3, 12]) / 25)
+
+
+@given(accuracy=st.floats(0.4, 0.999), colour=st.sampled_from(range(3)))
+def test_reports_of_a_colour_persuade_as_bayes_says(accuracy, colour):
+    belief = np.full(3, 1 / 3)
+    belief = colour_updated(belief, colour, accuracy)
+    assert belief[colour] == pytest.approx(accuracy)
+    again = colour_updated(belief, colour, accuracy)
+    assert again[colour] == pytest.approx(accuracy**2 / (accuracy**2 + (1 - accuracy) ** 2 / 2), rel=1e-5)
+    for _ in range(100):
+        belief = colour_updated(belief, colour, accuracy)
+    other = (colour + 1) % 3
+    for _ in range(100):  # whatever was believed, another colour can still be learnt
+        belief = colour_updated(belief, other, accuracy)
+    assert belief.argmax() == other
+
+
+def test_the_belief_mixes_or_selects():
+    beliefs = np.array([[0.3, 0.1, 0.6], [0.5, 0.2, 0.3]])
+    assert np.allclose(SignalSettings().closed(beliefs), [0.4, 0.7])
+    assert SignalSettings(belief="likeliest").closed(beliefs).tolist() == [0, 1]
+
+
+# the stop line
+
+
+@given(turn=st.floats(-3, 3), speed=st.floats(2, 14), gap=st.floats(8, 60))
+def test_stopping_is_the_even_deceleration_to_the_line(turn, speed, gap):
+    """The linearised law at its estimate, in any direction; and its derivatives against finite differences."""
+    u = np.array([np.cos(turn), np.sin(turn)])
+    law = Stopping(margin=1.0)
+    place = -(gap + 2 + 1.0) * u
+    ends = np.stack([[-u[1], u[0]], [u[1], -u[0]]]) * 2
+    rows = [("car", *place, speed, turn, 4.0), ("stop_line", 0, 0, 0, turn, 0)]
+    nodes = table(rows, np.array([0.0, 1.0]), {1: ends})
+    A_self, A_other, b = (part[0] for part in law.triples(nodes, np.array([0]), np.array([1])))
+    x, line = state(nodes, 0), np.zeros(2)
+    assert np.allclose((A_self @ x + A_other @ line + b)[2:], -u * speed**2 / (2 * gap), atol=1e-9)
+
+    def needed(p, v, q):
+        return -u * (u @ v) ** 2 / (2 * (u @ (q - p) - 3.0))
+
+    eps = 1e-6
+    for axis, e in enumerate(np.eye(2) * eps):
+        by_v = (needed(place, speed * u + e, line) - needed(place, speed * u - e, line)) / (2 * eps)
+        by_p = (needed(place + e, speed * u, line) - needed(place - e, speed * u, line)) / (2 * eps)
+        assert np.allclose(A_self[2:, 2 + axis], by_v, atol=1e-5)
+        assert np.allclose(A_self[2:, axis], by_p, atol=1e-5)
+        assert np.allclose(A_other[2:, axis], -by_p, atol=1e-5)
+
+
+def test_a_red_light_stops_the_first_of_each_lane():
+    target, source, rate = RedLight().pairs(queue())
+    assert sorted(target.tolist()) == [0, 3]
+    assert source.tolist() == [4, 4]
+    assert rate == pytest.approx([1.0, 1.0])
+    assert RedLight().pairs(queue(closed=0.4)).rate == pytest.approx([0.4, 0.4])
+    acceleration = pull(queue(), RedLight())
+    assert acceleration[0, 0] == pytest.approx(-(10**2) / (2 * (30 - 2 - 3)))
+    assert np.allclose(acceleration[[1, 2, 4]], 0)
+
+
+def test_who_cannot_stop_goes_on_and_the_next_one_stops():
+    rows = [("car", -8, 0, 12, 0, 4), ("car", -30, 0, 12, 0, 4), ("stop_line", 0, 0, 0, 0, 0)]
+    nodes = table(rows, np.array([0, 0, 1.0]), {2: np.array([[0, 1.75], [0, -1.75]])})
+    assert RedLight().pairs(nodes).target.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    "row",
+    [("car", -30, 4, 10, 0, 4), ("car", 20, 0, 10, 0, 4), ("car", -30, 0, 10, math.pi, 4), ("car", -300, 0, 9, 0, 4)],
+)
+def test_who_does_not_come_to_the_line_is_not_stopped(row):
+    """Beside it, beyond it, the other way, far away."""
+    nodes = table([row, ("stop_line", 0, 0, 0, 0, 0)], np.array([0, 1.0]), {1: np.array([[0, 1.75], [0, -1.75]])})
+    assert len(RedLight().pairs(nodes).target) == 0
+
+
+def test_the_queue_brakes_through_following():
+    """The second car has no edge to the line; it slows down because the first one does."""
+    nodes = queue()
+    rules = [RedLight(), Following(interaction=SharedVelocity(), rate=1.0)]
+    ends = [
+        (edges.interaction, target, source)
+        for edges in build_graph(nodes, rules).edges
+        for target, source in zip(edges.target.tolist(), edges.source.tolist(), strict=True)
+    ]
+    assert ("Stopping", 0, 4) in ends
+    assert ("SharedVelocity", 1, 0) in ends
+    assert not any(name == "Stopping" and t in (1, 2) for name, t, _ in ends)
+
+
+def test_the_way_to_a_line_is_along_the_lane():
+    """A line round the bend: straight on, the vehicle would miss it."""
+    nodes = bent_lane()
+    lane = nodes.outline[1]
+    end, before = lane[-1], lane[-2]
+    t = (end - before) / np.linalg.norm(end - before)
+    across = np.array([-t[1], t[0]])
+    rows = [("car", *nodes.position[0], 8.0, 0.2, 4), ("lane", *nodes.position[1], 0, 0, 0)]
+    rows.append(("stop_line", *(end - t), 0, math.atan2(t[1], t[0]), 0))
+    with_line = table(
+        rows,
+        np.array([0, 0, 1.0]),
+        {1: lane, 2: np.stack([end - t + 1.75 * across, end - t - 1.75 * across])},
+        {1: 3.5},
+    )
+    assert RedLight().pairs(with_line).target.tolist() == [0]
+    at = feet(lane, nodes.position[:1])
+    arc, speed = 50 * 1.2 - 1 - at.s[0], 8.0 * (at.direction[0] @ (np.cos(0.2), np.sin(0.2)))
+    rule = RedLight(firm=0.3)
+    expected = -(speed**2) / (2 * (arc - 2 - rule.interaction.margin))
+    assert pull(with_line, rule)[0] @ at.direction[0] == pytest.approx(expected, rel=1e-3)  # an arc of chords
+
+
+# lanes
+
+
+def test_feet_and_directions_of_an_arc():
+    angle = np.linspace(0, 1.5, 200)
+    arc = 20 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+    places = np.array([[20 * np.sin(a) * k, 20 - 20 * np.cos(a) * k] for a, k in ((0.5, 0.9), (1.0, 1.1))])
+    found = feet(arc, places)
+    assert np.allclose(found.s, [10, 20], atol=0.01)
+    assert np.allclose(found.e, [2, -2], atol=0.01)
+    assert np.allclose(direction_at(arc, np.array([10.0])), [[np.cos(0.5), np.sin(0.5)]], atol=1e-3)
+    beyond = feet(arc, np.array([[-5.0, 0.3]]))
+    assert beyond.s[0] == pytest.approx(-5, abs=0.02)
+
+
+def test_a_vehicle_turns_with_its_lane():
+    """At the centre, along the lane: the pull is the centripetal acceleration v^2 / r, to first order."""
+    nodes = bent_lane()
+    at = feet(nodes.outline[1], nodes.position[:1])
+    placed = table(
+        [("car", *at.point[0], 8.0, math.atan2(*at.direction[0][::-1]), 4), ("lane", *nodes.position[1], 0, 0, 0)],
+        np.zeros(2),
+        nodes.outline,
+        nodes.width,
+    )
+    rule = InLane(interaction=KeepLane(lag=0.5), rate=2.0)
+    n = np.array([-at.direction[0, 1], at.direction[0, 0]])
+    assert pull(placed, rule)[0] @ n == pytest.approx(8.0**2 / 50, rel=0.1)
+
+
+@given(turn=st.floats(-3, 3), x=st.floats(-500, 500), y=st.floats(-500, 500))
+def test_lanes_pull_alike_at_every_place_and_in_every_direction(turn, x, y):
+    here, there = pull(bent_lane(), InLane())[0], pull(bent_lane(turn, (x, y)), InLane())[0]
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    assert np.allclose(R @ here, there, atol=1e-6)
+
+
+def test_who_leaves_a_lane_is_let_go():
+    straight = {1: np.array([[-50.0, 0.0], [50.0, 0.0]])}
+    rows = [("car", 0, 1.0, 10, 0.2, 4), ("lane", 0, 0, 0, 0, 0)]
+    leaving = InLane().pairs(table(rows, np.zeros(2), straight, {1: 3.5}))
+    assert leaving.rate[0] < 0.1
+    rows[0] = ("car", 0, 2.5, 10, 0, 4)
+    assert len(InLane().pairs(table(rows, np.zeros(2), straight, {1: 3.5})).target) == 0
+
+
+def test_who_is_pushed_out_of_a_lane_by_cones_does_not_keep_it():
+    rows = [("car", 0, 0, 10, 0, 4), ("lane", 0, 0, 0, 0, 0)]
+    rows += [("traffic_cone", 10 + 5 * k, -2 + k, 0, 0, 0.4) for k in range(5)]
+    nodes = table(rows, np.zeros(7), {1: np.array([[-50.0, 0.0], [50.0, 0.0]])}, {1: 3.5})
+    assert len(InLane().pairs(nodes).target) == 1
+    assert len(InLane(cones=ConeGeometry()).pairs(nodes).target) == 0
+
+
+# cones
+
+
+def test_cones_push_aside_whose_lane_they_close():
+    nodes = taper()
+    acceleration = pull(nodes, ConeEdge(cones=ConeGeometry(clearance=1.5)))
+    assert acceleration[0, 1] > 0.5
+    assert acceleration[0, 0] == pytest.approx(0)
+    assert np.allclose(acceleration[1:], 0)
+
+
+def test_the_push_is_to_where_the_edge_is_just_cleared():
+    """Looking 15 m ahead, at the second cone, which is at y = -1: the way aside there is clearance - 1."""
+    cones = ConeGeometry(clearance=1.5, preview=1.5)
+    assert pull(taper(), ConeEdge(cones=cones, rate=2.0))[0, 1] == pytest.approx(2.0 * 0.5 / 1.5)
+
+
+def test_cones_on_the_left_push_to_the_right():
+    nodes = taper()
+    mirrored = table([(str(nodes.label[k]), *(nodes.position[k] * (1, -1)), 10.0 * (k < 2), 0, 4) for k in range(7)])
+    assert np.allclose(pull(mirrored, ConeEdge()) * (1, -1), pull(nodes, ConeEdge()))
+
+
+def test_the_car_beside_knows_that_cones_push_another_into_its_lane():
+    """Figure 1 of the paper: car A, in the lane beside, follows car B before B is there."""
+    nodes = taper()
+    plain = Following(interaction=SharedVelocity(), lateral_scale=0.8)
+    assert len(plain.pairs(nodes).target) == 0
+    edges = replace(plain, cones=ConeGeometry()).pairs(nodes)
+    assert (edges.target.tolist(), edges.source.tolist()) == ([1], [0])
+    moved = anticipated(nodes, ("car",), ConeGeometry(clearance=1.5))
+    assert moved[0].tolist() == [0, 3.5]
+    assert moved[1].tolist() == [-12, 3.5]
+
+
+# trailers and riders
+
+
+def test_attached_is_the_nearest_that_touches_and_goes_along():
+    rows = [("truck", 0, 0, 10, 0, 7), ("trailer", -8.5, 0, 10, 0, 8), ("truck", -9, 3.5, 10, 0, 7)]
+    target, source, _ = Attached().pairs(table(rows))
+    assert sorted(zip(target.tolist(), source.tolist(), strict=True)) == [(0, 1), (1, 0)]
+    rows[1] = ("trailer", -8.5, 0, 2, 0, 8)
+    assert all(rate < 0.01 for rate in Attached(speed_scale=1.0).pairs(table(rows)).rate)
+
+
+def test_a_couple_that_moves_as_one_feels_nothing_and_a_change_of_one_moves_the_other():
+    nodes = table([("truck", 0, 0, 10, 0, 7), ("trailer", -8.5, 0, 10, 0, 8)])
+    assert np.allclose(pull(nodes, Attached()), 0)
+    A_self, A_other, b = (part[0] for part in RigidCoupling(2.0).triples(nodes, np.array([1]), np.array([0])))
+    ahead = state(nodes, 0) + np.array([1.0, 0, -2.0, 0])
+    assert np.allclose((A_self @ state(nodes, 1) + A_other @ ahead + b)[2:], [-2.0 + 1.0 / 2.0, 0])
+
+
+# the map
+
+
+def test_a_stop_line_looks_where_traffic_goes():
+    assert StopLine("a", (0, 2), (0, -2), "l").heading == pytest.approx(0)
+    assert StopLine("a", (-2, 0), (2, 0), "l").heading == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: RoadMap((), (StopLine("a", (0, 1), (0, 0), "b"),)),
+            "there is no traffic light 'b'",
+        ),
+        (lambda: RoadMap((TrafficLight("a", (0, 0)), TrafficLight("a", (1, 1)))), "'a' occurs twice"),
+        (lambda: StopLine("a", (0, 1), (0, 1), "b"), "two different ends"),
+        (lambda: Lane("a", ((0, 0),)), "at least two points"),
+        (lambda: TrafficLight("", (0, 0)), "expected a name"),
+        (lambda: TrafficLight("a", (0, math.nan)), "finite numbers"),
+        (lambda: RoadMap(deviation=0), "deviation"),
+    ],
+)
+def test_a_map_that_makes_no_sense_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

@@ -1,0 +1,348 @@
+"""The tracker: one object followed, births, coasting and deaths, coordinates, classes."""
+
+import numpy as np
+import pytest
+from traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle
+
+from saga_fg import (
+    ConstantAcceleration,
+    ConstantVelocity,
+    Detection,
+    Detections,
+    Frame,
+    Sensor,
+    Tracker,
+    TrackerSettings,
+)
+from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.tracking import ClassSettings, ExistenceSettings
+from saga_fg.types.sensor import Extrinsics, FieldOfView, NoiseModel
+
+TENTHS = np.arange(0, 5, 0.1)
+
+
+def settings(edges=(), **values):
+    """Independent objects of one kind of class settings."""
+    existence = {k: values.pop(k) for k in ("report", "confirm", "give_up", "lifetime") if k in values}
+    overall = {k: values.pop(k) for k in ("max_delay", "report_coasting", "max_out_of_view") if k in values}
+    return TrackerSettings(
+        {"default": ClassSettings(**values)}, edges=edges, existence=ExistenceSettings(**existence), **overall
+    )
+
+
+# one object
+
+
+def test_a_single_car_is_one_track_from_beginning_to_end():
+    truth = straight((5.0, -3.0), (10.0, 2.0))
+    frames = seen(np.random.default_rng(1), truth, TENTHS, yaw=np.arctan2(2, 10))
+    history = run(Tracker(), frames)
+    assert {tuple(tracks.id.tolist()) for tracks in history} == {(1,)}
+    last = history[-1]
+    assert last.timestamp == frames[-1].timestamp
+    assert last.boxes.label.tolist() == ["car"]
+    assert last.boxes.position[0, :2] == pytest.approx(truth(last.timestamp)[0], abs=0.3)
+    assert last.boxes.position[0, 2] == pytest.approx(1.0)
+    assert last.boxes.velocity[0] == pytest.approx([10.0, 2.0], abs=1.0)
+    assert last.boxes.size[0] == pytest.approx(SIZE)
+    assert last.boxes.yaw[0] == pytest.approx(np.arctan2(2, 10))
+    assert last.score[0] == pytest.approx(0.9)
+    assert last.coasting.tolist() == [0.0]
+
+
+def test_the_filter_is_better_than_the_detections_and_knows_how_good_it_is():
+    sensor = Sensor(noise={"default": NoiseModel(position=0.5)})
+    errors, detected, claimed = [], [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        truth = straight(rng.normal(size=2) * 20, rng.normal(size=2) * 8)
+        frames = seen(rng, truth, TENTHS, noise=0.5, yaw=NAN)
+        tracker = Tracker(settings(motion=ConstantVelocity(acceleration_noise=0.05)), {"lidar": sensor})
+        tracks = run(tracker, frames)[-1]
+        errors.append(tracks.boxes.position[0, :2] - truth(tracks.timestamp)[0])
+        detected.append(frames[-1].detections.boxes.position[0, :2] - truth(tracks.timestamp)[0])
+        claimed.append(np.trace(tracks.position_covariance[0]))
+    mean_square = float(np.mean(np.sum(np.square(errors), axis=1)))
+    assert mean_square < 0.4 * np.mean(np.sum(np.square(detected), axis=1))
+    assert 0.3 < mean_square / np.mean(claimed) < 1.7
+
+
+def test_a_measured_velocity_is_taken_in():
+    first = Tracker().step(frame(0.0, [(0, 0)], velocity=(7.0, -1.0)))
+    assert first.boxes.velocity[0] == pytest.approx([7.0, -1.0])
+    ignoring = Tracker(sensors={"lidar": Sensor(use_velocity=False)}).step(frame(0.0, [(0, 0)], velocity=(7.0, -1.0)))
+    assert ignoring.boxes.velocity[0].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "unknown", [{"velocity": (NAN, NAN)}, {"velocity": (10.0, NAN)}, {}, {"size": (NAN,) * 3}, {"yaw": NAN}]
+)
+def test_what_was_not_measured_does_no_harm(unknown):
+    truth = straight((0, 0), (10, 0))
+    history = run(Tracker(), seen(np.random.default_rng(0), truth, TENTHS, **unknown))
+    assert history[-1].id.tolist() == [1]
+    assert history[-1].boxes.position[0, :2] == pytest.approx(truth(TENTHS[-1])[0], abs=0.4)
+    assert np.isfinite(history[-1].boxes.velocity).all()
+    if "yaw" in unknown:
+        assert np.isnan(history[-1].boxes.yaw).all()
+    if "size" in unknown:
+        assert np.isnan(history[-1].boxes.size).all()
+
+
+def test_an_unmeasured_velocity_is_unknown_along_the_heading_and_small_across():
+    known = Tracker().step(frame(0.0, [(0, 0)], yaw=np.pi / 2)).velocity_covariance[0]
+    assert known == pytest.approx(np.diag([1.0, 25.0]), abs=1e-12)
+    unknown = Tracker().step(frame(0.0, [(0, 0)], yaw=NAN)).velocity_covariance[0]
+    assert unknown == pytest.approx(25.0 * np.eye(2))
+
+
+# births, coasting, deaths
+
+
+def test_tracks_are_born_where_no_track_explains_a_detection():
+    tracker = Tracker(settings())
+    assert tracker.step(frame(0.0, [(0, 0)])).id.tolist() == [1]
+    assert tracker.step(frame(0.1, [(0, 0), (30, 0)])).id.tolist() == [1, 2]
+    assert tracker.step(frame(0.2, [(30, 0), (60, 5), (0, 0)])).id.tolist() == [1, 2, 3]
+
+
+def test_weak_detections_start_no_track_but_keep_one_alive():
+    tracker = Tracker(settings(birth_score=0.5, min_score=0.1))
+    assert len(tracker.step(frame(0.0, [(0, 0)], score=0.4))) == 0
+    assert len(tracker.step(frame(0.1, [(0, 0)], score=0.6))) == 1
+    weak = tracker.step(frame(0.2, [(0.5, 0)], score=0.2))
+    assert weak.coasting.tolist() == [0.0]
+    assert weak.boxes.position[0, 0] > 0.1
+    unusable = tracker.step(frame(0.3, [(0.5, 0)], score=0.05))
+    assert unusable.coasting == pytest.approx([0.1])
+
+
+def test_a_track_coasts_is_no_longer_reported_and_dies():
+    tracker = Tracker(settings(max_coasting=1.0, report_coasting=0.55))
+    run(tracker, [frame(t, [(10 * t, 0)]) for t in np.arange(0, 1.05, 0.1)])
+    coasting = [tracker.step(frame(1.0 + t, [])) for t in np.arange(0.1, 1.25, 0.1)]
+    reported = [len(tracks) for tracks in coasting]
+    assert reported == [1] * 5 + [0] * 7
+    assert coasting[3].coasting == pytest.approx([0.4])
+    assert coasting[3].boxes.position[0, :2] == pytest.approx([14.0, 0.0], abs=0.3)
+    assert coasting[3].position_covariance[0, 0, 0] > coasting[0].position_covariance[0, 0, 0]
+    assert tracker.step(frame(2.3, [(23, 0)])).id.tolist() == [2], "a dead track came back"
+
+
+def test_an_object_seen_again_in_time_keeps_its_id():
+    tracker = Tracker(settings(max_coasting=1.0))
+    run(tracker, [frame(t, [(10 * t, 0)]) for t in np.arange(0, 1.05, 0.1)])
+    run(tracker, [frame(t, []) for t in np.arange(1.1, 1.75, 0.1)])
+    again = tracker.step(frame(1.8, [(18, 0)]))
+    assert (again.id.tolist(), again.coasting.tolist()) == ([1], [0.0])
+
+
+def test_ids_are_never_reused():
+    rng = np.random.default_rng(4)
+    tracker, met = Tracker(settings(max_coasting=0.3)), {}
+    for k in range(60):
+        position = rng.uniform(-60, 60, (int(rng.integers(0, 5)), 2))
+        for track in tracker.step(frame(0.2 * k, position, score=0.95)):
+            if track.id in met:
+                assert k - met[track.id] <= 2, f"track {track.id} came back"
+            met[track.id] = k
+    assert len(met) > 30
+    assert sorted(met) == list(range(1, len(met) + 1))
+
+
+def test_doubtful_tracks_end_by_misses_where_the_sensor_looks_and_not_elsewhere():
+    ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
+    pose = {"world_T_ego": np.eye(4)}
+    left = []
+    for position in ((20.0, 0.0), (-20.0, 0.0)):
+        tracker = Tracker(settings(max_coasting=5.0, report_coasting=5.0), {"camera": ahead})
+        tracker.step(frame(0.0, [position], score=0.3, **pose))
+        left.append(len(run(tracker, [frame(t, [], "camera", **pose) for t in (0.1, 0.2, 0.3)])[-1]))
+    assert left == [0, 1]
+
+
+def test_how_often_nobody_looks_does_not_matter_to_belief():
+    """Existence out of view falls with time, not with the number of frames."""
+    sensors = {"blind": Sensor(detection_probability=0.0)}
+    scores = []
+    for count in (1, 20):
+        tracker = Tracker(settings(max_coasting=5.0, report_coasting=5.0, lifetime=2.0), sensors)
+        tracker.step(frame(0.0, [(0, 0)], score=0.5))
+        scores.append(run(tracker, [frame(t, [], "blind") for t in np.linspace(0, 1, count + 1)[1:]])[-1].score[0])
+    assert scores[0] == pytest.approx(0.5 * 0.5 * np.exp(-1.0 / 2.0))
+    assert scores[1] == pytest.approx(scores[0])
+
+
+def test_a_confirmed_track_outlives_misses():
+    for score, alive in ((0.95, 1), (0.3, 0)):
+        tracker = Tracker(settings(max_coasting=2.0, report_coasting=2.0, confirm=0.9))
+        tracker.step(frame(0.0, [(0, 0)], score=score))
+        assert len(run(tracker, [frame(t, []) for t in np.arange(0.1, 1.0, 0.1)])[-1]) == alive
+
+
+def test_only_believed_tracks_are_reported():
+    tracker = Tracker(settings(report=0.7))
+    assert len(tracker.step(frame(0.0, [(0, 0)], score=0.5))) == 0
+    assert tracker.step(frame(0.1, [(0, 0)], score=0.5)).id.tolist() == [1]
+
+
+def test_frames_without_detections():
+    tracker = Tracker()
+    for t in (0.0, 0.1, 9.0):
+        assert len(tracker.step(frame(t, []))) == 0
+    assert tracker.step(frame(9.1, [(1, 1)])).id.tolist() == [1]
+    assert tracker.step(frame(9.2, [])).coasting == pytest.approx([0.1])
+
+
+def test_a_thousand_seconds_later():
+    tracker = Tracker()
+    for t in (0.0, 0.1):
+        tracker.step(frame(t, [(5 * t, 0), (10 + 5 * t, 0)], velocity=(5, 0)))
+    assert tracker.step(frame(1000.0, [(300, 0)])).id.tolist() == [1, 2], "nobody believes it yet"
+    assert tracker.step(frame(1000.1, [(300, 0)])).id.tolist() == [3]
+    assert len(tracker.step(frame(1000.2, [(300, 0)]))) == 1
+
+
+def test_of_duplicates_the_stronger_starts_the_track():
+    rows = [Detection("car", (0, 0, 0), score=0.6), Detection("car", (0.3, 0, 0), score=0.8)]
+    tracks = Tracker().step(Frame(0.0, "lidar", Detections.of(rows)))
+    assert tracks.boxes.position[0, 0] == pytest.approx(0.3)
+    assert len(tracks) == 1
+
+
+# classes and motion models
+
+
+def test_classes_do_not_mix():
+    tracker = Tracker()
+    tracker.step(frame(0.0, [(0, 0), (0, 1)], label=["car", "pedestrian"]))
+    swapped = tracker.step(frame(0.1, [(0, 0), (0, 1)], label=["pedestrian", "car"]))
+    assert swapped.boxes.label.tolist() == ["car", "pedestrian"]
+    assert swapped.boxes.position[:, 1].tolist() == pytest.approx([1.0, 0.0], abs=0.5)
+
+
+def test_constant_velocity_and_constant_acceleration_side_by_side():
+    """A queue whose cars and trucks move by different models, coupled with each other."""
+    classes = {
+        "car": ClassSettings(motion=ConstantVelocity(1.0)),
+        "truck": ClassSettings(motion=ConstantAcceleration(0.5, fading_time=3.0)),
+    }
+    start = np.stack([-14.0 * np.arange(4), np.zeros(4)], axis=-1)
+    truth = lambda t: start + np.array([10.0 * t + 0.5 * t**2, 0.0])  # noqa: E731
+    label = ["car", "truck", "car", "truck"]
+    tracker = Tracker(TrackerSettings(classes))
+    history = run(tracker, seen(np.random.default_rng(0), truth, TENTHS, label=label))
+    assert history[-1].boxes.label.tolist() == label
+    assert history[-1].id.tolist() == [1, 2, 3, 4]
+    assert history[-1].boxes.position[:, :2] == pytest.approx(truth(TENTHS[-1]), abs=0.4)
+    assert tracker.graph.dims.tolist() == [4, 6, 4, 6]
+    pairs = {
+        (int(tracker.graph.dims[i]), int(tracker.graph.dims[j]))
+        for group in tracker.graph.edges
+        for i, j in zip(group.target, group.source, strict=True)
+    }
+    assert {(4, 6), (6, 4)} <= pairs
+
+
+def test_an_unknown_sensor_is_the_default_one():
+    noisy = {"default": Sensor(noise={"default": NoiseModel(position=2.0)})}
+    sonar = Tracker(sensors=noisy).step(frame(0.0, [(0, 0)], "sonar")).position_covariance[0]
+    assert sonar == pytest.approx(4.0 * np.eye(2))
+    assert Tracker().step(frame(0.0, [(0, 0)], "sonar")).position_covariance[0] == pytest.approx(0.09 * np.eye(2))
+
+
+def test_without_a_pose_the_range_is_unknown_and_adds_no_noise():
+    sensor = {"lidar": Sensor(noise={"default": NoiseModel(position=0.3, range_noise=0.01)})}
+    anywhere = Tracker(sensors=sensor).step(frame(0.0, [(1e6, 1e6)])).position_covariance[0]
+    assert anywhere == pytest.approx(0.09 * np.eye(2))
+    posed = Tracker(sensors=sensor).step(frame(0.0, [(100, 0)], world_T_ego=np.eye(4))).position_covariance[0]
+    assert posed == pytest.approx(np.diag([0.09 + 1.0, 0.09]))
+
+
+# coordinates
+
+
+def traffic(seed=3, **fields):
+    truth = straight([(0, 0), (15, 4), (-20, -8)], [(8, 0), (5, 1), (0, 0)])
+    return seen(np.random.default_rng(seed), truth, TENTHS, **fields)
+
+
+def agree(first, second, shift=(0.0, 0.0, 0.0), tolerance=1e-8):
+    for a, b in zip(first, second, strict=True):
+        assert a.id.tolist() == b.id.tolist()
+        assert b.boxes.position - a.boxes.position == pytest.approx(np.tile(shift, (len(a), 1)), abs=tolerance)
+        for name in ("velocity", "yaw", "size"):
+            assert getattr(b.boxes, name) == pytest.approx(getattr(a.boxes, name), abs=tolerance)
+        assert b.position_covariance == pytest.approx(a.position_covariance, abs=tolerance)
+        assert b.score == pytest.approx(a.score, abs=tolerance)
+
+
+@pytest.mark.parametrize("coordinates", ["ego", "sensor"])
+def test_frames_in_vehicle_or_sensor_coordinates_give_the_same_tracks(coordinates):
+    noise = {"default": NoiseModel(0.3, range_noise=0.01, bearing_noise=0.002)}
+    mount = Extrinsics(x=1.2, y=0.4, z=1.7, yaw=0.6)
+    sensors = {"lidar": Sensor(noise, extrinsics=mount, field_of_view=FieldOfView(-2.0, 1.0))}
+    frames = [
+        Frame(f.timestamp, f.sensor, f.detections, turning_vehicle(f.timestamp)) for f in traffic(velocity=(4.0, 1.0))
+    ]
+    told = [at_pose(f, turning_vehicle(f.timestamp), coordinates, mount.ego_T_sensor) for f in frames]
+    agree(run(Tracker(sensors=sensors), frames), run(Tracker(sensors=sensors), told), tolerance=1e-7)
+
+
+@pytest.mark.parametrize("first", ["an object", "nothing"])
+def test_far_from_the_origin_nothing_changes(first):
+    frames = traffic()
+    if first == "nothing":
+        frames = [frame(-0.1, []), *frames]
+    shift = np.array([1e6, -4e6, 0.0])
+    T = np.eye(4)
+    T[:3, 3] = shift
+    moved = [Frame(f.timestamp, f.sensor, f.detections.transformed(T)) for f in frames]
+    agree(run(Tracker(), frames), run(Tracker(), moved), shift, tolerance=2e-9 * 4e6 / 4)
+
+
+def test_a_turned_world_turns_the_tracks():
+    T = turning_vehicle(2.0)
+    frames = traffic()
+    turned = [Frame(f.timestamp, f.sensor, f.detections.transformed(T)) for f in frames]
+    for a, b in zip(run(Tracker(), frames), run(Tracker(), turned), strict=True):
+        back = b.boxes.transformed(inverse_transform(T))
+        assert a.id.tolist() == b.id.tolist()
+        assert back.position == pytest.approx(a.boxes.position, abs=1e-6)
+        assert back.velocity == pytest.approx(a.boxes.velocity, abs=1e-6)
+
+
+def test_the_same_frames_give_the_same_tracks_to_the_last_bit():
+    first, second = run(Tracker(), traffic()), run(Tracker(), traffic())
+    assert [columns(t) for t in first] == [columns(t) for t in second]
+
+
+def test_the_order_of_detections_does_not_matter_but_for_new_ids():
+    frames = traffic()
+    reversed_later = [frames[0], *(Frame(f.timestamp, f.sensor, f.detections.select([2, 1, 0])) for f in frames[1:])]
+    agree(run(Tracker(), frames), run(Tracker(), reversed_later), tolerance=1e-9)
+
+
+def test_earlier_reports_do_not_change_afterwards():
+    tracker = Tracker()
+    frames = traffic()
+    history, copies = [], []
+    for f in frames:
+        history.append(tracker.step(f))
+        copies.append(columns(history[-1]))
+    assert [columns(t) for t in history] == copies
+
+
+def test_the_tracker_tells_which_detection_went_where():
+    def told(timestamp, *rows):
+        detections = [Detection("car", (*place, 0.0), score=score) for place, score in rows]
+        tracker.step(Frame(timestamp, "lidar", Detections.of(detections)))
+        return dict(zip(tracker.assignment.detection.tolist(), tracker.assignment.id.tolist(), strict=True))
+
+    tracker = Tracker(settings(birth_score=0.5, min_score=0.1))
+    born = told(0.0, ((0, 0), 0.05), ((9, 0), 0.9), ((0, 9), 0.9))
+    assert born.keys() == {1, 2}  # the first is too weak for anything
+    later = told(0.1, ((0, 9.1), 0.9), ((50, 0), 0.9), ((9.1, 0), 0.9))
+    assert (later[0], later[2]) == (born[2], born[1])
+    assert later[1] not in born.values()
+    assert told(0.2) == {}

@@ -1,0 +1,324 @@
+"""Nothing that a sensor sends stops a tracker: steps are transactions, states stay in bounds, numbers are judged."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import pickle
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from traffic_frames import columns, frame, run, seen, straight
+
+from saga_fg import Boxes, Detection, Detections, Frame, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.estimators import JointKalmanFilter
+from saga_fg.tracking import ClassSettings
+from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
+from saga_fg.types.sensor import NoiseModel
+
+ESTIMATORS = ("kalman", "isam2", "fixed-lag")
+CARS = straight([(0.0, 0.0), (12.0, 0.0), (24.0, 0.0)], [(8.0, 0.0), (8.5, 0.0), (9.0, 0.0)])
+POSE = np.eye(4)
+FAR = np.array([[1e5, -2e5]])
+
+
+def traffic(count=10):
+    """Frames at 10 Hz."""
+    return seen(np.random.default_rng(0), CARS, np.arange(count) / 10)
+
+
+# whatever comes: the whole range of numbers, in every field
+
+ANY = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(-50.0, 50.0))
+CORRUPTIONS = ("timestamp", "position", "velocity", "range_rate", "score", "size", "yaw", "ego")
+
+
+@st.composite
+def corrupted(draw):
+    """A field of a frame, and what is written there."""
+    return draw(st.sampled_from(CORRUPTIONS)), draw(st.lists(ANY, min_size=3, max_size=3))
+
+
+def written(timestamp, places, corruption):
+    """A radar's frame; raises `InputError` where validation refuses what was written."""
+    n = len(places)
+    values = {
+        "timestamp": timestamp,
+        "position": np.c_[places, np.zeros(n)],
+        "velocity": np.full((n, 2), np.nan),
+        "range_rate": np.full(n, np.nan),
+        "score": np.full(n, 0.9),
+        "size": np.full((n, 3), 2.0),
+        "yaw": np.zeros(n),
+        "ego": POSE,
+    }
+    if corruption is not None:
+        name, numbers = corruption
+        if name == "timestamp":
+            values[name] = numbers[0] + timestamp if abs(numbers[0]) < 50.0 else numbers[0]
+        elif name == "ego":
+            values[name] = POSE.copy()
+            values[name][:3, 3] = numbers
+        else:
+            shape = values[name].shape
+            values[name] = np.broadcast_to(numbers[: shape[1]] if len(shape) == 2 else numbers[0], shape)
+    boxes = Boxes.of(["car"] * n, values["position"], values["size"], values["yaw"], values["velocity"])
+    return Frame(values["timestamp"], "radar", Detections(boxes, values["score"], values["range_rate"]), values["ego"])
+
+
+@pytest.mark.parametrize("estimator", [*ESTIMATORS, "centerpoint"])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    corruptions=st.lists(st.one_of(st.none(), corrupted()), max_size=14),
+    epoch=st.sampled_from([0.0, 1.7e9]),
+    max_step=st.sampled_from([np.inf, 0.05]),
+)
+def test_a_valid_frame_is_tracked_after_whatever_came_before(estimator, corruptions, epoch, max_step):
+    logging.disable(logging.WARNING)
+    if estimator == "centerpoint":
+        tracker = GreedyTracker()
+    else:
+        tracker = Tracker(TrackerSettings(estimator=estimator, max_step=max_step, lag=0.5))
+    try:
+        for k, corruption in enumerate(corruptions):
+            try:
+                tracker.step(written(epoch + 0.1 * k, CARS(0.1 * k), corruption))
+            except InputError:
+                continue
+        times = epoch + 0.1 * (len(corruptions) + np.arange(3))
+        tracks = [tracker.step(frame(t, FAR, sensor="radar")) for t in times.tolist()][-1]
+    finally:
+        logging.disable(logging.NOTSET)
+    apart = np.hypot(*(tracks.boxes.position[:, :2] - FAR).T)
+    assert (apart < 1.0).sum() == 1
+    assert 0.0 <= tracks.timestamp - times[-1] <= 0.5, "the newest time, within the delay that frames may have"
+
+
+# a step is a transaction
+
+
+class Failing:
+    """An edge rule that raises as long as there are nodes, once it is told to."""
+
+    interaction = "neighbours"
+
+    def __init__(self):
+        self.error = None
+
+    def pairs(self, nodes):
+        if self.error is not None and len(nodes):
+            raise self.error
+        empty = np.empty(0, dtype=np.int64)
+        return empty, empty, np.empty(0)
+
+
+def estimator_state(tracker):
+    return columns(tracker.tracks(100.0)), tracker.snapshot().tracks.next_id, tracker.time_verdict
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("stage", ["_associate", "_update", "_believe", "_bear", "_bury"])
+def test_what_raises_in_a_step_leaves_the_tracker_as_it_was(monkeypatch, estimator, stage):
+    from saga_fg.tracking.track_set import TrackSet
+
+    silent, failing = (Tracker(TrackerSettings(estimator=estimator)) for _ in range(2))
+    frames = traffic(12)
+    for tracker in (silent, failing):
+        run(tracker, frames[:10])
+    original = getattr(TrackSet, stage)
+
+    def breaking(self, *arguments):
+        original(self, *arguments)
+        raise ArithmeticError("broken")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(TrackSet, stage, breaking)
+        with pytest.raises(ArithmeticError, match="broken"):
+            failing.step(frames[10])
+    for a, b in zip(run(silent, frames[10:]), run(failing, frames[10:]), strict=True):
+        assert b.id.tolist() == a.id.tolist()
+        assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-9)
+        assert b.score == pytest.approx(a.score)
+
+
+def test_an_interrupt_leaves_the_tracker_as_it_was(monkeypatch):
+    from saga_fg.tracking.track_set import TrackSet
+
+    tracker = Tracker()
+    run(tracker, traffic())
+    before = columns(tracker.tracks(0.9))
+
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(TrackSet, "_bury", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            tracker.step(frame(1.0, CARS(1.0)))
+    assert columns(tracker.tracks(0.9)) == before
+
+
+def test_tracks_that_cannot_go_on_are_given_up_at_the_second_frame(monkeypatch, caplog):
+    def singular(self, transition):
+        if len(self.nodes):
+            raise np.linalg.LinAlgError("singular")
+
+    tracker = Tracker()
+    run(tracker, traffic())
+    monkeypatch.setattr(JointKalmanFilter, "predict", singular)
+    with pytest.raises(np.linalg.LinAlgError):
+        tracker.step(frame(1.0, CARS(1.0)))
+    assert tracker.tracks(0.9).id.tolist() == [1, 2, 3]
+    assert tracker.step(frame(1.1, CARS(1.1))).id.tolist() == [4, 5, 6]
+    assert "tracks [1, 2, 3] are deleted, they can't go on: singular" in caplog.text
+
+
+def test_frames_that_cannot_be_used_cost_no_tracks():
+    tracker = Tracker()
+    run(tracker, traffic())
+    beyond = yaw_pose(MAX_POSITION)
+    for k in range(4):  # a detection is beyond all bounds once it is in the world
+        unusable = Frame(1.0 + k / 10, "lidar", Detections.of([Detection("car", (1e8, 0, 0))]), beyond, "ego")
+        with pytest.raises(InputError, match="position"):
+            tracker.step(unusable)
+    assert tracker.step(frame(1.0, CARS(1.0))).id.tolist() == [1, 2, 3]
+
+
+def yaw_pose(x):
+    pose = POSE.copy()
+    pose[0, 3] = x
+    return pose
+
+
+# states stay in bounds
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_tracks_that_leave_all_bounds_are_deleted_by_name_and_the_others_go_on(estimator, caplog):
+    tracker = Tracker(TrackerSettings(edges=(), estimator=estimator), {"default": Sensor(max_speed=np.inf)})
+    near = [(0.0, 0.0), (MAX_POSITION - 1.0, 50.0)]
+    tracker.step(frame(0.0, near, velocity=[(0.0, 0.0), (0.9 * MAX_SPEED, 0.0)]))
+    tracks = tracker.step(frame(0.1, near[:1]))
+    assert tracks.id.tolist() == [1]
+    assert "deleted, since their states are out of bounds: tracks [2]" in caplog.text
+    assert tracker.step(frame(0.2, near[:1])).id.tolist() == [1]
+
+
+def test_a_state_that_is_not_finite_is_deleted_and_the_others_go_on(monkeypatch, caplog):
+    update = JointKalmanFilter.update
+
+    def poisoning(self, measurements):
+        likelihood = update(self, measurements)
+        mean = self._state.mean.copy()
+        mean[:4] = np.nan
+        self._state = replace(self._state, mean=mean)
+        return likelihood
+
+    tracker = Tracker(TrackerSettings(edges=()))
+    run(tracker, traffic())
+    with monkeypatch.context() as patched:
+        patched.setattr(JointKalmanFilter, "update", poisoning)
+        assert tracker.step(frame(1.0, CARS(1.0))).id.tolist() == [2, 3]
+    assert "out of bounds: tracks [1]" in caplog.text
+    assert tracker.step(frame(1.1, CARS(1.1))).id.tolist() == [2, 3, 4]
+
+
+@pytest.mark.parametrize("timestamp", [1e12, 1e300])
+def test_looking_ahead_for_ever(timestamp):
+    tracker = Tracker(TrackerSettings(report_coasting=1e308))
+    run(tracker, traffic())
+    assert len(tracker.tracks(timestamp)) == 0
+    assert tracker.step(frame(1.0, CARS(1.0))).id.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("max_step", [1e-9, 5e-324])
+def test_the_steps_of_an_interval_are_limited(max_step, caplog):
+    tracker = Tracker(TrackerSettings(max_step=max_step))
+    run(tracker, traffic(4))
+    assert "0.1 s are predicted in 100 steps, max_step asks for" in caplog.text
+    assert tracker.tracks(0.3).id.tolist() == [1, 2, 3]
+
+
+# range rates and velocities
+
+RADAR = {"radar": Sensor(noise={"default": NoiseModel(range_rate=0.1)})}
+
+
+def with_rate(timestamp, rate, velocity=None):
+    plain = frame(timestamp, [(30.0 + timestamp * 10.0, 0.0)], "radar", velocity=velocity)
+    return Frame(timestamp, "radar", replace(plain.detections, range_rate=np.array([rate])), POSE)
+
+
+@pytest.mark.parametrize("rate", [1e10, 1e300, -2e6])
+def test_range_rates_that_nothing_has_are_refused(rate):
+    with pytest.raises(InputError, match=r"range_rate\[0\]: expected numbers within 1e\+06"):
+        with_rate(0.0, rate)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("rate", [60.0, -140.0, 300.0, 9e5])
+def test_a_wrong_range_rate_changes_nothing(estimator, rate):
+    """60 and -140 m/s could be, and are gated; more than 150 m/s is no speed on a road."""
+    right, wrong = (Tracker(TrackerSettings(estimator=estimator), RADAR) for _ in range(2))
+    for k in range(20):
+        good, bad = with_rate(0.1 * k, 10.0), with_rate(0.1 * k, rate if k in (10, 11) else 10.0)
+        without = with_rate(0.1 * k, np.nan if k in (10, 11) else 10.0)
+        assert len(good) == 1
+        expected, got = right.step(without), wrong.step(bad)
+    assert got.boxes.velocity == pytest.approx(expected.boxes.velocity, abs=1e-9)
+    assert got.boxes.velocity[0] == pytest.approx([10.0, 0.0], abs=0.5)
+
+
+def test_how_fast_things_are_can_be_set():
+    for limit, expected in ((150.0, 0.0), (400.0, 300.0)):
+        sensors = {"radar": Sensor(max_speed=limit)}
+        tracks = Tracker(TrackerSettings(edges=()), sensors).step(with_rate(0.0, np.nan, velocity=(300.0, 0.0)))
+        assert tracks.boxes.velocity[0, 0] == pytest.approx(expected)
+    with pytest.raises(InputError, match="max_speed: expected a number > 0"):
+        Sensor(max_speed=-1.0)
+
+
+# what is no frame, and copies
+
+
+@pytest.mark.parametrize("make", [Tracker, GreedyTracker])
+@pytest.mark.parametrize("nothing", [None, [], [Detection("car", (0, 0, 0))], np.zeros((3, 2))], ids=type)
+def test_what_is_no_frame_is_refused(make, nothing):
+    with pytest.raises(InputError, match=f"frame: expected a Frame, got {type(nothing).__name__}"):
+        make().step(nothing)
+
+
+def test_a_list_of_detections_may_be_any_iterable():
+    assert len(Detections.of(Detection("car", (k, 0, 0)) for k in range(3))) == 3
+
+
+@pytest.mark.parametrize("timestamp", [10**400, 10**5000, "a", None, [1.0]], ids=lambda t: type(t).__name__)
+def test_times_that_are_none_are_refused(timestamp):
+    for ask in (lambda: Frame(timestamp, "lidar", Detections.empty()), lambda: Tracker().tracks(timestamp)):
+        with pytest.raises(InputError, match="timestamp: expected a finite number of seconds"):
+            ask()
+
+
+@pytest.mark.parametrize("rows", [np.zeros((3, 2)), [(0, 0, 0)], [None], 7, None], ids=repr)
+def test_what_are_no_detections_is_refused(rows):
+    with pytest.raises(InputError, match="detections: expected a list of Detection"):
+        Detections.of(rows)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, lambda t: pickle.loads(pickle.dumps(t))])
+@pytest.mark.parametrize("estimator", [*ESTIMATORS, "centerpoint"])
+def test_trackers_can_be_copied_and_pickled(estimator, copied):
+    classes = {"default": ClassSettings(max_coasting=2.0)}
+    tracker = GreedyTracker() if estimator == "centerpoint" else Tracker(TrackerSettings(classes, estimator=estimator))
+    frames = traffic(20)
+    run(tracker, frames[:10])
+    tracker.step(frame(1e6, CARS(0.9)))
+    twin = copied(tracker)
+    assert twin.time_verdict == tracker.time_verdict == "unconfirmed"
+    expected = run(tracker, frames[10:])
+    for a, b in zip(expected, run(twin, frames[10:]), strict=True):
+        assert b.id.tolist() == a.id.tolist()
+        assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-9)
