@@ -1,32 +1,46 @@
-"""Drawings as a file of MCAP (https://mcap.dev) for Foxglove, and for whatever else reads its messages.
+"""Drawings as a file of MCAP (https://mcap.dev) for Foxglove, and for other readers of its messages.
 
-Messages are JSON after the schemas in `foxglove_schemas`; the path of a drawing is the topic of its messages, its frame
-the message's. Chunks are compressed with zstd. Times are nanoseconds from the scene's start.
+A pose is a `FrameTransforms`, a cloud a `PointCloud` of float32 x, y, z, every other shape a `SceneUpdate` that first
+deletes all its layer showed before: each message is complete, so that playback may begin anywhere. Boxes with facts are
+an entity each, named by the first fact and with all of them as metadata; other shapes are one entity together.
+
+The path of a drawing is the topic of its messages, its frame the message's. Messages are protobuf with the fields that
+Foxglove publishes (https://docs.foxglove.dev/docs/sdk/schemas); times are nanoseconds from the scene's start.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from types import ModuleType
+from typing import Any, assert_never
+
+import numpy as np
 
 from data_tools.files.atomic_files import atomic_file
-from pipelines.view.drawing import Drawing
-from pipelines.view.foxglove_messages import foxglove_message, nanoseconds
-from pipelines.view.foxglove_schemas import SCHEMAS
+from pipelines.view.drawing import Arrows, Cubes, Drawing, Ellipses, Lines, Marks, Points, Pose
 from saga_fg.errors import MissingExtraError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import rotation_quaternion, yaw_quaternion
 
-LIBRARY = "saga-fg"
+FLAT = 0.04  # height of an ellipse, m
+OPACITY = 0.4  # of solids
+TEXT_SIZE, TEXT_GAP = 12.0, 0.3  # pixels; m above the named thing
+UP = np.array([0.0, 0.0, 1.0])
+HEAD = 0.25  # of an arrow's length
+
+Fields = dict[str, Any]
+"""Fields of a message by name; those left out have protobuf's defaults."""
+IDENTITY: Fields = {"position": {}, "orientation": {"w": 1.0}}
 
 
-def load_mcap() -> ModuleType:
-    """The module mcap.writer. Raises `MissingExtraError` where the package is not installed."""
+def load_mcap() -> Any:
+    """The class that writes messages. Raises `MissingExtraError` where its packages are not installed."""
     try:
-        import mcap.writer
+        import foxglove_schemas_protobuf  # noqa: F401
+        from mcap_protobuf.writer import Writer
     except ImportError as error:
         raise MissingExtraError('files for Foxglove need mcap; pip install "saga-fg[mcap]"') from error
-    return mcap.writer
+    return Writer
 
 
 def write_mcap(path: Path, drawings: Iterable[Drawing]) -> None:
@@ -34,23 +48,128 @@ def write_mcap(path: Path, drawings: Iterable[Drawing]) -> None:
 
     Raises `InputError` where the file cannot be written, `MissingExtraError` without mcap.
     """
-    package = load_mcap()
     with atomic_file(path) as file:
-        writer = package.Writer(file, compression=package.CompressionType.ZSTD)
-        writer.start(library=LIBRARY)
-        schemas: dict[str, int] = {}
-        channels: dict[str, int] = {}
+        writer = load_mcap()(file)
         for each in drawings:
-            name, message = foxglove_message(each)
-            if name not in schemas:
-                schemas[name] = writer.register_schema(name, "jsonschema", _json(SCHEMAS[name]))
-            topic = f"/{each.path}"
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "json", schemas[name])
-            time = nanoseconds(each)
-            writer.add_message(channels[topic], log_time=time, publish_time=time, data=_json(message))
+            time = _nanoseconds(each)
+            writer.write_message(f"/{each.path}", _message(each), log_time=time, publish_time=time)
         writer.finish()
 
 
-def _json(content: object) -> bytes:
-    return json.dumps(content, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode("utf-8")
+def _nanoseconds(drawing: Drawing) -> int:
+    """Time to the microsecond (seconds since 1970 are no finer); 0 for static drawings."""
+    return 1000 * round(1e6 * (drawing.time or 0.0))
+
+
+def _message(drawing: Drawing) -> Any:
+    """A `FrameTransforms`, `PointCloud` or `SceneUpdate`."""
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+    from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    shape = drawing.shape
+    seconds, nanoseconds = divmod(_nanoseconds(drawing), 10**9)
+    fields: Fields
+    stamp: Fields = {"timestamp": {"seconds": seconds, "nanos": nanoseconds}}
+    if isinstance(shape, Pose):
+        matrix = shape.parent_T_child[None]
+        (translation,), (rotation,) = _xyz(matrix[:, :3, 3]), _quaternions(rotation_quaternion(matrix[:, :3, :3]), 9)
+        frames = {"parent_frame_id": drawing.frame, "child_frame_id": drawing.path}
+        fields = {"transforms": [{**stamp, **frames, "translation": translation, "rotation": rotation}]}
+        return FrameTransforms(**fields)
+    if isinstance(shape, Points):
+        xyz = [{"name": name, "offset": 4 * k, "type": PackedElementField.FLOAT32} for k, name in enumerate("xyz")]
+        points = shape.points.astype("<f4").tobytes()
+        fields = {"frame_id": drawing.frame, "pose": IDENTITY, "point_stride": 12, "fields": xyz, "data": points}
+        return PointCloud(**stamp, **fields)
+    common = {**stamp, "frame_id": drawing.frame, "frame_locked": drawing.time is None}
+    fields = {
+        "deletions": [{**stamp, "type": SceneEntityDeletion.ALL}],
+        "entities": [{**common, **entity} for entity in _entities(drawing.name, shape)],
+    }
+    return SceneUpdate(**fields)
+
+
+def _entities(layer: str, shape: Cubes | Lines | Arrows | Ellipses | Marks) -> list[Fields]:
+    """Identifiers, metadata and primitives of a shape's entities."""
+    match shape:
+        case Cubes():
+            cubes = _solids(shape.centre, shape.size, shape.yaw, shape.colour)
+            if not shape.facts:
+                return [{"id": layer, "cubes": cubes}]
+            texts = _texts(shape.centre + UP * (shape.size / 2 + TEXT_GAP), shape.labels, shape.colour)
+            return [
+                {
+                    "id": row[0],
+                    "metadata": [{"key": key, "value": value} for key, value in zip(shape.facts, row, strict=True)],
+                    "cubes": [cube],
+                    "texts": [text],
+                }
+                for row, cube, text in zip(zip(*shape.facts.values(), strict=True), cubes, texts, strict=True)
+            ]
+        case Ellipses():
+            size = np.column_stack([2 * shape.half, np.full(len(shape.half), FLAT)])
+            return [{"id": layer, "spheres": _solids(shape.centre, size, shape.yaw, shape.colour)}]
+        case Marks():
+            places = len(shape.place)
+            size, yaw = np.full((places, 3), 2 * shape.radius), np.zeros(places)
+            texts = _texts(shape.place + TEXT_GAP * UP, shape.names, shape.colour)
+            return [{"id": layer, "spheres": _solids(shape.place, size, yaw, shape.colour), "texts": texts}]
+        case Lines():
+            return [{"id": layer, "lines": _lines(shape)}]
+        case Arrows():
+            return [{"id": layer, "arrows": _arrows(shape)}]
+    assert_never(shape)
+
+
+def _solids(centre: FloatArray, size: FloatArray, yaw: FloatArray, colour: IntArray) -> list[Fields]:
+    poses, sizes, colours = _poses(centre, yaw), _xyz(size), _colours(colour, len(centre), OPACITY)
+    return [{"pose": p, "size": s, "color": c} for p, s, c in zip(poses, sizes, colours, strict=True)]
+
+
+def _texts(place: FloatArray, texts: Sequence[str], colour: IntArray) -> list[Fields]:
+    poses, colours = _poses(place, np.zeros(len(place))), _colours(colour, len(place))
+    look = {"billboard": True, "font_size": TEXT_SIZE, "scale_invariant": True}
+    return [{"pose": p, **look, "color": c, "text": t} for p, c, t in zip(poses, colours, texts, strict=True)]
+
+
+def _lines(shape: Lines) -> list[Fields]:
+    """Line strips, the first type of line and so the default."""
+    count = len(shape.strips)
+    thickness = np.broadcast_to((2 * shape.radius).round(3), (count,)).tolist()
+    return [
+        {"pose": IDENTITY, "thickness": thick, "points": _xyz(strip), "color": colour}
+        for strip, thick, colour in zip(shape.strips, thickness, _colours(shape.colour, count), strict=True)
+    ]
+
+
+def _arrows(shape: Arrows) -> list[Fields]:
+    length = np.hypot(*shape.vector.T)
+    poses = _poses(shape.tail, np.arctan2(shape.vector[:, 1], shape.vector[:, 0]))
+    diameters = {"shaft_diameter": 2 * shape.radius, "head_diameter": 4 * shape.radius}
+    return [
+        {"pose": pose, "shaft_length": (1 - HEAD) * long, "head_length": HEAD * long, **diameters, "color": colour}
+        for pose, long, colour in zip(poses, length.round(3).tolist(), _colours(shape.colour, len(length)), strict=True)
+    ]
+
+
+def _poses(place: FloatArray, yaw: FloatArray) -> list[Fields]:
+    turns = _quaternions(yaw_quaternion(yaw), 5)
+    return [{"position": p, "orientation": q} for p, q in zip(_xyz(place), turns, strict=True)]
+
+
+def _xyz(rows: FloatArray) -> list[Fields]:
+    """Vectors (N, 3), to the millimetre."""
+    return [{"x": x, "y": y, "z": z} for x, y, z in rows.round(3).tolist()]
+
+
+def _quaternions(rows: FloatArray, digits: int) -> list[Fields]:
+    """Quaternions (N, 4), (w, x, y, z)."""
+    return [{"x": x, "y": y, "z": z, "w": w} for w, x, y, z in rows.round(digits).tolist()]
+
+
+def _colours(colour: IntArray, count: int, opacity: float = 1.0) -> list[Fields]:
+    rows = np.broadcast_to((colour / 255).round(3), (count, 3)).tolist()
+    return [{"r": r, "g": g, "b": b, "a": opacity} for r, g, b in rows]

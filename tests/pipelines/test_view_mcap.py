@@ -1,9 +1,7 @@
-"""Views for Foxglove: what is in the file, read back by mcap's own reader and held against its own schemas."""
+"""Views for Foxglove: the content of the file, read back by mcap's own reader with the schemas in the file."""
 
 from __future__ import annotations
 
-import base64
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
 from data_tools.lidar import Scan
@@ -22,7 +19,6 @@ from pipelines.config import load_config
 from pipelines.report import ReportScene, scene_of_run
 from pipelines.tracking import track_scene
 from pipelines.view import Drawing, SceneView, draw_scene, in_order, write_view
-from pipelines.view.foxglove_schemas import SCHEMAS
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
@@ -60,57 +56,45 @@ class Read:
     content: Any
 
 
-def read_back(path: Path) -> tuple[dict[str, list[Read]], dict[str, Any]]:
-    """Messages by topic, as they stand in the file; schemas by name."""
+def read_back(path: Path) -> dict[str, list[Read]]:
+    """Messages by topic, decoded with the schemas that the file brings."""
     reader = pytest.importorskip("mcap.reader", reason="mcap is not installed (extra [mcap])")
+    decoder = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
     topics: dict[str, list[Read]] = {}
-    schemas: dict[str, Any] = {}
     with path.open("rb") as file:
-        for schema, channel, message in reader.make_reader(file, validate_crcs=True).iter_messages(
-            log_time_order=False
-        ):
-            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+        opened = reader.make_reader(file, validate_crcs=True, decoder_factories=[decoder.DecoderFactory()])
+        for schema, channel, message, content in opened.iter_decoded_messages(log_time_order=False):
+            assert (schema.encoding, channel.message_encoding) == ("protobuf", "protobuf")
             assert message.publish_time == message.log_time
-            schemas[schema.name] = json.loads(schema.data)
-            found = Read(schema.name, message.log_time, json.loads(message.data))
-            topics.setdefault(channel.topic, []).append(found)
-    return topics, schemas
+            topics.setdefault(channel.topic, []).append(Read(schema.name, message.log_time, content))
+    return topics
 
 
-def strict(schema: Any) -> Any:
-    """The schema with all that it names required, and nothing besides allowed."""
-    if isinstance(schema, list):
-        return [strict(each) for each in schema]
-    if not isinstance(schema, dict):
-        return schema
-    inner = {key: strict(value) for key, value in schema.items()}
-    if schema.get("type") == "object":
-        inner |= {"required": list(schema["properties"]), "additionalProperties": False}
-    return inner
+def seconds(stamp: Any) -> int:
+    return int(stamp.seconds) * 10**9 + int(stamp.nanos)
 
 
-def seconds(stamp: dict[str, int]) -> int:
-    return stamp["sec"] * 10**9 + stamp["nsec"]
+def xyz(vector: Any) -> list[float]:
+    return [vector.x, vector.y, vector.z]
 
 
-def test_every_message_says_all_that_its_schema_names_and_times_ascend(tmp_path: Path, shown: ReportScene) -> None:
+def test_every_message_is_complete_and_times_ascend(tmp_path: Path, shown: ReportScene) -> None:
     start = float(shown.scene.timestamps[0])
     view = SceneView(shown, TwoScans(np.array([start - 0.1, start + 0.6])))
     write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(view))
-    topics, schemas = read_back(tmp_path / "a.mcap")
-    assert schemas == SCHEMAS
-    checks = {name: Draft202012Validator(strict(schema)) for name, schema in schemas.items()}
+    topics = read_back(tmp_path / "a.mcap")
     for topic, messages in topics.items():
         assert len({each.schema for each in messages}) == 1, topic
         times = [each.time for each in messages]
         assert times == sorted(set(times)), topic
         for each in messages:
-            checks[each.schema].validate(each.content)
             if each.schema == "foxglove.SceneUpdate":
-                (deletion,) = each.content["deletions"]
-                assert deletion["type"] == 1
-                assert {seconds(entity["timestamp"]) for entity in each.content["entities"]} <= {each.time}
-                assert len({entity["id"] for entity in each.content["entities"]}) == len(each.content["entities"])
+                (deletion,) = each.content.deletions
+                assert deletion.type == deletion.ALL
+                assert {seconds(entity.timestamp) for entity in each.content.entities} <= {each.time}
+                assert len({entity.id for entity in each.content.entities}) == len(each.content.entities)
+    schemas = {each.schema for messages in topics.values() for each in messages}
+    assert schemas == {"foxglove.SceneUpdate", "foxglove.FrameTransforms", "foxglove.PointCloud"}
     reader = pytest.importorskip("mcap.reader")
     with (tmp_path / "a.mcap").open("rb") as file:
         opened = reader.make_reader(file)
@@ -123,83 +107,85 @@ def test_every_message_says_all_that_its_schema_names_and_times_ascend(tmp_path:
 def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path: Path, shown: ReportScene) -> None:
     scene, table = shown.scene, shown.tracks["saga"]
     write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown)))
-    topics, _ = read_back(tmp_path / "a.mcap")
+    topics = read_back(tmp_path / "a.mcap")
     boxes = topics[f"{ROOT}/saga/boxes"]
-    assert [len(each.content["entities"]) for each in boxes] == np.bincount(table.moment, minlength=len(scene)).tolist()
+    assert [len(each.content.entities) for each in boxes] == np.bincount(table.moment, minlength=len(scene)).tolist()
     np.testing.assert_allclose([each.time / 1e9 for each in boxes], scene.timestamps - scene.timestamps[0], atol=1e-6)
     origin, k = scene.world_T_ego[0, :3, 3], len(scene) - 1
     rows = np.flatnonzero(table.moment == k)
-    entities = boxes[k].content["entities"]
+    entities = boxes[k].content.entities
     assert len(entities) > 5
-    assert [entity["id"] for entity in entities] == table.id[rows].tolist()
+    assert [entity.id for entity in entities] == table.id[rows].tolist()
     for entity, row in zip(entities, rows.tolist(), strict=True):
-        assert entity["frame_id"] == "scene-0001"
-        (cube,), (text,) = entity["cubes"], entity["texts"]
-        place, turn = cube["pose"]["position"], cube["pose"]["orientation"]
-        np.testing.assert_allclose(list(place.values()), table.boxes.position[row] - origin, atol=1e-3)
-        np.testing.assert_allclose(list(cube["size"].values()), table.boxes.size[row], atol=1e-3)
-        yaw = 2 * np.arctan2(turn["z"], turn["w"])
+        assert entity.frame_id == "scene-0001"
+        (cube,), (text,) = entity.cubes, entity.texts
+        place, turn = cube.pose.position, cube.pose.orientation
+        np.testing.assert_allclose(xyz(place), table.boxes.position[row] - origin, atol=1e-3)
+        np.testing.assert_allclose(xyz(cube.size), table.boxes.size[row], atol=1e-3)
+        yaw = 2 * np.arctan2(turn.z, turn.w)
         assert np.cos(yaw - table.boxes.yaw[row]) == pytest.approx(1.0, abs=1e-6)
-        assert {each["key"]: each["value"] for each in entity["metadata"]} == {
+        assert {each.key: each.value for each in entity.metadata} == {
             "id": table.id[row],
             "class": table.boxes.label[row],
             "score": f"{table.score[row]:.2f}",
         }
-        assert text["text"].startswith(f"{table.id[row]} ")
+        assert text.text.startswith(f"{table.id[row]} ")
 
     def layer(name: str, kind: str) -> list[Any]:
-        (entity,) = topics[f"{ROOT}/saga/{name}"][k].content["entities"]
-        primitives: list[Any] = entity[kind]
-        return primitives
+        (entity,) = topics[f"{ROOT}/saga/{name}"][k].content.entities
+        return list(getattr(entity, kind))
 
-    colours = [entity["cubes"][0]["color"] | {"a": 1.0} for entity in entities]
-    assert len({json.dumps(colour) for colour in colours}) == len(colours)
+    def rgb(primitive: Any) -> tuple[float, float, float]:
+        return primitive.color.r, primitive.color.g, primitive.color.b
+
+    colours = [rgb(entity.cubes[0]) for entity in entities]
+    assert len(set(colours)) == len(colours)
     velocity = table.boxes.velocity[rows]
     arrows = layer("velocities", "arrows")
-    lengths = [arrow["shaft_length"] + arrow["head_length"] for arrow in arrows]
+    lengths = [arrow.shaft_length + arrow.head_length for arrow in arrows]
     np.testing.assert_allclose(lengths, np.hypot(*velocity.T), atol=2e-3)
-    assert [arrow["color"] for arrow in arrows] == colours
+    assert [rgb(arrow) for arrow in arrows] == colours
     trails = layer("trails", "lines")
-    ends = [list(trail["points"][-1].values()) for trail in trails]
+    ends = [xyz(trail.points[-1]) for trail in trails]
     np.testing.assert_allclose(ends, table.boxes.position[rows] - origin, atol=1e-3)
-    spread = [sphere["size"]["x"] * sphere["size"]["y"] for sphere in layer("ellipses", "spheres")]
+    spread = [sphere.size.x * sphere.size.y for sphere in layer("ellipses", "spheres")]
     determinant = np.linalg.det(table.position_covariance[rows])
     np.testing.assert_allclose(spread, 4 * 2 * np.log(10) * np.sqrt(determinant), rtol=0.02)
-    assert all(len(line["points"]) == 2 for line in layer("edges", "lines"))
+    assert all(len(line.points) == 2 for line in layer("edges", "lines"))
     assert scene.ground_truth is not None
-    seen, hidden = (topics[f"{ROOT}/truth/{name}"][k].content["entities"] for name in ("seen", "hidden"))
+    seen, hidden = (topics[f"{ROOT}/truth/{name}"][k].content.entities for name in ("seen", "hidden"))
     truth = scene.ground_truth[k]
-    assert [entity["id"] for entity in seen] == truth.id[truth.visible].tolist()
-    assert [entity["id"] for entity in hidden] == truth.id[~truth.visible].tolist()
-    (transform,) = topics[f"{ROOT}/ego"][k].content["transforms"]
-    assert (transform["parent_frame_id"], transform["child_frame_id"]) == ("scene-0001", "scene-0001/ego")
-    np.testing.assert_allclose(list(transform["translation"].values()), scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
+    assert [entity.id for entity in seen] == truth.id[truth.visible].tolist()
+    assert [entity.id for entity in hidden] == truth.id[~truth.visible].tolist()
+    (transform,) = topics[f"{ROOT}/ego"][k].content.transforms
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("scene-0001", "scene-0001/ego")
+    np.testing.assert_allclose(xyz(transform.translation), scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
 
 
 def test_scans_are_clouds_in_the_frame_of_their_sensor(tmp_path: Path, shown: ReportScene) -> None:
     start = float(shown.scene.timestamps[0])
     scans = TwoScans(np.array([start - 0.1, start + 0.6]))
     write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown, scans)))
-    topics, _ = read_back(tmp_path / "a.mcap")
+    topics = read_back(tmp_path / "a.mcap")
     first, second = topics[f"{ROOT}/ego/lidar/points"]
     assert (first.time, second.time) == (0, 700_000_000)  # of what is earliest
     assert topics[f"{ROOT}/saga/boxes"][0].time == 100_000_000
-    points = np.frombuffer(base64.b64decode(second.content["data"]), "<f4").reshape(-1, 3)
+    points = np.frombuffer(second.content.data, "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points, [[1, 2, 3], [4, 5, 7]])  # thinned
-    assert second.content["point_stride"] == 12
-    assert [(each["name"], each["offset"], each["type"]) for each in second.content["fields"]] == [
+    assert second.content.point_stride == 12
+    assert [(each.name, each.offset, each.type) for each in second.content.fields] == [
         ("x", 0, 7),
         ("y", 4, 7),
         ("z", 8, 7),
     ]
-    (pose,) = topics[f"{ROOT}/ego/lidar"][0].content["transforms"]
-    assert pose["child_frame_id"] == first.content["frame_id"] == "scene-0001/ego/lidar"
-    np.testing.assert_allclose(list(pose["translation"].values()), [1, 0, 2])
-    np.testing.assert_allclose(list(pose["rotation"].values()), [0, 0, np.sin(0.25), np.cos(0.25)])
+    (pose,) = topics[f"{ROOT}/ego/lidar"][0].content.transforms
+    assert pose.child_frame_id == first.content.frame_id == "scene-0001/ego/lidar"
+    np.testing.assert_allclose(xyz(pose.translation), [1, 0, 2])
+    np.testing.assert_allclose([*xyz(pose.rotation), pose.rotation.w], [0, 0, np.sin(0.25), np.cos(0.25)])
 
 
 def test_the_command_writes_the_file_that_the_suffix_names(tmp_path: Path) -> None:
-    pytest.importorskip("mcap", reason="mcap is not installed (extra [mcap])")
+    pytest.importorskip("mcap_protobuf", reason="mcap is not installed (extra [mcap])")
     slam = tmp_path / "slam"
     slam.mkdir()
     poses = np.tile(np.eye(4), (2, 1, 1))
@@ -210,11 +196,9 @@ def test_the_command_writes_the_file_that_the_suffix_names(tmp_path: Path) -> No
     done = CliRunner().invoke(app, ["view", "slam", str(slam), "--save", str(file)])
     assert done.exit_code == 0, done.output
     assert "open it in Foxglove" in done.stdout
-    topics, schemas = read_back(file)
-    for each in (message for messages in topics.values() for message in messages):
-        Draft202012Validator(strict(schemas[each.schema])).validate(each.content)
-    ((entity,),) = (each.content["entities"] for each in topics["/slam/names"])
-    assert [text["text"] for text in entity["texts"]] == ["pole 2"]
+    topics = read_back(file)
+    ((entity,),) = (each.content.entities for each in topics["/slam/names"])
+    assert [text.text for text in entity.texts] == ["pole 2"]
     assert [each.time for each in topics["/slam/pose"]] == [0, 100_000_000]
 
 
@@ -227,8 +211,7 @@ def test_other_suffixes_are_refused(tmp_path: Path) -> None:
 
 
 def test_without_mcap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    monkeypatch.setitem(sys.modules, "mcap_protobuf.writer", None)
     done = CliRunner().invoke(app, ["view", "file", "tracks.csv", "--save", str(tmp_path / "t.mcap")])
     assert done.exit_code == 2
     assert 'pip install "saga-fg[mcap]"' in done.stderr
@@ -236,7 +219,7 @@ def test_without_mcap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_drawing_that_fails_leaves_no_file(tmp_path: Path, shown: ReportScene) -> None:
-    pytest.importorskip("mcap", reason="mcap is not installed (extra [mcap])")
+    pytest.importorskip("mcap_protobuf", reason="mcap is not installed (extra [mcap])")
 
     def broken() -> Any:
         yield next(draw_scene(SceneView(shown)))
