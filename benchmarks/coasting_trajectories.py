@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.block_bootstrap import Average, relative_change_of_errors
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval
-from pipelines.figures import FigureTable, cell
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import (

@@ -29,12 +29,12 @@ from benchmarks.affected import affected
 from benchmarks.foreseeing import Foreseeing
 from benchmarks.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, without_parts
 from benchmarks.predictions import FOLLOWED, Asked, in_view, moving, prediction_errors
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, paired_bootstrap, ratio_of_sums
 from data_tools.simulator.scenarios import ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_in
 from data_tools.simulator.world import build_world
 from pipelines.config import TrackConfig, load_config
-from pipelines.figures import FigureTable, cell
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.numerics.arrays import FloatArray

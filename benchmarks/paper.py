@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from data_tools.figures import FigureTable, cell, count
 from pipelines.bench.recordings import NuScenesSet
 from pipelines.bench.variants import METHODS
 from pipelines.config import Method, TrackConfig
-from pipelines.figures import FigureTable, cell, count
 from pipelines.tracking import Progress, track_scene
 
 FUSION = "fusion"

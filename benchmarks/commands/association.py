@@ -27,8 +27,8 @@ def association(
       python -m benchmarks association --objects 200 --seconds 4 --json figures.json
     """
     from benchmarks.association import bench_association
+    from data_tools.figures import FigureTable, cell, write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import FigureTable, cell, write_figures
 
     sizes = counts("--objects", objects)
     if json_file is not None:

@@ -54,9 +54,9 @@ def coasting(
         coasting_figures,
         coasting_table,
     )
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
     from pipelines.learning import TrajectorySource
     from saga_fg.errors import InputError
 

@@ -35,11 +35,11 @@ def fusion(
       python -m benchmarks fusion --scenes 4 --method kf --json figures.json
     """
     from benchmarks.fusion import fusion as run
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from data_tools.simulator import SimulatorSettings
     from pipelines.config import load_config
     from pipelines.configuration import load_settings
-    from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)

@@ -38,10 +38,10 @@ def heterogeneous(
     """
     from benchmarks.heterogeneous import heterogeneous as run
     from benchmarks.heterogeneous import tables
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable, write_text
     from data_tools.simulator.scenarios import SCENARIOS, ScenarioName
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 
     chosen = names("--kinds", kinds)

@@ -40,8 +40,8 @@ def metrics(
       python -m benchmarks metrics --result tracks.json --dataroot data/nuscenes --split mini_train
     """
     from benchmarks.devkit import PYTHON_VARIABLE, parity, tracked_simulation
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import write_figures
 
     python = os.environ.get(PYTHON_VARIABLE)
     if not python:

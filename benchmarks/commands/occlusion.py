@@ -34,9 +34,9 @@ def occlusion(
       python -m benchmarks occlusion --scenes 20 --seed 100 --json figures.json
     """
     from benchmarks.occlusion import occlusion as run
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 
     fit_seeds, seeds = range(fit_seed, fit_seed + fit_scenes), range(seed, seed + scenes)

@@ -32,9 +32,9 @@ def paper(
           --camera simulated/detections/camera.json --lidar simulated/detections/lidar.json
     """
     from benchmarks.paper import PUBLISHED, paper_table, shown
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)

@@ -35,8 +35,8 @@ def reading(
     """
     from benchmarks.large_tables import TableSize, write_large_tables
     from benchmarks.reading import bench_reading
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import write_figures
 
     size = TableSize(scenes=scenes, detections=detections)
     if json_file is not None:

@@ -36,8 +36,8 @@ def scaling(
       python -m benchmarks scaling --objects 5,10,15 --frames 60 --json figures.json --output scaling.png
     """
     from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
+    from data_tools.figures import FigureTable, cell, write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import FigureTable, cell, write_figures
 
     sizes = counts("--objects", objects, least=2)  # one has no neighbours
     for path in (json_file, output):

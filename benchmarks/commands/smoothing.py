@@ -30,8 +30,8 @@ def smoothing(
     """
     from benchmarks.drawn_recordings import drawn_fit
     from benchmarks.hidden_objects import hidden_objects
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import write_figures
     from pipelines.smoothing import load_smooth_config
 
     settings = load_smooth_config("simulated", config)

@@ -46,8 +46,8 @@ def streaming(
       python -m benchmarks streaming --file --seconds 120 --compared 60
     """
     from benchmarks.streaming import StreamingBenchSettings, bench_streaming
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import write_figures
 
     settings = StreamingBenchSettings(objects, seconds, rate, compared=compared, seed=seed)
     if json_file is not None:
@@ -73,7 +73,7 @@ def streaming(
 
 def _file(settings: StreamingBenchSettings, json_file: Path | None) -> None:
     from benchmarks.streamed_files import bench_files
-    from pipelines.figures import write_figures
+    from data_tools.figures import write_figures
 
     with progress_bar() as progress:
         result = bench_files(settings, progress)

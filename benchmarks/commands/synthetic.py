@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from data_tools.figures import FigureTable, cell
 from pipelines.cli.options import Verbose, names
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, show_tables
-from pipelines.figures import FigureTable, cell
 
 if TYPE_CHECKING:
     from benchmarks.synthetic import Cell, SyntheticResult
@@ -35,8 +35,8 @@ def synthetic(
       python -m benchmarks synthetic --seeds 2 --cells 'base,no coupling' --json figures.json
     """
     from benchmarks.synthetic import CELLS, synthetic
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 
     chosen = dict(CELLS) if cells is None else {}

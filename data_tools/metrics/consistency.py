@@ -19,8 +19,9 @@ from saga_fg.numerics.chi_square import chi_square_quantile
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """NEES (N,) of errors (N, d) under covariances (N, d, d); NaN where a covariance is not positive definite."""
-    eigenvalues = np.linalg.eigvalsh(covariance)
+    """NEES (N,) of errors (N, d) under covariances (N, d, d); NaN where one has NaN or is not positive definite."""
+    known = np.isfinite(covariance).all(axis=(1, 2), keepdims=True)
+    eigenvalues = np.linalg.eigvalsh(np.where(known, covariance, 0.0))
     proper = eigenvalues[:, 0] > 1e-12 * np.maximum(eigenvalues[:, -1], np.finfo(np.float64).tiny)
     result = np.full(len(error), np.nan)
     solved = np.linalg.solve(covariance[proper], error[proper][..., None])[..., 0]

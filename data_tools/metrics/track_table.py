@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -73,3 +74,8 @@ class TrackTable(Columns):
         score = np.concatenate([np.empty(0), *(found.score for found in moments)])
         covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in moments)])
         return cls(moment, numbers.astype(np.str_), boxes, score, covariance)
+
+    def by_moment(self, count: int) -> list[Self]:
+        """The boxes of each of the scene's `count` moments."""
+        bounds = np.searchsorted(self.moment, np.arange(count + 1)).tolist()
+        return [self.select(slice(first, end)) for first, end in pairwise(bounds)]

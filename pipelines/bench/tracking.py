@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from data_tools.evaluation.hota import HotaRow
 from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.coasting import coasting_errors
 from pipelines.bench.drawn_differences import drawn_differences
@@ -18,7 +19,6 @@ from pipelines.bench.learned_folds import learn_by_folds
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
-from pipelines.evaluation.hota import HotaRow
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.model.learned_interactions import LearnedInteractions

@@ -52,9 +52,9 @@ def estimators(
       saga-fg bench estimators
       saga-fg bench estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
     """
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
-    from pipelines.figures import write_figures
 
     settings = EstimatorBenchSettings(
         counts("--sizes", sizes),

@@ -59,11 +59,11 @@ def joint(
       saga-fg bench joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
     from data_tools.datasets.kitti import KittiTracking
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from data_tools.simulator import simulate_scene
     from pipelines.bench.joint import bench_joint
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
     from pipelines.slam.simulated import street
     from saga_fg.errors import InputError
 
@@ -124,8 +124,8 @@ def joint(
 
 def _online(scenes: Sequence[Scene], config: TrackConfig, seeds: int, lag: float, json_file: Path | None) -> None:
     """Run and print the online comparison."""
+    from data_tools.figures import write_figures
     from pipelines.bench.joint_online import OnlineBench, bench_online
-    from pipelines.figures import write_figures
 
     def so_far(result: OnlineBench) -> None:
         row = result.rows[-1]

@@ -68,8 +68,8 @@ def service(
 
 
 def _endurance(settings: ServiceBenchSettings, json_file: Path | None) -> None:
+    from data_tools.figures import write_figures
     from pipelines.bench.service import bench_service
-    from pipelines.figures import write_figures
 
     with progress_bar() as progress:
         result = bench_service(settings, lambda done, total: progress("frames sent", done, total))
@@ -91,8 +91,8 @@ def _endurance(settings: ServiceBenchSettings, json_file: Path | None) -> None:
 
 
 def _hostile(settings: HostileBenchSettings, json_file: Path | None) -> None:
+    from data_tools.figures import write_figures
     from pipelines.bench.hostile_service import bench_hostile_service
-    from pipelines.figures import write_figures
 
     with progress_bar() as progress:
         result = bench_hostile_service(settings, lambda done, total: progress("valid frames", done, total))

@@ -39,9 +39,9 @@ def slam(
       saga-fg bench slam --dataroot data/kitti --sequence 0000
     """
     from data_tools.datasets.kitti import KittiScans
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from pipelines.bench.slam import bench_slam
-    from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)

@@ -52,12 +52,12 @@ def tracking(
       saga-fg bench tracking --data data --sets kitti --no-components --no-coasting
       saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components --no-coasting
     """
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.bench.recordings import SETS, recording_set
     from pipelines.bench.tracking import TrackingBenchSettings, bench_set
     from pipelines.bench.tracking_tables import figures, tables
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
 
     for path in (json_file, markdown):
         if path is not None:

@@ -16,8 +16,8 @@ from pipelines.cli.tracking_options import AssociationOption, EstimatorOption, L
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
+    from data_tools.figures import FigureTable
     from pipelines.evaluation import KittiEvaluation, NuScenesEvaluation
-    from pipelines.figures import FigureTable
     from saga_fg.numerics.arrays import FloatArray
 
 evaluate_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
@@ -230,8 +230,8 @@ def labels(
 
 def _report(run: Callable[[], AnyEvaluation], json_file: Path | None, doing: str = "scoring") -> AnyEvaluation:
     """Run an evaluation, show its tables, write its figures."""
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
-    from pipelines.figures import write_figures
 
     if json_file is not None:
         check_writable(json_file)
@@ -245,7 +245,7 @@ def _report(run: Callable[[], AnyEvaluation], json_file: Path | None, doing: str
 
 def _innovations_of(result: Path) -> dict[str, FloatArray]:
     """Those of the journal beside the result, by class."""
-    from pipelines.evaluation.innovations import journal_innovations
+    from data_tools.evaluation.innovations import journal_innovations
     from pipelines.explaining import journal_of
 
     return journal_innovations(journal_of(result))

@@ -42,7 +42,7 @@ def labelled_recordings(
     """
     import numpy as np
 
-    from data_tools.export.labels import read_label_table
+    from data_tools.datasets.label_table import read_label_table
 
     given = [value is not None for value in (nuscenes, kitti, file, seed)]
     if sum(given) != 1:

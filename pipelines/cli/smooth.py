@@ -59,8 +59,8 @@ def nuscenes(
       saga-fg smooth nuscenes --dataroot data/nuscenes --version v1.0-trainval --split train \\
           --detections lidar=megvii.json --workers 0 --output labels   # all cores
     """
+    from data_tools.datasets.label_table import merge_label_parts
     from data_tools.datasets.nuscenes import NuScenes, local_nuscenes, merge_tracking_results
-    from data_tools.export.labels import merge_label_parts
     from pipelines.scale_out import HeldScene, SmoothTask
     from pipelines.smoothing import smooth_dataset, write_nuscenes_run
 

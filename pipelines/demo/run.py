@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.figures import FigureTable
 from data_tools.files.atomic_files import atomic_directory
 from data_tools.plots import Panel, birds_eye_view, png, trails
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.comparison import COLUMNS, Comparison, compare, table_rows
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
-from pipelines.figures import FigureTable
 from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import IntArray

@@ -9,8 +9,8 @@ import numpy as np
 
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
 from data_tools.datasets.nuscenes import read_scored_scenes
+from data_tools.figures import FigureTable
 from pipelines.evaluation import evaluate_kitti, evaluate_nuscenes
-from pipelines.figures import FigureTable
 from pipelines.report.charts import Chart, accuracy_charts, latency_chart
 from pipelines.report.page import Report
 from pipelines.report.results import Results, kitti_results, nuscenes_results, table_results

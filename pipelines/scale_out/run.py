@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Protocol
 
 from data_tools.files.atomic_files import remove_leftovers
+from data_tools.datasets.parts import Part
 from pipelines.scale_out.folder import OutputFolder
-from pipelines.scale_out.job import Job, Outcome, SceneInput, SceneTask, sha256
+from pipelines.scale_out.job import Job, Outcome, SceneTask, sha256
 from pipelines.scale_out.manifest import Manifest, Record
 from saga_fg.errors import InputError
 
@@ -46,7 +47,7 @@ class Report:
 
 
 def run_scenes(
-    inputs: Iterable[SceneInput],
+    inputs: Iterable[Part],
     total: int,
     task: SceneTask,
     output: Path,
@@ -88,7 +89,7 @@ def run_scenes(
 
 
 def _jobs(
-    inputs: Iterable[SceneInput], task: SceneTask, manifest: Manifest, configuration: str, here: str
+    inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configuration: str, here: str
 ) -> Iterator[Job]:
     names: set[str] = set()
     for scene in inputs:

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar.ply import write_ply
 from data_tools.plots import paths_from_above, png
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
-from pipelines.figures import write_figures
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.landmark import Landmark
 

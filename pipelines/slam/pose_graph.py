@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.pose_graphs import write_g2o
-from pipelines.figures import write_figures
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
 

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.plots import paths_from_above, png
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import LightSettings, SurroundingSettings
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.figures import write_figures
 from pipelines.slam.joint import JointRun
 from pipelines.slam.landmark_results import records
 from pipelines.slam.object_tracks import tracks, tracks_csv

@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
+from data_tools.lidar.scan_sequence import ScanSequence
 from data_tools.metrics import TrackTable
 from pipelines.report.edges import Edges, edges_of_moments
 from pipelines.report.scenes import UNMEASURED, ReportScene, latest_detections
-from pipelines.scan_sequence import ScanSequence
 from pipelines.view.drawing import (
     VEHICLE,
     Arrows,

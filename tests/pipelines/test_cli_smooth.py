@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.export.labels import read_label_table
+from data_tools.datasets.label_table import read_label_table
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
 from pipelines.cli import app
 from pipelines.config import Family
