@@ -27,7 +27,6 @@ class StreamSettings:
         500, "detections of a frame at most; one frame of so many takes up to 0.2 s, for which all clients wait"
     )
     max_message: int = setting(4 * MB, "bytes of a message at most")
-    max_queue: int = setting(64, "messages of one client that wait at most; beyond, its reading pauses")
     max_failures: int = setting(3, "internal errors of the tracker in a row that start a fresh tracker")
     max_clients: int = setting(256, "connections at most, fewer where the process may not open as many files")
     max_unfinished: int = setting(
@@ -42,7 +41,7 @@ class StreamSettings:
 
     def __post_init__(self) -> None:
         require_between(self, 0.0, math.inf, "reorder")
-        require_positive(self, "max_held", "max_sensors", "max_seq_jump", "max_detections", "max_message", "max_queue")
+        require_positive(self, "max_held", "max_sensors", "max_seq_jump", "max_detections", "max_message")
         require_positive(
             self, "max_failures", "max_clients", "max_unfinished", "max_outbox", "client_timeout", "stop_timeout"
         )
