@@ -10,7 +10,6 @@ what detections correct, and who is out of sight may have braked since. So it te
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from saga_fg.model.interactions import NodeTable
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, setting, settings_group
+from saga_fg.settings import NonNegative, Settings, setting, settings_group
 
 
 def news_setting() -> Any:
@@ -32,16 +31,13 @@ def counted(news: News | None, rate: FloatArray, nodes: NodeTable, target: IntAr
 
 
 @dataclass(frozen=True)
-class News:
+class News(Settings):
     """Edges count by what they have to tell."""
 
-    spread: float = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
-    unseen_acceleration: float = setting(
+    spread: NonNegative = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
+    unseen_acceleration: NonNegative = setting(
         0.0, "how much less sure a velocity is for every second in which nobody has seen its object, m/s^2"
     )
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "spread", "unseen_acceleration")
 
     def shares(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E,) in [0, 1], of the edges source[k] -> target[k] (rows of `nodes`)."""
