@@ -41,7 +41,7 @@ class BoundedRow:
                   worst_error: the largest
     anees         mean of e^T P^-1 e / d against the truth, and anees_ratio to that of the exact filter
     likelihood_error  largest difference of a frame's log-likelihood, per measured value
-    nodes_per_cluster guests included
+    nodes_per_cluster with its halo
     """
 
     hops: int

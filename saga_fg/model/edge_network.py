@@ -19,7 +19,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.model.edge_features import EdgeFeatures, features_of
-from saga_fg.model.edge_information import News, counted, news_setting
+from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.edge_rules import VEHICLES, Pairs, close_pairs, strongest
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.numerics.arrays import of_classes
@@ -57,7 +57,7 @@ class EdgeNetwork(Settings):
     max_distance: Positive = setting(40.0, "no edge beyond this distance, m")
     max_degree: NonNegativeInt = setting(4, "edges kept per influenced node, strongest first")
     ahead_only: bool = setting(False, "whether only nodes ahead lead, along the heading of the one that is led")
-    news: News | None = news_setting()
+    news: EdgeInformation | None = information_setting()
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
     def __post_init__(self) -> None:
@@ -91,7 +91,7 @@ class EdgeNetwork(Settings):
         rate = edge_rates(weights, message, heard[target], self.max_rate)
         if self.ahead_only:
             rate = np.where(features.ahead > 0, rate, 0.0)
-        rate = counted(self.news, rate, nodes, target, source)
+        rate = weighted_by_gain(rate, self.news, nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
     def candidate_rates(self, weights: dict[str, Any], features: EdgeFeatures, able: Any, xp: Any = np) -> Any:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from saga_fg.errors import InputError
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
-from saga_fg.model.edge_information import News, counted, news_setting
+from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.node import distinct_types
@@ -69,7 +69,7 @@ class Neighbours(Settings):
     max_distance: NonNegative = setting(20.0, "no edge beyond this distance, m")
     min_speed: NonNegative = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
     max_degree: NonNegativeInt = setting(4, "edges kept per influenced node, strongest first")
-    news: News | None = news_setting()
+    news: EdgeInformation | None = information_setting()
     parked: bool = setting(
         False,
         "couples objects never seen moving whose velocity is known to within speed_scale, and no others; the "
@@ -96,7 +96,7 @@ class Neighbours(Settings):
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
-        rate = counted(self.news, self.strength(features_of(nodes, target, source)), nodes, target, source)
+        rate = weighted_by_gain(self.strength(features_of(nodes, target, source)), self.news, nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
 
@@ -112,7 +112,7 @@ class Following(Settings):
     gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m")
     lateral_scale: PositiveOrInf = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
     heading_scale: PositiveOrInf = setting(0.4, "sigma of the heading kernel, rad")
-    news: News | None = news_setting()
+    news: EdgeInformation | None = information_setting()
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
     apart: NonNegative = setting(
         0.0,
@@ -151,7 +151,7 @@ class Following(Settings):
         features = features_of(seen, target, source)
         near = self.apart * (nodes.length[target] + nodes.length[source]) / 2
         led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
-        rate = counted(self.news, np.where(led, self.strength(features), 0.0), nodes, target, source)
+        rate = weighted_by_gain(np.where(led, self.strength(features), 0.0), self.news, nodes, target, source)
         nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
 

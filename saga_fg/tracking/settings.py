@@ -14,7 +14,7 @@ from saga_fg.model.modes import Mixture
 from saga_fg.model.node import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
@@ -186,7 +186,7 @@ class TrackerSettings(Settings):
         default_factory=lambda: {DEFAULT: ClassSettings()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = (
+    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
         settings_group(lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects")
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
