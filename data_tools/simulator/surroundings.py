@@ -9,7 +9,7 @@ import numpy as np
 from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, sample_sizes
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import Road
-from data_tools.simulator.settings import Range, RoadworkSettings, SurroundingSettings
+from data_tools.simulator.settings import RoadworkSettings, SurroundingSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 
@@ -33,7 +33,7 @@ def sample_surroundings(
     road: Road,
     edges: tuple[float, float],
     hedge: float | None,
-    window: Range,
+    window: tuple[float, float],
     walkable: tuple[bool, bool],
     settings: SurroundingSettings,
     rng: np.random.Generator,
@@ -86,7 +86,9 @@ def sample_cones(lanes: Lanes, settings: RoadworkSettings, rng: np.random.Genera
     return Boxes(np.full(n, "traffic_cone"), position, size, np.zeros(n), np.zeros((n, 2)))
 
 
-def _intervals(window: Range, length: Range, gap: Range, rng: np.random.Generator) -> FloatArray:
+def _intervals(
+    window: tuple[float, float], length: tuple[float, float], gap: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
     """Random intervals over the window, separated by gaps: starts and ends (K, 2), m."""
     s, intervals = window[0] - rng.uniform(0, length[1]), []
     while s < window[1]:
@@ -106,7 +108,12 @@ def _row(road: Road, intervals: FloatArray, d: float, width: float, height: floa
 
 
 def _parked(
-    road: Road, d: float, side: float, window: Range, settings: SurroundingSettings, rng: np.random.Generator
+    road: Road,
+    d: float,
+    side: float,
+    window: tuple[float, float],
+    settings: SurroundingSettings,
+    rng: np.random.Generator,
 ) -> Boxes:
     place = np.arange(window[0], window[1], 6.5)
     place = place[rng.random(len(place)) < settings.parking_occupancy]

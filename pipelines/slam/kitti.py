@@ -32,7 +32,7 @@ from pipelines.figures import write_figures
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.object_tracks import tracks, tracks_csv
-from pipelines.slam.sightings import EDGE, GROUND, WALL
+from pipelines.slam.sightings import GROUND, LINE, WALL
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
@@ -125,7 +125,7 @@ def _write_landmarks(folder: Path, result: LidarSlam) -> None:
         z = np.arange(start - 1.5, start + POLE_HEIGHT, 0.1)
         drawn.append(np.column_stack([np.broadcast_to(pole, (len(z), 2)), z]))
         colours.append(np.full((len(z), 3), _COLOURS[True], dtype=np.uint8))
-    for a, b in _pieces(result, EDGE.name):
+    for a, b in _pieces(result, LINE.name):
         share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(b - a) / 0.2)))
         drawn.append(np.column_stack([a + share[:, None] * (b - a), np.full(len(share), start - 1.7)]))
         colours.append(np.full((len(share), 3), _EDGE_COLOUR, dtype=np.uint8))
@@ -139,18 +139,18 @@ def _write_landmarks(folder: Path, result: LidarSlam) -> None:
 
 
 def _lines(result: LidarSlam) -> dict[str, FloatArray]:
-    """Pieces of walls and lane edges, under their names."""
-    return {"walls": _pieces(result, WALL.name), "lane edges": _pieces(result, EDGE.name)}
+    """Pieces of walls and road lines, under their names."""
+    return {"walls": _pieces(result, WALL.name), "road lines": _pieces(result, LINE.name)}
 
 
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
-    """Places (P, 2) of all but planes and edges."""
-    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (EDGE, GROUND, WALL)]
+    """Places (P, 2) of all but planes and lines."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, GROUND, WALL)]
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 
 def _pieces(result: LidarSlam, kind: str) -> FloatArray:
-    """Ends (W, 2, 2), from above, of the pieces of walls or lane edges that were seen, one or several of each."""
+    """Ends (W, 2, 2), from above, of the pieces of walls or road lines that were seen, one or several of each."""
     ends = []
     for mark in result.landmarks:
         if mark.kind.name != kind:

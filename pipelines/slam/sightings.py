@@ -1,4 +1,4 @@
-"""What a scan shows of landmarks: walls and the ground as planes, masts and trunks as poles, curbs as lane edges."""
+"""What a scan shows of landmarks: walls and the ground as planes, masts and trunks as poles, curbs as road lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from data_tools.lidar import (
     straight_edges,
 )
 from saga_fg.model.landmarks.detector import LandmarkDetector
-from saga_fg.model.landmarks.line import LaneEdgeLandmark
+from saga_fg.model.landmarks.line import LineLandmark
 from saga_fg.model.landmarks.plane import PlaneLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
@@ -31,7 +31,7 @@ from saga_fg.types.landmark import Observation
 GROUND = PlaneLandmark(name="ground")
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
-EDGE = LaneEdgeLandmark()
+LINE = LineLandmark()
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,6 @@ def landmarks_seen(
         found.append(Seen(Observation(POLE, pole.foot, pole.covariance), extent))
     curbs = extract_curbs(points, ground.height, s.curb) if s.edges else np.empty((0, 3))
     for edge in straight_edges(curbs, s.edges, s.edge):
-        found.append(Seen(Observation(EDGE, edge.ends.ravel(), edge.covariance), edge.ends))
+        found.append(Seen(Observation(LINE, edge.ends.ravel(), edge.covariance), edge.ends))
     found += [Seen(other, np.zeros((2, 3))) for detector in detectors for other in detector.observations(points)]
     return found

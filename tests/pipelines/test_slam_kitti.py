@@ -17,7 +17,7 @@ from pipelines.cli import app
 from pipelines.slam.kitti import covered_spans, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
-from pipelines.slam.sightings import EDGE, POLE
+from pipelines.slam.sightings import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
@@ -73,10 +73,10 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
     assert trajectory_errors(found.trajectory, truth, "start").ate < 0.7 * before
 
 
-def test_lane_edges_are_found_where_the_road_ends() -> None:
+def test_road_lines_are_found_where_the_road_ends() -> None:
     scans = SimulatedScans(0, 16, kerbs=True)
     settings = LidarSlamSettings(loop_closures=False)
-    edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == EDGE]
+    edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == LINE]
     assert len(edges) == 2
     for mark in edges:  # the lines y = KERB and y = -KERB
         truth = np.array([np.pi / 2 * np.sign(mark.state[0]), KERB])

@@ -26,7 +26,7 @@ from saga_fg.learning import (
 )
 from saga_fg.learning.interaction_fit import FittedInteractions, couple_rules
 from saga_fg.model.edge_features import EdgeFeatures
-from saga_fg.model.edge_information import News
+from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedCourse, SharedVelocity
 
@@ -137,7 +137,11 @@ def test_edges_that_tell_the_hidden_alone_leave_those_in_view_to_their_measureme
         rule = dataclasses.replace(FOLLOW, rate=RATE, news=news)
         return JointGaps(trajectories, filtered, {"default": 1.5}, 0.005, (rule,)).errors(sample, GapSettings())
 
-    kf, hidden, nobody = errors(News(1e6)), errors(News(1.0, 1e6)), errors(News(1e4, 1e-3))
+    kf, hidden, nobody = (
+        errors(EdgeInformation(1e6)),
+        errors(EdgeInformation(1.0, 1e6)),
+        errors(EdgeInformation(1e4, 1e-3)),
+    )
     np.testing.assert_allclose(kf, nobody, atol=1e-3)
     at_once = gap_errors(sample, predict_gaps(sample, alone, 1.5, 0.0))
     np.testing.assert_allclose(kf, at_once, atol=1e-3)
