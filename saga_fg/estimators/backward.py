@@ -206,8 +206,8 @@ def _moved(blocks: BlockDiagonal, old: Partition, new: Partition) -> BlockDiagon
         and (old.label == new.label).all()
     ):
         return blocks
-    where = {int(node): row for row, node in enumerate(new.layout.nodes)}
-    return regrouped(blocks, old, new, np.array([where.get(int(node), -1) for node in old.layout.nodes]))
+    row = {node: row for row, node in enumerate(old.layout.nodes.tolist())}
+    return regrouped(blocks, old, new, np.array([row.get(node, -1) for node in new.layout.nodes.tolist()], dtype=int))
 
 
 def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition, told: float) -> BlockDiagonal:
