@@ -23,7 +23,7 @@ BUILT_IN = {
     "argoverse2": "data_tools.datasets.argoverse2.dataset:ArgoverseSource",
     "eth_ucy": "data_tools.datasets.eth_ucy.dataset:EthUcySource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
-    "simulated": "data_tools.simulator.dataset:SimulatedSource",
+    "simulated": "data_tools.simulator.source:SimulatedSource",
 }
 
 
