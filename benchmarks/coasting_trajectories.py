@@ -20,10 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from benchmarks.block_bootstrap import Average, relative_change_of_errors
+from data_tools.datasets.registry import dataset_source
+from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval
 from pipelines.tracking import Progress
@@ -50,7 +53,7 @@ CLASSES = {
     "kitti": ("car",),
     "nuscenes": ("car", "pedestrian"),
     "eth_ucy": ("pedestrian",),
-    "argoverse": ("car",),
+    "argoverse2": ("car",),
     "simulated": ("car",),
 }
 """The classes that are hidden, by kind of recordings; all others are neighbours."""
@@ -61,6 +64,20 @@ NOISE_ALONE = "noise alone"
 AVERAGES: tuple[Average, Average] = ("median", "mean")
 STRETCH = 10.0  # s
 BESIDE, ALIKE = 2.0, 0.5  # in company: another within so many m, whose velocity differs by less than so many m/s
+
+
+def annotated_source(kind: str, place: str, recordings: Sequence[str] | None = None) -> DatasetSource:
+    """The recordings of a dataset in a folder, or so many simulated scenes; all, or those that are named.
+
+    Raises `InputError` for a number of scenes that is none.
+    """
+    if kind == "simulated" and (not place.isdecimal() or int(place) == 0):
+        raise InputError(f"--data simulated={place}: expected a number of scenes")
+    chosen: dict[str, Any] = {"scenes": int(place)} if kind == "simulated" else {"dataroot": place}
+    if kind == "nuscenes":
+        chosen["split"] = "all"
+    source = dataset_source(kind)(**chosen)
+    return source if recordings is None else source.restricted(recordings)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Config, Verbose, names
+from data_tools.datasets.source import names
+from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, show_tables
 
@@ -16,7 +17,7 @@ def coasting(
         list[str],
         typer.Option(
             "--data",
-            help="Recordings with their truth: kitti=, nuscenes=, eth_ucy=, argoverse= with their folder, simulated= "
+            help="Recordings with their truth: kitti=, nuscenes=, eth_ucy=, argoverse2= with their folder, simulated= "
             "with a number of scenes; repeatable.",
             metavar="KIND=PLACE",
         ),
@@ -50,6 +51,7 @@ def coasting(
     from benchmarks.coasting_trajectories import (
         CLASSES,
         CoastingSettings,
+        annotated_source,
         coasting_errors,
         coasting_figures,
         coasting_table,
@@ -57,7 +59,7 @@ def coasting(
     from data_tools.figures import write_figures
     from data_tools.files.atomic_files import check_writable
     from pipelines.config import load_config
-    from pipelines.learning import TrajectorySource
+    from pipelines.learning import trajectories
     from saga_fg.errors import InputError
 
     if recordings is not None and len(data) != 1:
@@ -66,17 +68,18 @@ def coasting(
         check_writable(json_file)
     chosen = names("--recordings", recordings) if recordings is not None else None
     figures, settings = {}, CoastingSettings(folds, tested_folds, gaps, network)
-    for source in [TrajectorySource.parsed(value, chosen) for value in data]:
-        if source.kind not in CLASSES:
-            raise InputError(f"--data {source.kind}=...: expected recordings with truth: {', '.join(CLASSES)}")
-        found = source.trajectories()
+    for kind, _, place in (value.partition("=") for value in data):
+        if kind not in CLASSES or not place:
+            raise InputError(f"--data {kind}={place}: expected KIND=PLACE with a kind of {', '.join(CLASSES)}")
+        source = annotated_source(kind, place, chosen)
+        found = trajectories(source, with_truth=True)
         if len(found) < 2:
-            raise InputError(f"--data {source.kind}={source.place}: expected at least two recordings")
+            raise InputError(f"--data {kind}={place}: expected at least two recordings")
         rules = load_config(source.family, config).tracker.edges
         with progress_bar(unit="recordings") as progress:
-            errors, learned = coasting_errors(found, CLASSES[source.kind], rules, settings, progress)
+            errors, learned = coasting_errors(found, CLASSES[kind], rules, settings, progress)
         rows = coasting_figures(errors)
-        show_tables([coasting_table(rows, f"{source.kind}, {len(found)} recordings")])
-        figures[source.kind] = {"recordings": list(found), "figures": rows, "learned": learned}
+        show_tables([coasting_table(rows, f"{kind}, {len(found)} recordings")])
+        figures[kind] = {"recordings": list(found), "figures": rows, "learned": learned}
     if json_file is not None:
         write_figures(json_file, figures)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.options import Verbose, Version
+from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import working
 from pipelines.cli.tables import JsonFile
 from saga_fg.errors import InputError
@@ -22,7 +22,7 @@ def metrics(
         Path | None, typer.Option("--result", help="Tracking-result JSON; without it, simulated scenes are tracked.")
     ] = None,
     dataroot: Annotated[Path | None, typer.Option("--dataroot", help="Folder that holds the folder of tables.")] = None,
-    version: Version = "v1.0-mini",
+    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = "v1.0-mini",
     split: Annotated[str, typer.Option("--split", help="The split to score.")] = "all",
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes, if there is no result.")] = 2,
     json_file: JsonFile = None,

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from data_tools.datasets.source import names
 from data_tools.figures import FigureTable, cell
-from pipelines.cli.options import Verbose, names
+from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, show_tables
 

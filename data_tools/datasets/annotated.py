@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -43,6 +44,9 @@ class AnnotatedSource(DatasetSource):
             else:
                 with local_copy(self.detections) as path:
                     yield DetectedScenes(dataset, read_detections(path))
+
+    def restricted(self, scenes: Collection[str]) -> Self:
+        return replace(self, scenes=",".join(scenes))
 
     def input_files(self) -> tuple[Path, ...]:
         return () if self.detections is None or is_url(self.detections) else (Path(self.detections),)

@@ -27,8 +27,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from data_tools.files.located import unknown
 from saga_fg.errors import InputError
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.track import Tracks
 
 if TYPE_CHECKING:
     from data_tools.datasets.parts import Parts
@@ -37,19 +35,21 @@ if TYPE_CHECKING:
     from data_tools.lidar.scan_sequence import ScanSequence
     from saga_fg.numerics.arrays import FloatArray
     from saga_fg.smoothing import Labels
+    from saga_fg.types.dataset import Dataset, Scene
+    from saga_fg.types.track import Tracks
 
 Verb = Literal["track", "smooth", "evaluate", "evaluate labels", "report", "view", "learn noise", "learn interactions"]
 
 TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "learn noise")
 """Verbs that need detections."""
 
-TrackedScenes = Iterable[tuple[Scene, Sequence[Tracks]]]
+TrackedScenes = Iterable[tuple["Scene", Sequence["Tracks"]]]
 """Scenes with one `Tracks` for each of their timestamps."""
 
 Innovations = Mapping[str, "FloatArray"]
 """Squared distances of tracks and the detections they took, in sigmas, by class."""
 
-LabelledScenes = Sequence[tuple[Scene, "Sequence[Labels]"]]
+LabelledScenes = Sequence[tuple["Scene", Sequence["Labels"]]]
 """Scenes with one `Labels` for each of their timestamps."""
 
 

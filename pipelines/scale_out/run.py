@@ -13,8 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
-from data_tools.files.atomic_files import remove_leftovers
 from data_tools.datasets.parts import Part
+from data_tools.files.atomic_files import remove_leftovers
 from pipelines.scale_out.folder import OutputFolder
 from pipelines.scale_out.job import Job, Outcome, SceneTask, sha256
 from pipelines.scale_out.manifest import Manifest, Record
@@ -88,9 +88,7 @@ def run_scenes(
     return report
 
 
-def _jobs(
-    inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configuration: str, here: str
-) -> Iterator[Job]:
+def _jobs(inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configuration: str, here: str) -> Iterator[Job]:
     names: set[str] = set()
     for scene in inputs:
         if scene.name in names:

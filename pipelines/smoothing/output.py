@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from data_tools.datasets.label_table import write_label_table
+from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory
 from pipelines.smoothing.scene import SmoothedScene
 from pipelines.smoothing.streamed import StreamedScene

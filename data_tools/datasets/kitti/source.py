@@ -51,6 +51,9 @@ class KittiSource(DatasetSource):
     iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate",))
     classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate",))
 
+    def __post_init__(self) -> None:
+        overlaps(self.iou)
+
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[KittiTracking]:
         with local_kitti(self.dataroot, self.detections, self._chosen(), truth) as dataset:

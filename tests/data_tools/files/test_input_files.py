@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from data_tools import read_detections
-from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import read_tracking_results
