@@ -6,7 +6,7 @@ odometry.tum                by odometry alone; online.tum: as estimated when eac
 covariances.csv             of the sensor's pose at the keyframes: time, then the upper triangle of (rotation vector,
                             translation) in the sensor's frame, rad and m
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
-landmarks.json              kind, number of sightings, coordinates and covariance of each landmark
+landmarks.json              kind, number of observations, coordinates and covariance of each landmark
 landmarks.ply               the same to look at: points along the poles and on the seen pieces of the walls
 tracks.csv                  with objects: those in the world at every moment of the graph, see `object_tracks`
 above.png                   map, paths, landmarks and the objects' tracks from above
@@ -39,7 +39,7 @@ from saga_fg.numerics.geometry import transform_points
 from saga_fg.types.landmark import Landmark
 
 POLE_HEIGHT = 3.0  # m above the first pose, to which poles are drawn
-_GAP = 2.0  # m between sightings of a wall, beyond which two pieces of it are drawn
+_GAP = 2.0  # m between observations of a wall, beyond which two pieces of it are drawn
 _EDGE_COLOUR = (148, 103, 189)
 _COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
 
@@ -112,7 +112,7 @@ def _write_landmarks(folder: Path, result: LidarSlam) -> None:
         {
             "id": landmark.number,
             "kind": landmark.kind.name,
-            "sightings": landmark.sightings,
+            "observations": landmark.observations,
             **landmark.kind.coordinates(landmark.state),
             "covariance": landmark.covariance.tolist(),
         }
@@ -160,7 +160,7 @@ def _pieces(result: LidarSlam, kind: str) -> FloatArray:
         along = np.array([-normal[1], normal[0]])
         foot = (np.array([place["x"], place["y"]]) @ normal) * normal
         spans = []
-        for seen, extent in zip(result.sightings, result.extents, strict=True):
+        for seen, extent in zip(result.observations, result.extents, strict=True):
             if seen.landmark == mark.number:
                 u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
                 spans.append((float(u.min()), float(u.max())))

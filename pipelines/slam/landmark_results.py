@@ -31,7 +31,7 @@ class LandmarkRecord:
     kind: str
     coordinates: dict[str, float]
     covariance: FloatArray
-    sightings: int
+    observations: int
 
     def listed(self) -> dict[str, object]:
         """The entry of landmarks.json."""
@@ -40,14 +40,14 @@ class LandmarkRecord:
             "type": self.kind,
             **self.coordinates,
             "covariance": self.covariance.tolist(),
-            "sightings": self.sightings,
+            "observations": self.observations,
         }
 
 
 def records(landmarks: Sequence[Landmark]) -> list[LandmarkRecord]:
     """The landmarks of a map."""
     return [
-        LandmarkRecord(l_.number, l_.kind.name, l_.kind.coordinates(l_.state), l_.covariance, l_.sightings)
+        LandmarkRecord(l_.number, l_.kind.name, l_.kind.coordinates(l_.state), l_.covariance, l_.observations)
         for l_ in landmarks
     ]
 

@@ -114,7 +114,7 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Lida
     assert len(read_scan(folder / "landmarks.ply")) > 0
     landmarks = json.loads((folder / "landmarks.json").read_text())
     assert {mark["kind"] for mark in landmarks} == {"pole", "wall"}
-    assert all(mark["sightings"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
+    assert all(mark["observations"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
     covariances = np.loadtxt(folder / "covariances.csv", delimiter=",", skiprows=1)
     assert covariances.shape == (len(result.keyframes), 22)
     assert json.loads((folder / "metrics.json").read_text()) == figures
