@@ -15,9 +15,9 @@ from factors import nonlinear_graph
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.block_variables import BlockVariables
 from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.prediction import Prediction
-from saga_fg.estimators.sighting import WhitenedRows
 from saga_fg.numerics.arrays import IntArray
 
 
@@ -60,7 +60,7 @@ class BayesTree:
         factors = self.factors + tuple(variables.births(rows, x.covariances(rows)))
         return replace(self, variables=variables, components=x.partition, factors=factors, new=self.new | new)
 
-    def with_measurements(self, rows: WhitenedRows) -> BayesTree:
+    def with_measurements(self, rows: WhitenedMeasurements) -> BayesTree:
         """Add linear measurements."""
         return replace(self, factors=self.factors + tuple(self.variables.detections(rows)))
 

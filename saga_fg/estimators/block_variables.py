@@ -1,8 +1,8 @@
 r"""The variables of the iSAM2 filter, and the linear factors on them.
 
-A variable is the stacked state of some correlated nodes, a whole component or a part of a large one, so that elimination
-works on blocks that are worth a call to the linear algebra. Its unit is the standard deviation and its zero the estimate
-at which it began,
+A variable is the stacked state of some correlated nodes, a whole component or a part of a large one: elimination works
+on blocks that are worth a call to the linear algebra. Its unit is the standard deviation, its zero its first
+estimate,
 
     x = origin + scale y,
 
@@ -29,8 +29,8 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.sighting import WhitenedRows
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _WHOLE = 64  # size of a component up to which it is one variable
@@ -114,7 +114,7 @@ class BlockVariables:
         keys = self.keys[self.partition.label[rows]].tolist()
         return [native_factor([key], [d], matrix.T) for key, matrix in zip(keys, augmented, strict=True)]
 
-    def detections(self, seen: WhitenedRows) -> list[gtsam.JacobianFactor]:
+    def detections(self, seen: WhitenedMeasurements) -> list[gtsam.JacobianFactor]:
         """One factor a variable for the measurements of its nodes."""
         rows, z, H = seen.rows, seen.z, seen.H
         partition, (_, k, d) = self.partition, H.shape

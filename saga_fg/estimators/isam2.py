@@ -25,15 +25,14 @@ from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
 from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
 from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.moment import Birth, Moment, passed
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
 from saga_fg.estimators.motion import Motion, Standstill
-from saga_fg.estimators.newest import NewestMarginals, live_rows
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.prediction import Prediction
-from saga_fg.estimators.protocol import Measurements, require_kind
-from saga_fg.estimators.sighting import Observations, Sighting, whitened
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import IntArray
@@ -68,18 +67,18 @@ class _State:
     tree: BayesTree | None
     x: BlockGaussian | None
     before: BlockGaussian
-    moments: tuple[Moment, ...]
+    epochs: tuple[Epoch, ...]
 
     @property
-    def newest(self) -> Moment:
-        return self.moments[-1]
+    def newest(self) -> Epoch:
+        return self.epochs[-1]
 
-    def with_newest(self, moment: Moment) -> tuple[Moment, ...]:
-        """The moments with `moment` in the place of the newest."""
-        return (*self.moments[:-1], moment)
+    def with_newest(self, epoch: Epoch) -> tuple[Epoch, ...]:
+        """The epochs with `epoch` in the place of the newest."""
+        return (*self.epochs[:-1], epoch)
 
 
-class IncrementalFilter(NewestMarginals):
+class IncrementalFilter(LatestMarginals):
     """The exact filter, by `gtsam.ISAM2`. See `saga_fg.estimators.protocol.Estimator` for the methods."""
 
     def __init__(self) -> None:
@@ -106,9 +105,9 @@ class IncrementalFilter(NewestMarginals):
         state, x = _solved(state)
         x = x.extended(x.layout.extended(added, mean.shape[1]), mean, covariance)
         birth = Birth(added, mean, covariance)
-        moments = state.with_newest(replace(state.newest, births=(*state.newest.births, birth)))
+        epochs = state.with_newest(replace(state.newest, births=(*state.newest.births, birth)))
         tree = None if state.tree is None else state.tree.with_births(x)
-        self._state = replace(state, live=live, tree=tree, x=x, moments=moments)
+        self._state = replace(state, live=live, tree=tree, x=x, epochs=epochs)
 
     def predict(self, transition: Transition) -> None:
         motion = Motion(transition)
@@ -116,26 +115,26 @@ class IncrementalFilter(NewestMarginals):
         self._state = _moved(self._state, motion)
 
     def update(self, measurements: Measurements | Observations) -> float:
-        sighting = Sighting(measurements)
-        sighting.check(self._state.live)
+        recorded = RecordedMeasurements(measurements)
+        recorded.check(self._state.live)
         if len(measurements) == 0:
             return 0.0
         state = self._state
-        if state.x is None and _is_wide(state, sighting):
+        if state.x is None and _is_wide(state, recorded):
             state, _ = _solved(state)
-        moments = state.with_newest(replace(state.newest, sightings=(*state.newest.sightings, sighting)))
+        epochs = state.with_newest(replace(state.newest, measurements=(*state.newest.measurements, recorded)))
         if state.x is None:
             assert state.tree is not None
             prior_mean = state.tree.variables.origin
-            seen = sighting.linearised(state.tree.components.layout, prior_mean)
+            seen = recorded.linearised(state.tree.components.layout, prior_mean)
             white = whitened(seen)
-            self._state, x = _solved(replace(state, tree=state.tree.with_measurements(white), moments=moments))
+            self._state, x = _solved(replace(state, tree=state.tree.with_measurements(white), epochs=epochs))
             return posterior_likelihood(x, prior_mean, *white)
-        seen = sighting.linearised(state.x.layout, state.x.mean)
+        seen = recorded.linearised(state.x.layout, state.x.mean)
         likelihood = innovation_likelihood(state.x, *seen)
         tree = _begun(state.x, _largest(state.x.partition) <= _SMALL) if state.tree is None else state.tree
         tree = None if tree is None else tree.with_measurements(whitened(seen))
-        self._state, _ = _solved(replace(state, tree=tree, x=None, moments=moments))
+        self._state, _ = _solved(replace(state, tree=tree, x=None, epochs=epochs))
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -145,7 +144,7 @@ class IncrementalFilter(NewestMarginals):
             raise InputError("nodes: expected each node once")
         gone = (*state.newest.gone, *state.live.nodes[rows].tolist())
         self._state = replace(
-            state, live=state.live.without(rows), moments=state.with_newest(replace(state.newest, gone=gone))
+            state, live=state.live.without(rows), epochs=state.with_newest(replace(state.newest, gone=gone))
         )
 
     def posterior(self) -> BlockGaussian:
@@ -157,9 +156,9 @@ class IncrementalFilter(NewestMarginals):
         """The last interval: the posterior before it as prior, its factors, and all measurements since."""
         self._state, x = _solved(self._state)
         state = self._state
-        passes = passed(state.before, list(state.moments))
-        means = [*smoothed_means(passes)[:-1], x.mean]
-        return recording_graph(state.before, state.moments, [state.layout for state in passes], means)
+        steps = filter_epochs(state.before, list(state.epochs))
+        means = [*smoothed_means(steps)[:-1], x.mean]
+        return recording_graph(state.before, state.epochs, [step.layout for step in steps], means)
 
     def snapshot(self) -> IncrementalState:
         """The whole state as a value. The filter itself restarts from it, so that both go on to the same bits."""
@@ -172,7 +171,7 @@ class IncrementalFilter(NewestMarginals):
     def restore(self, state: IncrementalState) -> None:
         """Continue from a snapshot."""
         require_kind("state", state, IncrementalState)
-        self._state = _State(state.x.layout, None, state.x, state.x, (Moment(state.time),))
+        self._state = _State(state.x.layout, None, state.x, state.x, (Epoch(state.time),))
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         return live_rows(self.posterior(), self._state.live, nodes)
@@ -189,7 +188,7 @@ def _solved(state: _State) -> tuple[_State, BlockGaussian]:
         except RuntimeError as error:
             log.info("iSAM2 begins anew at %.3f s: %s", state.newest.time, " ".join(str(error).split())[:200])
     if tree is None:
-        x = passed(state.before, list(state.moments))[-1].filtered
+        x = filter_epochs(state.before, list(state.epochs))[-1].filtered
     return replace(state, tree=tree, x=x), x
 
 
@@ -224,8 +223,8 @@ def _moved(state: _State, motion: Motion | Standstill) -> _State:
         if tree is None:
             predicted = predict(apart, dynamics)
     then, now = state.newest.time, state.newest.time + motion.dt
-    moments = (Moment(then, gone=state.newest.gone, motion=motion), Moment(now))
-    return _State(apart.layout, tree, predicted if tree is None else None, x, moments)
+    epochs = (Epoch(then, gone=state.newest.gone, motion=motion), Epoch(now))
+    return _State(apart.layout, tree, predicted if tree is None else None, x, epochs)
 
 
 def _tree_predicted(
@@ -238,12 +237,12 @@ def _tree_predicted(
         return None
 
 
-def _is_wide(state: _State, sighting: Sighting) -> bool:
+def _is_wide(state: _State, recorded: RecordedMeasurements) -> bool:
     """True where a prediction is so uncertain beside the measurements that its trace is lost in the posterior."""
     assert state.tree is not None
     variables = state.tree.variables
     layout = variables.partition.layout
-    rows, _, H, R = sighting.linearised(layout, variables.origin)
+    rows, _, H, R = recorded.linearised(layout, variables.origin)
     predicted = (H**2 @ (variables.scale**2)[layout.spans(rows)][:, :, None])[:, :, 0]
     noise = np.diagonal(R, axis1=1, axis2=2)
     return bool((predicted > _WIDE * noise).any())
