@@ -19,7 +19,7 @@ import numpy as np
 
 from data_tools.lidar import Scan
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 from saga_fg.types.boxes import Boxes
 
 
@@ -39,19 +39,16 @@ class StandingWorld:
 
 
 @dataclass(frozen=True)
-class ScannerSettings:
+class ScannerSettings(Settings):
     """A small sensor, so that tests are quick; 64 rings and 2000 columns make a Velodyne HDL-64E."""
 
-    rings: int = setting(32, "beams, one above the other")
-    columns: int = setting(720, "firings a turn")
+    rings: PositiveInt = setting(32, "beams, one above the other")
+    columns: PositiveInt = setting(720, "firings a turn")
     lowest: float = setting(-0.44, "elevation of the lowest beam, rad")
     highest: float = setting(0.06, "and of the highest, rad")
-    reach: float = setting(80.0, "longest range, m")
+    reach: Positive = setting(80.0, "longest range, m")
     noise: float = setting(0.02, "standard deviation of a range, m")
-    period: float = setting(0.1, "of a turn, s")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "rings", "columns", "reach", "period")
+    period: Positive = setting(0.1, "of a turn, s")
 
 
 def simulate_scan(

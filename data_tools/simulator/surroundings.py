@@ -8,7 +8,7 @@ import numpy as np
 
 from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, draw_sizes
 from data_tools.simulator.road import Road
-from data_tools.simulator.settings import Range, SurroundingSettings
+from data_tools.simulator.settings import SurroundingSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 
@@ -30,7 +30,7 @@ def draw_surroundings(
     road: Road,
     edges: tuple[float, float],
     hedge: float | None,
-    window: Range,
+    window: tuple[float, float],
     walkable: tuple[bool, bool],
     settings: SurroundingSettings,
     rng: np.random.Generator,
@@ -67,7 +67,9 @@ def draw_surroundings(
     return Surroundings(Boxes.concatenate(parked), Boxes.concatenate(occluders), pavements)
 
 
-def _stretches(window: Range, length: Range, gap: Range, rng: np.random.Generator) -> FloatArray:
+def _stretches(
+    window: tuple[float, float], length: tuple[float, float], gap: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
     """Alternating stretches and gaps over the window: starts and ends (K, 2), m."""
     s, stretches = window[0] - rng.uniform(0, length[1]), []
     while s < window[1]:
@@ -87,7 +89,12 @@ def _row(road: Road, stretches: FloatArray, d: float, width: float, height: floa
 
 
 def _parked(
-    road: Road, d: float, side: float, window: Range, settings: SurroundingSettings, rng: np.random.Generator
+    road: Road,
+    d: float,
+    side: float,
+    window: tuple[float, float],
+    settings: SurroundingSettings,
+    rng: np.random.Generator,
 ) -> Boxes:
     place = np.arange(window[0], window[1], 6.5)
     place = place[rng.random(len(place)) < settings.parking_occupancy]

@@ -34,7 +34,7 @@ from saga_fg.graph import Additions, FactorProvider, GraphView
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import LandmarkMapper, MapperSettings, MeasuredMotion, Sighting, Sightings, pose_key
 from saga_fg.types.landmark import Landmark, Observation
@@ -55,7 +55,7 @@ CALIBRATED = OdometryNoise(
 
 
 @dataclass(frozen=True)
-class LidarSlamSettings:
+class LidarSlamSettings(Settings):
     """All that shapes a run."""
 
     odometry: OdometrySettings = settings_group(OdometrySettings, "of the LiDAR")
@@ -64,14 +64,11 @@ class LidarSlamSettings:
     loops: LoopSettings = settings_group(LoopSettings, "closing loops")
     landmarks: bool = setting(True, "whether landmarks are nodes of the graph")
     loop_closures: bool = setting(True, "whether loops are looked for")
-    robust_scale: float = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
-    map_spacing: float = setting(0.25, "a scan is thinned to this for the accumulated map, m")
+    robust_scale: Positive = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
+    map_spacing: Positive = setting(0.25, "a scan is thinned to this for the accumulated map, m")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "of objects in the same graph")
-    oxts_rotation: float = setting(1e-3, "standard deviation of a motion by GPS/IMU between scans, rad")
-    oxts_translation: float = setting(0.03, "and of its translation, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "robust_scale", "map_spacing", "oxts_rotation", "oxts_translation")
+    oxts_rotation: Positive = setting(1e-3, "standard deviation of a motion by GPS/IMU between scans, rad")
+    oxts_translation: Positive = setting(0.03, "and of its translation, m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
@@ -36,25 +37,20 @@ _CALIBRATION = key_of(EGO_ERROR, 0, None)
 
 
 @dataclass(frozen=True)
-class PlazaSettings:
+class PlazaSettings(Settings):
     """How odometry and ranges are believed."""
 
-    distance_noise: float = setting(0.05, "standard deviation of the distance of a step, as a share of it")
-    least_noise: float = setting(0.005, "m, of a step's distance, and sideways, at least")
-    turn_noise: float = setting(0.01, "rad, of a step's heading change")
-    range_noise: float = setting(0.5, "m, standard deviation of a range")
-    robust: float = setting(2.0, "standard deviations beyond which ranges are believed less (Cauchy)")
-    scale_noise: float = setting(0.1, "standard deviation of the radio's scale before anything is measured")
-    offset_noise: float = setting(1.0, "m, the same of its offset")
-    beginning: float = setting(100.0, "m driven before the beacons are placed")
-    growth: float = setting(1.3, "by which each part of the drive is longer than the one before")
-
-    def __post_init__(self) -> None:
-        require_positive(
-            self, "distance_noise", "least_noise", "turn_noise", "range_noise", "robust", "scale_noise",
-            "offset_noise", "beginning",
-        )  # fmt: skip
-        require_between(self, 1.01, 100.0, "growth")
+    distance_noise: Positive = setting(0.05, "standard deviation of the distance of a step, as a share of it")
+    least_noise: Positive = setting(0.005, "m, of a step's distance, and sideways, at least")
+    turn_noise: Positive = setting(0.01, "rad, of a step's heading change")
+    range_noise: Positive = setting(0.5, "m, standard deviation of a range")
+    robust: Positive = setting(2.0, "standard deviations beyond which ranges are believed less (Cauchy)")
+    scale_noise: Positive = setting(0.1, "standard deviation of the radio's scale before anything is measured")
+    offset_noise: Positive = setting(1.0, "m, the same of its offset")
+    beginning: Positive = setting(100.0, "m driven before the beacons are placed")
+    growth: Annotated[float, Range(1.01, 100.0)] = setting(
+        1.3, "by which each part of the drive is longer than the one before"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,25 +14,21 @@ import numpy as np
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.joint import Observations
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)
-class RoadsideSettings:
+class RoadsideSettings(Settings):
     """Poles and how they are seen."""
 
-    gap: float = setting(25.0, "mean distance between poles of one side, m")
-    offset: float = setting(9.0, "mean distance of a pole from the path, m")
-    reach: float = setting(30.0, "farther poles are not seen, m")
-    seen: float = setting(0.8, "chance to see a pole within reach")
-    noise: float = setting(0.1, "standard deviation of an observation, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "gap", "offset", "reach", "noise")
-        require_between(self, 0, 1, "seen")
+    gap: Positive = setting(25.0, "mean distance between poles of one side, m")
+    offset: Positive = setting(9.0, "mean distance of a pole from the path, m")
+    reach: Positive = setting(30.0, "farther poles are not seen, m")
+    seen: Fraction = setting(0.8, "chance to see a pole within reach")
+    noise: Positive = setting(0.1, "standard deviation of an observation, m")
 
 
 def observe_poles(world_T_ego: FloatArray, seed: int, settings: RoadsideSettings | None = None) -> Observations:

@@ -16,26 +16,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.estimators.backward import future_influence
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import NonNegative, Positive, Settings, setting
 
 _SURE = 5.0  # standard deviations
 
 
 @dataclass(frozen=True)
-class WindowSettings:
+class WindowSettings(Settings):
     """How a window slides."""
 
-    step: float = setting(5.0, "s from one look at what has become final to the next")
-    tolerance: float = setting(1e-3, "by which a final mean may differ from that of the batch smoother, m (m/s, ...)")
-    longest: float = setting(60.0, "s after which an epoch is taken as final in any case, which bounds the memory")
-    late: float = setting(0.0, "s by which measurements may come late: so much longer everything has to wait")
+    step: Positive = setting(5.0, "s from one look at what has become final to the next")
+    tolerance: Positive = setting(
+        1e-3, "by which a final mean may differ from that of the batch smoother, m (m/s, ...)"
+    )
+    longest: Positive = setting(60.0, "s after which an epoch is taken as final in any case, which bounds the memory")
+    late: NonNegative = setting(0.0, "s by which measurements may come late: so much longer everything has to wait")
 
     def __post_init__(self) -> None:
-        require_positive(self, "step", "tolerance", "longest")
-        require_between(self, 0.0, self.longest, "late")
+        super().__post_init__()
+        if self.late > self.longest:
+            raise InputError(f"late: expected a number from 0 to {self.longest:g}, got {self.late!r}")
 
 
 class WindowedSmoother(RecordedSmoother):

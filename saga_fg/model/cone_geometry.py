@@ -16,7 +16,7 @@ import numpy as np
 
 from saga_fg.model.interactions import NodeTable, unit
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 CONES = ("traffic_cone", "barrier")
 MIN_SPEED = 1.0  # m/s; who is slower is not pushed, since he goes nowhere
@@ -24,17 +24,16 @@ BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still be
 
 
 @dataclass(frozen=True)
-class ConeGeometry:
+class ConeGeometry(Settings):
     """Which cones concern a vehicle, and how it passes them."""
 
-    clearance: float = setting(1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m")
-    preview: float = setting(1.5, "time by which drivers look ahead along the line, s")
-    reach: float = setting(45.0, "cones further ahead do not belong to the line yet, m")
-    corridor: float = setting(6.0, "cones further aside than this do not concern a vehicle, m")
+    clearance: Positive = setting(
+        1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m"
+    )
+    preview: Positive = setting(1.5, "time by which drivers look ahead along the line, s")
+    reach: Positive = setting(45.0, "cones further ahead do not belong to the line yet, m")
+    corridor: Positive = setting(6.0, "cones further aside than this do not concern a vehicle, m")
     classes: tuple[str, ...] = setting(CONES, "classes that form a line")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "clearance", "preview", "reach", "corridor")
 
 
 class ConesAhead(NamedTuple):

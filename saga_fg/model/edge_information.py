@@ -11,7 +11,6 @@ detected objects is therefore low.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ import numpy as np
 
 from saga_fg.model.interactions import NodeTable
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, setting, settings_group
+from saga_fg.settings import NonNegative, Settings, setting, settings_group
 
 
 def information_setting() -> Any:
@@ -35,16 +34,13 @@ def weighted_by_gain(
 
 
 @dataclass(frozen=True)
-class EdgeInformation:
+class EdgeInformation(Settings):
     """Weight edges by their information gain."""
 
-    spread: float = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
-    unseen_acceleration: float = setting(
+    spread: NonNegative = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
+    unseen_acceleration: NonNegative = setting(
         0.0, "how much less sure a velocity is for every second in which nobody has seen its object, m/s^2"
     )
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "spread", "unseen_acceleration")
 
     def gains(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """Information gains (E,), in [0, 1], of the edges source[k] -> target[k] (rows of `nodes`)."""

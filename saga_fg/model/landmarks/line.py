@@ -12,20 +12,17 @@ import numpy as np
 from factors import HesseLine, ResidualFactors, SpatialPose, line_factors
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class LineLandmark:
+class LineLandmark(Settings):
     """A line, observed as the two ends (6,) of the piece seen, in the frame of the pose; its noise is that of the two
     ends across the line, m.
     """
 
     name: str = setting("road line", "what it is called in files")
-    density: float = setting(0.2, "landmarks per rad m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "density")
+    density: Positive = setting(0.2, "landmarks per rad m")
 
     @property
     def pose(self) -> SpatialPose:

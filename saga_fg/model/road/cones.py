@@ -13,7 +13,6 @@ the lane beside it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +22,12 @@ from saga_fg.model.edge_rules import VEHICLES, Pairs
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import IntArray, of_classes
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import (
+    NonNegative,
+    PositiveOrInf,
+    setting,
+    settings_group,
+)
 
 
 @dataclass(frozen=True)
@@ -57,13 +61,9 @@ class ConeLine:
     """Vehicles ahead of which cones form a line pass it on its free side."""
 
     cones: ConeGeometry = settings_group(ConeGeometry, "which cones concern a vehicle, and how it passes them")
-    rate: float = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
-    band: float = setting(0.5, "sigma of the kernel on the distance from where the line is just cleared, m")
+    rate: NonNegative = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
+    band: PositiveOrInf = setting(0.5, "sigma of the kernel on the distance from where the line is just cleared, m")
     vehicles: tuple[str, ...] = setting(VEHICLES, "classes that are pushed")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate")
-        require_positive(self, "band", infinite=True)
 
     @property
     def interaction(self) -> PassCones:
