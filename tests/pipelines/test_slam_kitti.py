@@ -11,14 +11,13 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from data_tools.lidar import read_scan
-from data_tools.simulator.scan_drive import SimulatedScans
-from data_tools.simulator.street import KERB, drive
+from data_tools.simulator.street import KERB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
-from pipelines.slam.kitti import covered_spans, write_lidar_slam
+from pipelines.slam.lidar_results import covered_spans, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
-from pipelines.slam.sightings import LINE, POLE
+from pipelines.slam.scan_landmarks import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
