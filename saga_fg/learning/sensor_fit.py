@@ -35,7 +35,7 @@ def fit_sensor(sample: DetectionSample, base: Sensor, gate: float) -> Sensor:
     sample = sample.select(np.ones(len(sample), dtype=bool), in_view)
     overall, by_class = detection_probabilities(sample, base.detection_probability)
     noise = fit_noise(sample, model, gate)
-    return replace(model, noise=noise, detection_probability=overall, class_detection=by_class)
+    return replace(model, noise=noise, detection_probability=overall, class_detection_probability=by_class)
 
 
 def fit_field_of_view(sample: DetectionSample, known: FieldOfView) -> FieldOfView:

@@ -36,12 +36,16 @@ APART = 0.7  # s, successive detections further apart than this say nothing of n
 
 
 def fit_trail_noise(
-    trails: Sequence[Trail], sensors: Mapping[str, Sensor], label: str, acceleration_noise: float, birth_speed: float
+    trails: Sequence[Trail],
+    sensors: Mapping[str, Sensor],
+    label: str,
+    acceleration_noise: float,
+    initial_speed_deviation: float,
 ) -> tuple[dict[str, NoiseModel], float]:
     """The noise of each sensor for a class and the class's acceleration noise, m^2/s^3, from trails of that class.
 
-    label: whose noise in the sensors' models to start from; birth_speed: standard deviation of a velocity component
-    before the second sighting, m/s. A sensor that saw less than ten times what others saw keeps its noise.
+    label: whose noise in the sensors' models to start from; initial_speed_deviation: standard deviation of a velocity
+    component before the second sighting, m/s. A sensor that saw less than ten times what others saw keeps its noise.
     """
     pieces = _pieces(trails)
     if not pieces:
@@ -79,7 +83,9 @@ def fit_trail_noise(
 
     def cost(theta: FloatArray) -> float:
         q = float(np.exp(theta[-1]))
-        likelihood = innovation_likelihood(lengths, time, position, covariances(theta), q, birth_speed, WRONG)
+        likelihood = innovation_likelihood(
+            lengths, time, position, covariances(theta), q, initial_speed_deviation, WRONG
+        )
         return float(0.5 * (((theta - start_logs) / PRIOR_WIDTH) ** 2).sum() - likelihood) / len(time)
 
     bounds = [(math.log(LEAST), math.log(30.0))] * (len(start_logs) - 1) + [(math.log(1e-3), math.log(1e2))]
