@@ -14,7 +14,7 @@ from running_graph_picture import write_running_graph_pictures
 
 from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
-from data_tools.simulator.scan_drive import SimulatedScans
+from data_tools.simulator.street import SimulatedScans
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint

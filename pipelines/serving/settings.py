@@ -35,7 +35,6 @@ class StreamSettings(Settings):
         500, "detections of a frame at most; one frame of so many takes up to 0.2 s, for which all clients wait"
     )
     max_message: PositiveInt = setting(4 * MB, "bytes of a message at most")
-    max_queue: PositiveInt = setting(64, "messages of one client that wait at most; beyond, its reading pauses")
     max_failures: PositiveInt = setting(3, "internal errors of the tracker in a row that start a fresh tracker")
     max_clients: PositiveInt = setting(256, "connections at most, fewer where the process may not open as many files")
     max_unfinished: PositiveInt = setting(

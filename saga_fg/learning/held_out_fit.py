@@ -27,11 +27,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.learning.filter_noise import FilterNoise
 from saga_fg.learning.gap_prediction import errors_alone
 from saga_fg.learning.gaps import GapSample, GapSettings, sample_gaps
 from saga_fg.learning.interaction_fit import MOST_GAPS, FittedInteractions, fit_interactions
 from saga_fg.learning.joint_gaps import JointGaps
-from saga_fg.learning.own_motion_fit import OwnMotion
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_network import EdgeNetwork
@@ -61,7 +61,7 @@ Trial = tuple[StrArray, dict[str, FloatArray]]
 def fit_by_held_out(
     recordings: Sequence[Trajectories],
     classes: tuple[str, ...],
-    own: OwnMotion,
+    own: FilterNoise,
     fit: Fit = fit_interactions,
     settings: GapSettings | None = None,
     forms: Mapping[str, Form] = FORMS,
@@ -114,7 +114,7 @@ def coupled_classes(rules: Rules) -> list[set[str]]:
 
 
 def _gaps(
-    recordings: Sequence[Trajectories], classes: tuple[str, ...], own: OwnMotion, settings: GapSettings
+    recordings: Sequence[Trajectories], classes: tuple[str, ...], own: FilterNoise, settings: GapSettings
 ) -> GapSample:
     return GapSample.concatenate(
         [sample_gaps(each, own.filtered(each), classes, settings, k) for k, each in enumerate(recordings)]
@@ -125,7 +125,7 @@ def _trial(
     of: Trajectories,
     taught: FittedInteractions,
     classes: tuple[str, ...],
-    own: OwnMotion,
+    own: FilterNoise,
     settings: GapSettings,
     forms: Mapping[str, Form],
 ) -> Trial:

@@ -11,8 +11,7 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from data_tools.lidar import read_scan
-from data_tools.simulator.scan_drive import SimulatedScans
-from data_tools.simulator.street import KERB, drive
+from data_tools.simulator.street import KERB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.kitti import covered_spans, write_lidar_slam

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.simulator.scan_drive import SimulatedScans
+from data_tools.simulator.street import SimulatedScans
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.cli import app
 from pipelines.config import load_config

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_tools.simulator.sensors import detection_probability, in_view, observe
+from data_tools.simulator.sensors import detect, detection_probability, in_view
 from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -32,7 +32,7 @@ def cars(ego_positions: FloatArray) -> Boxes:
 
 def detections(sensor: SensorSettings, boxes: Boxes, share: float = 1.0, frames: int = 200) -> list[Detections]:
     rng = np.random.default_rng(7)
-    return [observe(sensor, POSE, boxes, np.full(len(boxes), share), rng) for _ in range(frames)]
+    return [detect(sensor, POSE, boxes, np.full(len(boxes), share), rng) for _ in range(frames)]
 
 
 def within(value: float, expected: float, standard_error: float) -> bool:
