@@ -45,8 +45,8 @@ def fit_trajectory_noise(
     """The noise of each sensor for a class and the class's acceleration noise, m^2/s^3.
 
     trajectories: of the class; label: whose noise in the sensors' models is the start; initial_speed_deviation:
-    standard deviation of a velocity component before the second detection, m/s. A sensor with fewer than ten detections keeps its
-    noise.
+    standard deviation of a velocity component before the second detection, m/s. A sensor with fewer than ten detections
+    keeps its noise.
     """
     pieces = _pieces(trajectories)
     if not pieces:
