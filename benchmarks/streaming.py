@@ -18,7 +18,7 @@ import numpy as np
 
 from pipelines.process import one_thread, resident_memory
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
-from saga_fg.estimators import BatchSmoother, Measurements, Smoothed, WindowedSmoother, WindowSettings
+from saga_fg.estimators import BatchSmoother, Measurements, SmoothedState, WindowedSmoother, WindowSettings
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -205,7 +205,7 @@ class _Score:
         """Of a frame."""
         self._waiting.append((at, instant.transition.nodes, instant.truth))
 
-    def count(self, moments: tuple[Smoothed, ...]) -> None:
+    def count(self, moments: tuple[SmoothedState, ...]) -> None:
         """Compare moments with the truth, and forget it."""
         for moment in moments:
             if not self._waiting or moment.time < self._waiting[0][0] - 1e-6:
@@ -222,7 +222,7 @@ class _Score:
 def _largest_difference(settings: StreamingBenchSettings, window: WindowSettings | None) -> float:
     """Of any component of any mean from that of the batch smoother, on the first seconds of the traffic."""
     smoother, batch = WindowedSmoother(window), BatchSmoother(likelihoods=False, order="time")
-    moments: list[Smoothed] = []
+    moments: list[SmoothedState] = []
     for instant in traffic(settings, round(settings.compared * settings.rate)):
         _take(smoother, instant)
         _take(batch, instant)

@@ -40,10 +40,9 @@ from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.motion import Motion
-from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
-from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -58,7 +57,7 @@ class BoundedState:
     time: float
 
 
-class BoundedKalmanFilter(NewestMarginals):
+class BoundedKalmanFilter(LatestMarginals):
     """The filter that keeps correlations within `hops` of clusters of about `core` nodes.
 
     A node whose distance grows beyond `hops` is kept for `patience` further predictions, so that edges which come

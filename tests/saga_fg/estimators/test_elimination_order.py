@@ -107,7 +107,7 @@ def test_nodes_without_neighbours_do_not_end_the_interpreter():
 def test_the_cheapest_order_is_chosen(graph_of, n, order):
     smoother = recorded(graph_of, n, 40)
     recording = smoother._recording
-    assert cheapest_order(recording.moments, recording.layouts) in order.split()
+    assert cheapest_order(recording.epochs, recording.layouts) in order.split()
     assert smoother.order in order.split()
 
 

@@ -21,7 +21,7 @@ from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)
-class RoadsideSettings(Settings):
+class SimulatedPoleSettings(Settings):
     """Poles and how they are seen."""
 
     gap: Positive = setting(25.0, "mean distance between poles of one side, m")
@@ -31,9 +31,9 @@ class RoadsideSettings(Settings):
     noise: Positive = setting(0.1, "standard deviation of an observation, m")
 
 
-def observe_poles(world_T_ego: FloatArray, seed: int, settings: RoadsideSettings | None = None) -> Observations:
+def observe_poles(world_T_ego: FloatArray, seed: int, settings: SimulatedPoleSettings | None = None) -> Observations:
     """What is seen of poles from true poses (n, 4, 4); the same for the same seed."""
-    settings = settings or RoadsideSettings()
+    settings = settings or SimulatedPoleSettings()
     rng = np.random.default_rng(seed)
     poles = _poles(world_T_ego, settings, rng)
     kind, R = PoleLandmark(), settings.noise**2 * np.eye(2)
@@ -51,7 +51,7 @@ def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
     return observe_poles(np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None]), seed)
 
 
-def _poles(world_T_ego: FloatArray, settings: RoadsideSettings, rng: np.random.Generator) -> FloatArray:
+def _poles(world_T_ego: FloatArray, settings: SimulatedPoleSettings, rng: np.random.Generator) -> FloatArray:
     """(m, 3) places at a man's height, along the path and straight on beyond its end."""
     steps = np.linalg.norm(np.diff(world_T_ego[:, :3, 3], axis=0), axis=1)
     driven = np.concatenate([[0.0], np.cumsum(steps)])
