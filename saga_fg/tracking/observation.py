@@ -49,7 +49,7 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     probability = sensor.probability(detections.score, label)
     objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
     keep = np.flatnonzero(objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0]))
-    names = ("duplicate_distance", "shadow_distance", "shadow_ratio", "class_overlap")
+    names = ("nms_distance", "weak_nms_distance", "weak_nms_ratio", "cross_class_nms_iou")
     *limits, overlap = class_values(classes, ClassSettings, label[keep], *names)
     one_each = strongest(detections.boxes.select(keep), probability[keep], *limits)
     keep, overlap = keep[one_each], overlap[one_each]
