@@ -32,23 +32,23 @@ def _before_lights(world: World, time: float) -> BoolArray:
     """Which vehicles (N,) have a closed stop line within reach before them."""
     history, k = world.history, _moment(world, time)
     concerned = np.zeros(history.s.shape[1], dtype=np.bool_)
-    for line in world.scenario.stop_lines:
+    for line in world.layout.stop_lines:
         if line.closed(time):
-            way = line.s - history.s[k] - world.scenario.fleet.length / 2
+            way = line.s - history.s[k] - world.layout.fleet.length / 2
             concerned |= np.isin(history.lane[k], line.lanes) & (way > 0) & (way < REACH)
     return np.asarray(concerned & history.on_road[k])
 
 
 def _at_cones(world: World, time: float) -> BoolArray:
     """Which vehicles (N,) come to a taper or are in it, or are the next behind such a one in the lane it joins."""
-    history, k, lanes = world.history, _moment(world, time), world.scenario.lanes
+    history, k, lanes = world.history, _moment(world, time), world.layout.lanes
     lane, s, on_road = history.lane[k], history.s[k], history.on_road[k]
     if lanes.taper == 0:
         return np.zeros(len(s), dtype=np.bool_)
     begin = lanes.end - lanes.taper - HORIZON * history.speed[k]
     pushed = on_road & (lane == lanes.ending) & (s >= begin)
     concerned = pushed.copy()
-    beside = np.flatnonzero(on_road & (lane == lanes.beside))
+    beside = np.flatnonzero(on_road & (lane == lanes.adjacent))
     for row in np.flatnonzero(pushed).tolist():
         behind = beside[s[beside] < s[row]]
         if len(behind):

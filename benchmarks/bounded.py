@@ -6,6 +6,7 @@ On the connected flock of `pipelines.bench.flocks`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -14,25 +15,21 @@ from pipelines.bench.measuring import timed
 from pipelines.process import one_thread
 from saga_fg.estimators import BoundedKalmanFilter, Estimator, JointKalmanFilter
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_between, setting
+from saga_fg.settings import Range, Settings, setting
 
 
 @dataclass(frozen=True)
-class BoundedBenchSettings:
+class BoundedBenchSettings(Settings):
     """How much is measured."""
 
-    nodes: int = setting(1000, "nodes of the flock")
-    frames: int = setting(10, "frames that are counted")
-    warm_up: int = setting(5, "frames before them")
+    nodes: Annotated[int, Range(NEIGHBOURS + 1, 10**6)] = setting(1000, "nodes of the flock")
+    frames: Annotated[int, Range(1, 10**6)] = setting(10, "frames that are counted")
+    warm_up: Annotated[int, Range(0, 10**6)] = setting(5, "frames before them")
     hops: tuple[int, ...] = setting((1, 2, 3), "bounds to compare")
-    mixing: float = setting(0.35, "share of its velocity that a node takes over from its neighbours in a frame")
+    mixing: Annotated[float, Range(0, 0.99)] = setting(
+        0.35, "share of its velocity that a node takes over from its neighbours in a frame"
+    )
     seed: int = setting(0, "seed of the flock")
-
-    def __post_init__(self) -> None:
-        require_between(self, NEIGHBOURS + 1, 10**6, "nodes")
-        require_between(self, 1, 10**6, "frames")
-        require_between(self, 0, 10**6, "warm_up")
-        require_between(self, 0, 0.99, "mixing")
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class BoundedRow:
                   worst_error: the largest
     anees         mean of e^T P^-1 e / d against the truth, and anees_ratio to that of the exact filter
     likelihood_error  largest difference of a frame's log-likelihood, per measured value
-    nodes_per_cluster guests included
+    nodes_per_cluster with its halo
     """
 
     hops: int

@@ -26,7 +26,7 @@ def foreseen(
 
     believed  by number of a vehicle: how far ahead of the truth it is thought to be at `time`, m, and its speed, m/s
     """
-    history, scenario = world.history, world.scenario
+    history, scenario = world.history, world.layout
     k, later = (int(np.argmin(np.abs(history.time - moment))) for moment in (time, time + horizon))
     metric = scenario.lanes.metric(history.lane[k], history.s[k], history.offset[k], history.slope[k])
     s, speed = history.s[k].copy(), history.speed[k].copy()
@@ -46,7 +46,7 @@ def foreseen(
         settings.step,
         float(history.time[k]),
     )
-    traffic.react()
+    traffic.settle()
     for _ in range(later - k):
         traffic.step()
     return np.asarray((traffic.s - history.s[later]) * metric)

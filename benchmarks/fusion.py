@@ -77,7 +77,7 @@ def poor_model() -> Sensor:
         noise={DEFAULT: NoiseModel(position=1.0, range_noise=0.06, bearing_noise=0.03, yaw=1.0, height=0.5)},
         detection_probability=0.4,
         calibration={DEFAULT: ScoreCalibration(slope=0.1, offset=-0.5)},
-        births="confirmed",
+        initiation="confirmed",
     )
 
 

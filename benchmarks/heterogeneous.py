@@ -31,7 +31,7 @@ from benchmarks.hidden_parts import COUPLED, HIDDEN, hidden_errors, hidings, wit
 from benchmarks.predictions import FOLLOWED, Asked, in_view, moving, prediction_errors
 from data_tools.metrics import Interval, paired_bootstrap, ratio_of_sums
 from data_tools.simulator.scenarios import ScenarioName, scenario_settings
-from data_tools.simulator.scene import scene_in
+from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.world import build_world
 from pipelines.config import TrackConfig, load_config
 from pipelines.figures import FigureTable, cell
@@ -123,7 +123,7 @@ def _errors_of_scene(
     sensors = {name: replace(sensor, rate=RATE) for name, sensor in settings.sensors.items()}
     settings = replace(settings, sensors=sensors)
     world = build_world(settings, seed)
-    scene = scene_in(world, settings, seed)
+    scene = scene_from_world(world, settings, seed)
     assert scene.ground_truth is not None
     ahead, step = (round(time * settings.keyframe_rate) for time in (HORIZON, EVERY))
     rows = list(range(round(FIRST * settings.keyframe_rate), len(scene) - ahead, step))

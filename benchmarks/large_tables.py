@@ -11,11 +11,11 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from data_tools.datasets.nuscenes import CATEGORY_TO_TRACKING_CLASS
 from data_tools.files.atomic_files import atomic_directory, atomic_file
-from saga_fg.settings import require_between, setting
+from saga_fg.settings import Range, Settings, setting
 
 VERSION = "v1.0-trainval"
 CHANNELS = (
@@ -27,19 +27,16 @@ LIFE = 20  # samples that an object is there
 
 
 @dataclass(frozen=True)
-class TableSize:
+class TableSize(Settings):
     """How many rows."""
 
-    scenes: int = setting(850, "scenes")
-    samples: int = setting(40, "samples of a scene")
-    annotations: int = setting(34, "annotations of a sample")
-    readings: int = setting(77, "sensor readings of a sample, one keyframe of each of the twelve sensors among them")
-    detections: int = setting(30, "detections of a sample")
-
-    def __post_init__(self) -> None:
-        require_between(self, 1, 10**6, "scenes", "samples")
-        require_between(self, 0, 10**6, "annotations", "detections")
-        require_between(self, len(CHANNELS), 10**6, "readings")
+    scenes: Annotated[int, Range(1, 10**6)] = setting(850, "scenes")
+    samples: Annotated[int, Range(1, 10**6)] = setting(40, "samples of a scene")
+    annotations: Annotated[int, Range(0, 10**6)] = setting(34, "annotations of a sample")
+    readings: Annotated[int, Range(len(CHANNELS), 10**6)] = setting(
+        77, "sensor readings of a sample, one keyframe of each of the twelve sensors among them"
+    )
+    detections: Annotated[int, Range(0, 10**6)] = setting(30, "detections of a sample")
 
     @property
     def rows(self) -> dict[str, int]:

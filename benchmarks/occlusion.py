@@ -9,18 +9,17 @@ bootstraps over scenes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from data_tools.metrics import Interval, SceneMetrics, paired_bootstrap, scene_metrics
-from data_tools.sightings import sightings
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.learning import Sightings, fit_acceleration_noise_by_class
-from saga_fg.types.dataset import Annotations
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
+from saga_fg.types.dataset import Annotations, Scene
 
 METHODS: tuple[Method, Method] = ("kf", "saga")
 
@@ -51,13 +50,14 @@ def occlusion(
     """Fit on `fit_seeds`, compare on `seeds`."""
     simulator = simulator or SimulatorSettings()
     total = len(fit_seeds) + len(seeds)
-    objects: dict[str, list[Sightings]] = {}
-    for done, seed in enumerate(fit_seeds):
-        for label, found in sightings(simulate_scene(simulator, seed), config.sensors).items():
-            objects.setdefault(label, []).extend(found.values())
-        if progress is not None:
-            progress("fitting", done + 1, total)
-    noise = fit_acceleration_noise_by_class(objects)
+
+    def scenes() -> Iterator[Scene]:
+        for done, seed in enumerate(fit_seeds):
+            yield simulate_scene(simulator, seed)
+            if progress is not None:
+                progress("fitting", done + 1, total)
+
+    noise = fit_acceleration_noise_by_class(measured_trajectories(scenes(), config.sensors))
     config = config.with_acceleration_noise(noise)
     occluded: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}
     hidden: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}

@@ -12,16 +12,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from pipelines.process import one_thread, resident_memory
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
-from saga_fg.estimators import BatchSmoother, Measurements, Smoothed, WindowedSmoother, WindowSettings
+from saga_fg.estimators import BatchSmoother, Measurements, SmoothedState, WindowedSmoother, WindowSettings
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 
 PLATOON = 5
 CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.0))
@@ -34,20 +35,15 @@ HIDING, HIDDEN = 0.02, 3.0  # spells a second, and their length in s
 
 
 @dataclass(frozen=True)
-class StreamingBenchSettings:
+class StreamingBenchSettings(Settings):
     """How much is measured."""
 
-    objects: int = setting(200, "objects at any time")
-    seconds: float = setting(300.0, "length of the recording")
-    rate: float = setting(10.0, "frames a second")
-    rows: int = setting(10, "times at which memory is looked at")
-    compared: float = setting(20.0, "s of a recording of its own on which the result is compared with the batch's")
+    objects: Annotated[int, Range(PLATOON, 10**6)] = setting(200, "objects at any time")
+    seconds: Positive = setting(300.0, "length of the recording")
+    rate: Positive = setting(10.0, "frames a second")
+    rows: Annotated[int, Range(1, 1000)] = setting(10, "times at which memory is looked at")
+    compared: Positive = setting(20.0, "s of a recording of its own on which the result is compared with the batch's")
     seed: int = setting(0, "seed of the traffic")
-
-    def __post_init__(self) -> None:
-        require_between(self, PLATOON, 10**6, "objects")
-        require_positive(self, "seconds", "rate", "compared")
-        require_between(self, 1, 1000, "rows")
 
 
 @dataclass(frozen=True)
@@ -209,7 +205,7 @@ class _Score:
         """Of a frame."""
         self._waiting.append((at, instant.transition.nodes, instant.truth))
 
-    def count(self, moments: tuple[Smoothed, ...]) -> None:
+    def count(self, moments: tuple[SmoothedState, ...]) -> None:
         """Compare moments with the truth, and forget it."""
         for moment in moments:
             if not self._waiting or moment.time < self._waiting[0][0] - 1e-6:
@@ -226,7 +222,7 @@ class _Score:
 def _largest_difference(settings: StreamingBenchSettings, window: WindowSettings | None) -> float:
     """Of any component of any mean from that of the batch smoother, on the first seconds of the traffic."""
     smoother, batch = WindowedSmoother(window), BatchSmoother(likelihoods=False, order="time")
-    moments: list[Smoothed] = []
+    moments: list[SmoothedState] = []
     for instant in traffic(settings, round(settings.compared * settings.rate)):
         _take(smoother, instant)
         _take(batch, instant)

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.drawn_scenes import LABEL, DrawnSettings, drawn_config, drawn_scene
+from benchmarks.in_view_fit import fit_interactions_in_view
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
-from data_tools.sightings import sightings
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.learning import Sightings, Trajectories, fit_acceleration_noise_by_class, fit_interactions_in_view
+from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
@@ -63,10 +63,7 @@ Sums = Callable[[SceneMetrics], tuple[float, float]]
 def _independent(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfig:
     """Without edges, the noise fitted on scenes of the cell."""
     config = drawn_config(settings, ())
-    objects: dict[str, list[Sightings]] = {}
-    for scene in scenes:
-        for label, found in sightings(scene, config.sensors).items():
-            objects.setdefault(label, []).extend(found.values())
+    objects = measured_trajectories(scenes, config.sensors)
     return config.with_acceleration_noise(fit_acceleration_noise_by_class(objects))
 
 

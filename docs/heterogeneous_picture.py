@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from benchmarks.affected import affected
 from benchmarks.heterogeneous import cars_alone
 from data_tools.simulator.scenarios import scenario_settings
-from data_tools.simulator.scene import scene_in
+from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.world import World, build_world
 from pipelines.config import TrackConfig, load_config
 from saga_fg.numerics.arrays import FloatArray
@@ -48,7 +48,7 @@ def panel(axes: Any) -> None:
     """One scene: what is there, and where the affected vehicles are and are said to be two seconds on."""
     settings = replace(scenario_settings(KIND), duration=MOMENT + HORIZON + 1)
     world: World = build_world(settings, SEED)
-    scene = scene_in(world, settings, SEED)
+    scene = scene_from_world(world, settings, SEED)
     row = round(MOMENT * settings.keyframe_rate)
     then = scene.ground_truth[row + round(HORIZON * settings.keyframe_rate)]  # type: ignore[index]
     now = scene.ground_truth[row]  # type: ignore[index]

@@ -16,7 +16,7 @@ import numpy as np
 from data_tools.metrics import Interval, paired_bootstrap
 from pipelines.config import TrackConfig
 from pipelines.slam.joint import JointRun, run_joint
-from pipelines.slam.roadside import poles_at
+from pipelines.slam.simulated_poles import poles_at
 from pipelines.tracking import Progress
 from saga_fg.slam.joint import JointSettings, LaneSettings
 from saga_fg.types.dataset import Scene
@@ -82,11 +82,12 @@ def bench_joint(
     for seed in seeds:
         for scene in scenes:
             run = run_joint(scene, config, settings, sensor, seed)
-            odometry, joint = run.errors()
+            errors = run.errors()
+            odometry, joint = errors["odometry"], errors["joint"]
             with_poles = float("nan")
             if poles:
                 see = partial(poles_at, seed=seed)
-                with_poles = run_joint(scene, config, settings, sensor, seed, see).errors()[1].ate
+                with_poles = run_joint(scene, config, settings, sensor, seed, see).errors()["joint"].ate
             on_lanes = None
             if lanes:
                 on_lanes = run_joint(scene, config, replace(settings, lanes=LaneSettings()), sensor, seed)
@@ -103,7 +104,7 @@ def bench_joint(
                     with_poles,
                     _in_map(run),
                     float("nan") if on_lanes is None else _in_map(on_lanes),
-                    float("nan") if on_lanes is None else on_lanes.errors()[1].ate,
+                    float("nan") if on_lanes is None else on_lanes.errors()["joint"].ate,
                 )
             )
             if progress is not None:
@@ -114,7 +115,7 @@ def bench_joint(
 
 
 def _in_map(run: JointRun) -> float:
-    off = run.joint.positions - run.truth.positions
+    off = run.paths["joint"].positions - run.truth.positions
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 

@@ -64,7 +64,7 @@ def joint(
     from pipelines.bench.joint import bench_joint
     from pipelines.config import load_config
     from pipelines.figures import write_figures
-    from pipelines.slam.simulated import street
+    from pipelines.slam.joint import street
     from saga_fg.errors import InputError
 
     if (dataroot is None) != (detections is None):

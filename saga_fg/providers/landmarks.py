@@ -15,25 +15,22 @@ from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.providers.start import NO_POSE
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)
-class Landmarks:
-    """Adds sightings of landmarks (`frame.ego.landmarks`), and each landmark when it is first seen.
+class Landmarks(Settings):
+    """Add observations of landmarks (`frame.ego.landmarks`), and each landmark when it is first seen.
 
     Which one is seen is known; its kind is the observation's (`saga_fg.slam.mapping`).
     """
 
     labels: tuple[str, ...] = setting(
-        (), "detections in the vehicle's frame with one of these labels are sightings of a point, one point a label"
+        (), "detections in the vehicle's frame with one of these labels are observations of a point, one point a label"
     )
-    deviation: float = setting(0.3, "standard deviation of such a sighting, m")
+    deviation: Positive = setting(0.3, "standard deviation of such an observation, m")
     name: str = setting("landmarks", "what it is called in messages")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation")
 
     def factors(self, view: GraphView) -> Additions:
         pose = view.now(EGO_POSE).get(0)
@@ -44,7 +41,7 @@ class Landmarks:
         known, world_T_pose = view.static(LANDMARK), view.state(pose.key).matrix()
         new: dict[int, NewVariable] = {}
         factors: list[Factor] = []
-        for name, seen in self._sightings(view, planar=pose.dim == 3):
+        for name, seen in self._observations(view, planar=pose.dim == 3):
             kind = seen.kind
             if name not in known and name not in new:
                 start = kind.initialise(world_T_pose, seen.value)
@@ -54,7 +51,7 @@ class Landmarks:
             factors += [given] if isinstance(given, gtsam.NonlinearFactorGraph) else given
         return Additions(list(new.values()), factors)
 
-    def _sightings(self, view: GraphView, planar: bool) -> Iterator[tuple[int, Observation]]:
+    def _observations(self, view: GraphView, planar: bool) -> Iterator[tuple[int, Observation]]:
         frame = view.frame
         assert frame is not None
         if frame.ego is not None:

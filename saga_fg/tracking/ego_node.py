@@ -77,7 +77,7 @@ class EgoNode:
         if self.present:
             joint.update(_ID, label, z, R, np.zeros(1, dtype=bool), 0.0, relative)
         else:
-            speed = self.motion.birth_speed**2 * np.eye(2)[None]
+            speed = self.motion.initial_speed_deviation**2 * np.eye(2)[None]
             joint.add(_ID, label, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), relative=relative)
         velocity = joint.kinematics_of(_ID, label).velocity[0]
         self.present, self.time, self.yaw = True, time, float(yaw_of(pose[:3, :3]))

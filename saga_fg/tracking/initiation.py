@@ -20,8 +20,8 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     """Append new tracks; returns the rows of their measurements, whose delay the tracks are predicted by."""
     free = np.ones(len(measurements), dtype=bool)
     free[matching.detection] = False
-    birth_score = state.class_values(measurements.boxes.label, "birth_score")[0]
-    rows = np.flatnonzero(free & (measurements.probability >= birth_score))
+    initiation_score = state.class_values(measurements.boxes.label, "initiation_score")[0]
+    rows = np.flatnonzero(free & (measurements.probability >= initiation_score))
     if len(rows) == 0:
         return rows
     k, delay, boxes, p = len(rows), measurements.delay, measurements.boxes.select(rows), measurements.probability[rows]
@@ -46,7 +46,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         has_moved=np.zeros(k, dtype=bool),
         opportunities=np.ones(k),
         hits=np.ones(k),
-        accepted=np.full(k, measurements.sensor.births == "alone"),
+        accepted=np.full(k, measurements.sensor.initiation == "alone"),
         ready=np.zeros(k, dtype=bool),
         class_belief=state.class_groups.updated(0 * likelihood, likelihood),
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
@@ -81,7 +81,7 @@ def initial_kinematics(
 def _unmeasured_velocity(state: TrackerState, boxes: Boxes, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Velocity (k, 2), its covariance (k, 2, 2) and the probability (k,) to be stationary, by class, heading and
     traffic."""
-    speed, drift = state.class_values(boxes.label, "birth_speed", "birth_drift")
+    speed, drift = state.class_values(boxes.label, "initial_speed_deviation", "initial_lateral_speed_deviation")
     stationary, mean, variance = state.traffic.expected(boxes.label, boxes.position[:, :2], boxes.yaw, speed**2, prior)
     known = np.isfinite(boxes.yaw)
     ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))

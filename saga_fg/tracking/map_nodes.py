@@ -2,8 +2,8 @@
 
 Nodes of the map are stationary; their positions start at those of the map, as uncertain as the map, and are corrected
 by detections of lights and through the interactions of vehicles that stop at a line or keep a lane. Ids count down from
--1, so that they are never those of tracks. Detections labelled `saga_fg.types.signal.SIGHTINGS` report the colour of
-the nearest known light within reach.
+-1, so that they are never those of tracks. Detections labelled `saga_fg.types.signal.COLOUR_LABELS` report the
+colour of the nearest known light within reach.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, WALL, RoadMap
 from saga_fg.types.sensor import Sensor
-from saga_fg.types.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
+from saga_fg.types.signal import COLOUR_LABELS, COLOURS, SignalSettings, colour_updated
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
@@ -99,10 +99,10 @@ class MapNodes:
     def update(self, frame: Frame, sensor: Sensor, origin: FloatArray, joint: JointTrackState, delay: float) -> None:
         """Take in the colours and positions of lights in a frame taken `delay` s ago."""
         lights = np.flatnonzero(self.label == LIGHT)
-        if len(lights) == 0 or not of_classes(frame.detections.boxes.label, SIGHTINGS).any():
+        if len(lights) == 0 or not of_classes(frame.detections.boxes.label, COLOUR_LABELS).any():
             return
         seen = sensor.in_world(frame)
-        seen = seen.select(of_classes(seen.boxes.label, SIGHTINGS))
+        seen = seen.select(of_classes(seen.boxes.label, COLOUR_LABELS))
         R = sensor.detection_covariance(seen, sensor.origin(frame))
         position, _, P, _ = joint.kinematics_of(self.id[lights], self.label[lights])
         z = seen.boxes.position[:, :2] - origin
@@ -113,7 +113,7 @@ class MapNodes:
         row, column = assign(cost, possible, cost.max(initial=0.0) + 1.0)
         belief = dict(self.beliefs)
         for light, detection in zip(lights[row].tolist(), column.tolist(), strict=True):
-            colour = SIGHTINGS.index(str(seen.boxes.label[detection]))
+            colour = COLOUR_LABELS.index(str(seen.boxes.label[detection]))
             name = self.name[light]
             belief[name] = colour_updated(belief[name], colour, sensor.colour_accuracy)
         self.beliefs = belief

@@ -1,7 +1,7 @@
 """The measurements of a frame: its usable detections, in the world, with the sensor's model of their noise.
 
-Duplicates are left out by non-maximum suppression. Of two detections of a class closer than `duplicate_distance` the
-less probable one is suppressed; within `shadow_distance` only where its probability is below `shadow_ratio` of the
+Duplicates are left out by non-maximum suppression. Of two detections of a class closer than `nms_distance` the
+less probable one is suppressed; within `weak_nms_distance` only where its probability is below `weak_nms_ratio` of the
 other's: two people may walk half a metre apart, but a weak detection that close to a strong one is most often a
 duplicate. Boxes of different classes suppress each other only where they overlap.
 """
@@ -22,7 +22,7 @@ from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 from saga_fg.types.overlap import paired_bev_iou, touching_pairs
 from saga_fg.types.sensor import Sensor
-from saga_fg.types.signal import SIGHTINGS
+from saga_fg.types.signal import COLOUR_LABELS
 
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 
@@ -78,9 +78,9 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     detections = sensor.in_world(frame)
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
-    objects = ~of_classes(label, SIGHTINGS)  # the colours of lights are not objects of their own
+    objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
     keep = np.flatnonzero(objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0]))
-    names = ("duplicate_distance", "shadow_distance", "shadow_ratio", "class_overlap")
+    names = ("nms_distance", "weak_nms_distance", "weak_nms_ratio", "cross_class_nms_iou")
     *limits, overlap = class_values(classes, ClassSettings, label[keep], *names)
     kept = suppress_duplicates(detections.boxes.select(keep), probability[keep], *limits)
     keep, overlap = keep[kept], overlap[kept]

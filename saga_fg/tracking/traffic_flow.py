@@ -2,7 +2,7 @@ r"""Prior of the speed of a new track, from tracks of its class that head, or he
 
     k_j = weight * max over the passages of j of
               exp( -ahead^2 / (2 ahead_scale^2) - lateral^2 / (2 lateral_scale^2) - turn^2 / (2 heading_scale^2) )
-    p(speed) ~ N(0, birth_speed^2) + sum_j k_j N(s_j, sigma_j^2 + spread^2)
+    p(speed) ~ N(0, initial_speed_deviation^2) + sum_j k_j N(s_j, sigma_j^2 + spread^2)
 
 Every neighbour j counts once, by its nearest passage within `memory`, with its speed s_j along its heading there
 (parked ones with a speed near 0). The new track takes the mean and the variance of the mixture: as wide as the

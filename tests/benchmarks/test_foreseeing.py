@@ -9,7 +9,7 @@ from benchmarks.foreseeing import Foreseeing
 from benchmarks.foresight import foreseen
 from benchmarks.predictions import prediction_errors
 from data_tools.simulator.scenarios import scenario_settings
-from data_tools.simulator.scene import scene_in
+from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.world import build_world
 from pipelines.config import load_config
 
@@ -36,14 +36,14 @@ def test_drivers_who_are_all_alike_are_foreseen(even):
 def test_errors_of_estimates_are_carried_on(even):
     world, settings = even
     exact = foreseen(world, settings, world.start + 1.0, 2.0, {})
-    number = int(np.argmax(world.history.s[0] * (world.scenario.lanes.direction[world.history.lane[0]] > 0)))
+    number = int(np.argmax(world.history.s[0] * (world.layout.lanes.direction[world.history.lane[0]] > 0)))
     speed = float(world.history.speed[round(1.0 / settings.step), number])
     assert foreseen(world, settings, world.start + 1.0, 2.0, {number: (0.5, speed)})[number] > exact[number] + 0.2
 
 
 def test_the_floor_starts_from_the_tracks_of_the_tracker():
     world = build_world(SETTINGS, 500)
-    scene = scene_in(world, SETTINGS, 500)
+    scene = scene_from_world(world, SETTINGS, 500)
     scene = replace(scene, frames=scene.frames[::3])
     offset = float(scene.timestamps[0]) - world.start
     config = load_config("heterogeneous")

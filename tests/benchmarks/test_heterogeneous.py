@@ -52,7 +52,7 @@ def test_predictions_know_nothing_of_the_time_after():
 def test_the_baselines_differ_in_their_edges():
     found = contenders(load_config("heterogeneous"))
     kinds = {name: [type(edge).__name__ for edge in config.tracker.edges] for name, config in found.items()}
-    assert set(kinds["full"]) == {"RedLight", "InLane", "ConeEdge", "Following", "Attached", "Neighbours"}
+    assert set(kinds["full"]) == {"RedLight", "InLane", "ConeLine", "Following", "Attached", "Neighbours"}
     assert set(kinds["cars"]) == {"Following", "Neighbours"}
     assert kinds["kf"] == []
     assert cars_alone(found["full"]).tracker.classes == found["full"].tracker.classes

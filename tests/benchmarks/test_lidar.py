@@ -8,9 +8,8 @@ import numpy as np
 from typer.testing import CliRunner
 
 from benchmarks.app import app
-from data_tools.simulator.scan_drive import SimulatedScans
 from data_tools.simulator.scanner import ScannerSettings
-from data_tools.simulator.street import street
+from data_tools.simulator.street import SimulatedScans, street
 from pipelines.config import load_config
 from pipelines.detector_free import cluster_scene
 from pipelines.tracking import track_scene

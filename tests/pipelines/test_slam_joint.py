@@ -12,14 +12,13 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.simulator import simulate_scene
-from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
+from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from pipelines.bench.joint import JointBench, bench_joint
 from pipelines.bench.joint_online import bench_online
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.slam.joint import keyframes, run_joint
-from pipelines.slam.roadside import RoadsideSettings, observe_poles
-from pipelines.slam.simulated import street
+from pipelines.slam.joint import keyframes, run_joint, street
+from pipelines.slam.simulated_poles import SimulatedPoleSettings, observe_poles
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint import JointSettings
@@ -66,8 +65,8 @@ def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None
     assert told[-1] == result
     assert [row.scene for row in result.rows] == ["street 1", "street 2"]
     for scene, row in zip(scenes, result.rows, strict=True):
-        odometry, joint = run_joint(scene, config, settings, "lidar", 0).errors()
-        assert (row.decoupled_ate, row.joint_ate) == (odometry.ate, joint.ate)
+        errors = run_joint(scene, config, settings, "lidar", 0).errors()
+        assert (row.decoupled_ate, row.joint_ate) == (errors["odometry"].ate, errors["joint"].ate)
     square = [(row.joint_ate**2, row.decoupled_ate**2) for row in result.rows]
     joint_square, decoupled_square = np.sum(square, axis=0)
     assert result.landmarks is not None
@@ -95,7 +94,7 @@ def test_options_of_the_benchmark_go_together() -> None:
 
 def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
     poses = np.stack([yaw_transform(0.5 * k) for k in range(60)])
-    settings = RoadsideSettings(reach=20.0, noise=0.1)
+    settings = SimulatedPoleSettings(reach=20.0, noise=0.1)
     seen = observe_poles(poses, 1, settings)
     assert len(seen) == len(poses)
     places = np.array([pose[:2, 3] + o.value[:2] for pose, now in zip(poses, seen, strict=True) for o in now])
@@ -112,9 +111,7 @@ def test_online_objects_are_scored_where_both_report_them() -> None:
     result = bench_online(scenes, config, [0], lag=1.0)
     for scene, row in zip(scenes, result.rows, strict=True):
         run = run_joint(scene, config, JointSettings(), "lidar", 0, lag=1.0)
-        assert run.online is not None
-        online = Trajectory(run.online.timestamps, run.online.newest)
-        assert row.ate == (run.errors()[0].ate, trajectory_errors(online, run.truth).ate)
+        assert row.ate == (run.errors()["odometry"].ate, run.errors()["online"].ate)
         assert row.pairs > 20
         assert 0 < row.median_velocity[1] < row.velocity[1] < 5
         assert 0 < row.position[1] < 2
