@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
-from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscenes_tracking_metrics
+from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
 from pipelines.config import load_config
 from pipelines.process import one_thread
@@ -93,7 +93,7 @@ def differences(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> Iterat
 
     GT over all classes is left out: the official figure is a mean over classes, ours the sum.
     """
-    for field in fields(TrackingFigures):
+    for field in fields(NuScenesClassMetrics):
         if field.name != "gt":
             yield field.name, _apart(getattr(ours.overall, field.name), theirs[field.name])
         for label, value in theirs["label_metrics"][field.name].items():

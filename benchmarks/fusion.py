@@ -18,7 +18,7 @@ import numpy as np
 from data_tools.metrics import (
     Interval,
     NuScenesTrackingScene,
-    TrackTable,
+    SceneBoxes,
     match_scene,
     nuscenes_tracking_metrics,
 )
@@ -177,8 +177,8 @@ def on_visible(scene: Scene, tracks: Sequence[Tracks]) -> NuScenesTrackingScene:
     return NuScenesTrackingScene(
         scene.timestamps,
         scene.world_T_ego[:, :2, 3],
-        TrackTable.of_annotations(scene.ground_truth, hidden=False),
-        TrackTable.of_tracks(scored),
+        SceneBoxes.of_annotations(scene.ground_truth, hidden=False),
+        SceneBoxes.of_tracks(scored),
     )
 
 
