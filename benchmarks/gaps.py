@@ -37,12 +37,12 @@ from pipelines.learning import TrajectorySource
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import (
+    FilterNoise,
+    FilterNoiseLikelihood,
     FittedInteractions,
     GapSample,
     GapSettings,
     JointGaps,
-    OwnMotion,
-    OwnMotionLikelihood,
     Trajectories,
     errors_alone,
     fit_by_held_out,
@@ -135,7 +135,7 @@ def gap_errors(
     folds = min(settings.folds, len(names))
     likelihoods = []
     for done, name in enumerate(names):
-        likelihoods.append(OwnMotionLikelihood(recordings[name], classes, lengths))
+        likelihoods.append(FilterNoiseLikelihood(recordings[name], classes, lengths))
         if progress is not None:
             progress(f"own motion {name}", done + 1, len(names))
     methods = {LEARNED: fit_interactions} | ({NETWORK: fit_networks} if settings.network else {})
@@ -143,7 +143,7 @@ def gap_errors(
     parts: list[tuple[GapSample, FloatArray, dict[Method, FloatArray]]] = []
     for fold in range(min(folds, settings.tested_folds or folds)):
         training = [k for k in range(len(names)) if k % folds != fold]
-        own = OwnMotion.most_likely([likelihoods[k] for k in training])
+        own = FilterNoise.most_likely([likelihoods[k] for k in training])
         if not any(n for k in training for n in likelihoods[k].count.values()):
             taught = ", ".join(names[k] for k in training)
             wanted = f"some {' or '.join(classes)}, followed for {lengths.followed:g} s"
@@ -158,7 +158,7 @@ def gap_errors(
             gaps = _sample(trajectories, own, classes, lengths, k).drawn(settings.most_gaps, seed=1)
             fitted = {method: found[-1] for method, found in learned.items()}
             errors = _errors(trajectories, gaps, own, hand_crafted, fitted, lengths)
-            alone = OwnMotion(fitted[LEARNED].acceleration_noise, own.position_noise)
+            alone = FilterNoise(fitted[LEARNED].acceleration_noise, own.position_noise)
             same = _sample(trajectories, alone, classes, lengths, k).drawn(settings.most_gaps, seed=1)
             errors[NOISE_ALONE] = errors_alone(same)
             parts.append((gaps, trajectories.time[gaps.moment] // BLOCK, errors))
@@ -189,7 +189,7 @@ def _ends(recordings: Mapping[str, Trajectories], lengths: GapSettings) -> Float
 def _errors(
     trajectories: Trajectories,
     gaps: GapSample,
-    own: OwnMotion,
+    own: FilterNoise,
     hand_crafted: Sequence[EdgeRule],
     learned: Mapping[Method, FittedInteractions],
     lengths: GapSettings,
@@ -207,7 +207,7 @@ def _errors(
 
 
 def _sample(
-    trajectories: Trajectories, own: OwnMotion, classes: tuple[str, ...], lengths: GapSettings, number: int
+    trajectories: Trajectories, own: FilterNoise, classes: tuple[str, ...], lengths: GapSettings, number: int
 ) -> GapSample:
     return sample_gaps(trajectories, own.filtered(trajectories), classes, lengths, number)
 

@@ -26,9 +26,8 @@ from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig, load_config
 from pipelines.figures import FigureTable, cell, percent, write_figures
-from pipelines.slam.joint import JointRun, run_joint
-from pipelines.slam.roadside import poles_at
-from pipelines.slam.simulated import street
+from pipelines.slam.joint import JointRun, run_joint, street
+from pipelines.slam.simulated_poles import poles_at
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.slam.joint import JointSettings, LaneSettings
@@ -95,11 +94,12 @@ def bench_joint(
     for seed in seeds:
         for scene in scenes:
             run = run_joint(scene, config, settings, sensor, seed)
-            odometry, joint = run.errors()
+            errors = run.errors()
+            odometry, joint = errors["odometry"], errors["joint"]
             with_poles = float("nan")
             if poles:
                 see = partial(poles_at, seed=seed)
-                with_poles = run_joint(scene, config, settings, sensor, seed, see).errors()[1].ate
+                with_poles = run_joint(scene, config, settings, sensor, seed, see).errors()["joint"].ate
             on_lanes = None
             if lanes:
                 on_lanes = run_joint(scene, config, replace(settings, lanes=LaneSettings()), sensor, seed)
@@ -116,7 +116,7 @@ def bench_joint(
                     with_poles,
                     _in_map(run),
                     float("nan") if on_lanes is None else _in_map(on_lanes),
-                    float("nan") if on_lanes is None else on_lanes.errors()[1].ate,
+                    float("nan") if on_lanes is None else on_lanes.errors()["joint"].ate,
                 )
             )
             if progress is not None:
@@ -127,7 +127,7 @@ def bench_joint(
 
 
 def _in_map(run: JointRun) -> float:
-    off = run.joint.positions - run.truth.positions
+    off = run.paths["joint"].positions - run.truth.positions
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 

@@ -8,7 +8,7 @@ is never seen again has left, and counts only among the *hidden*. Intervals are 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -16,7 +16,6 @@ import numpy as np
 import typer
 
 from data_tools.metrics import Interval, SceneMetrics, paired_bootstrap, scene_metrics
-from data_tools.sightings import sightings
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import progress_bar
@@ -25,8 +24,8 @@ from pipelines.config import Method, TrackConfig, load_config
 from pipelines.figures import FigureTable, cell, percent
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import Sightings, fit_acceleration_noise_by_class
-from saga_fg.types.dataset import Annotations
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
+from saga_fg.types.dataset import Annotations, Scene
 
 METHODS: tuple[Method, Method] = ("kf", "saga")
 
@@ -56,13 +55,14 @@ def bench_occlusion(
     """Fit on `fit_seeds`, compare on `seeds`."""
     simulator = SimulatorSettings()
     total = len(fit_seeds) + len(seeds)
-    objects: dict[str, list[Sightings]] = {}
-    for done, seed in enumerate(fit_seeds):
-        for label, found in sightings(simulate_scene(simulator, seed), config.sensors).items():
-            objects.setdefault(label, []).extend(found.values())
-        if progress is not None:
-            progress("fitting", done + 1, total)
-    noise = fit_acceleration_noise_by_class(objects)
+
+    def scenes() -> Iterator[Scene]:
+        for done, seed in enumerate(fit_seeds):
+            yield simulate_scene(simulator, seed)
+            if progress is not None:
+                progress("fitting", done + 1, total)
+
+    noise = fit_acceleration_noise_by_class(measured_trajectories(scenes(), config.sensors))
     config = config.with_acceleration_noise(noise)
     occluded: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}
     hidden: dict[Method, list[SceneMetrics]] = {method: [] for method in METHODS}

@@ -25,7 +25,7 @@ from pipelines.figures import FigureTable, cell
 from pipelines.process import one_thread, resident_memory
 from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
 from pipelines.tracking import Progress
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.smoothing import Labels
 
 PLATOON, GAP = 5, 15.0  # cars, and m between them
@@ -37,18 +37,14 @@ PART = 30.0  # s that are read at a time, after which memory is read
 
 
 @dataclass(frozen=True)
-class StreamingBenchSettings:
+class StreamingBenchSettings(Settings):
     """How much is measured."""
 
-    objects: int = setting(200, "objects at any time")
-    seconds: float = setting(300.0, "length of the recording, s")
-    rate: float = setting(10.0, "frames a second")
-    compared: float = setting(20.0, "length of the recording that is compared with the batch's labels, s")
+    objects: Annotated[int, Range(PLATOON, 10**6)] = setting(200, "objects at any time")
+    seconds: Positive = setting(300.0, "length of the recording, s")
+    rate: Positive = setting(10.0, "frames a second")
+    compared: Positive = setting(20.0, "length of the recording that is compared with the batch's labels, s")
     seed: int = setting(0, "seed of the traffic")
-
-    def __post_init__(self) -> None:
-        require_between(self, PLATOON, 10**6, "objects")
-        require_positive(self, "seconds", "rate", "compared")
 
     @property
     def frames(self) -> int:

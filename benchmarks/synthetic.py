@@ -20,9 +20,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.in_view_fit import fit_interactions_in_view
 from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sampled_config
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
-from data_tools.sightings import sightings
 from pipelines.cli.options import Verbose, names
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
@@ -30,7 +30,7 @@ from pipelines.config import TrackConfig
 from pipelines.figures import FigureTable, cell, percent
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import Sightings, Trajectories, fit_acceleration_noise_by_class, fit_interactions_in_view
+from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
@@ -70,10 +70,7 @@ Sums = Callable[[SceneMetrics], tuple[float, float]]
 def _independent(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfig:
     """Without edges, the noise fitted on scenes of the cell."""
     config = sampled_config(settings, ())
-    objects: dict[str, list[Sightings]] = {}
-    for scene in scenes:
-        for label, found in sightings(scene, config.sensors).items():
-            objects.setdefault(label, []).extend(found.values())
+    objects = measured_trajectories(scenes, config.sensors)
     return config.with_acceleration_noise(fit_acceleration_noise_by_class(objects))
 
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from data_tools.simulator.scenarios import scenario_settings
-from data_tools.simulator.scene import scene_in
+from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.world import World, build_world
 from pipelines.config import TrackConfig, load_config
 from saga_fg.model.edge_rules import Following, Neighbours
@@ -38,7 +38,7 @@ def before_a_red_light(world: World, time: float) -> StrArray:
     history = world.history
     k = int(np.argmin(np.abs(history.time - time)))
     found = np.zeros(history.s.shape[1], dtype=np.bool_)
-    for line in world.scenario.stop_lines:
+    for line in world.layout.stop_lines:
         if line.closed(time):
             ahead = line.s - history.s[k]
             found |= np.isin(history.lane[k], line.lanes) & (ahead > 0) & (ahead < 100.0)
@@ -65,7 +65,7 @@ def panel(axes: Any) -> None:
     """One scene: what is there, and where vehicles before the light are, and are predicted to be, two seconds later."""
     settings = replace(scenario_settings(KIND), duration=MOMENT + HORIZON + 1)
     world: World = build_world(settings, SEED)
-    scene = scene_in(world, settings, SEED)
+    scene = scene_from_world(world, settings, SEED)
     row = round(MOMENT * settings.keyframe_rate)
     then = scene.ground_truth[row + round(HORIZON * settings.keyframe_rate)]  # type: ignore[index]
     now = scene.ground_truth[row]  # type: ignore[index]

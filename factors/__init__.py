@@ -10,7 +10,6 @@ from factors.between import Pose, between_factor, noise_model, pose, pose_prior_
 from factors.calibrated_range import calibrated_range_factors
 from factors.camera import Camera, PixelBearing
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
-from factors.edge import HesseLine, edge_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
     check_dimensions,
@@ -22,6 +21,7 @@ from factors.gaussian import (
 )
 from factors.interaction import interaction_factor, interaction_factors
 from factors.lane import lane_boundary_factors, lane_keeping_factors
+from factors.line import HesseLine, line_factors
 from factors.marginal import marginal_factors, marginal_moments
 from factors.measurement import Components, MeasurementModel, box, position, position_velocity
 from factors.nonlinear import Linearisable, ResidualFactor
@@ -77,7 +77,6 @@ __all__ = [
     "check_dimensions",
     "detection_factor",
     "detection_factors",
-    "edge_factors",
     "gaussian_factor",
     "gaussian_factors",
     "gaussian_graph",
@@ -86,6 +85,7 @@ __all__ = [
     "joint_prior_factor",
     "lane_boundary_factors",
     "lane_keeping_factors",
+    "line_factors",
     "linear_detection_factor",
     "linear_detection_factors",
     "linearised",

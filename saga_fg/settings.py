@@ -1,21 +1,100 @@
-"""How settings are declared: frozen dataclasses whose fields carry their own comment.
+"""How settings are declared: frozen dataclasses whose fields carry their own comment and range.
 
     @dataclass(frozen=True)
-    class GateSettings:
-        probability: float = setting(0.99, "share of true detections the gate lets through")
+    class GateSettings(Settings):
+        probability: Fraction = setting(0.99, "share of true detections the gate lets through")
 
-The comment is what `saga-fg config` prints and what the configuration reference in the docs is made of. Numbers out of
-their range end in an `InputError` at construction, by the `require_...` functions in `__post_init__`.
+The comment is what `saga-fg config` prints and what the configuration reference in the docs is made of, the range
+what construction checks: a number outside, or a word that is no choice of a `Literal`, ends in an `InputError`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from saga_fg.errors import InputError
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers from `low` to `high`; without `low` itself if `above`, with infinity if `infinite`.
+
+    For a tuple it is that of every entry; entries do not fall if `ascending`.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    infinite: bool = False
+    ascending: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        inside = (self.low < value if self.above else self.low <= value) and value <= self.high
+        return inside and (self.infinite or math.isfinite(value))
+
+    def __str__(self) -> str:
+        """As in "expected a finite number > 0"."""
+        if self.high < math.inf:
+            return f"number {'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+        bound = "" if self.low == -math.inf else f" {'>' if self.above else '>='} {self.low:g}"
+        return f"{'' if self.infinite else 'finite '}number{bound}"
+
+
+Finite = Annotated[float, Range()]
+Positive = Annotated[float, Range(0, above=True)]
+PositiveOrInf = Annotated[float, Range(0, above=True, infinite=True)]
+NonNegative = Annotated[float, Range(0)]
+Fraction = Annotated[float, Range(0, 1)]
+PositiveInt = Annotated[int, Range(0, above=True)]
+NonNegativeInt = Annotated[int, Range(0)]
+
+
+class Settings:
+    """Base of settings dataclasses: construction raises `InputError` for values outside their ranges and choices."""
+
+    def __post_init__(self) -> None:
+        cls: Any = type(self)
+        for name, allowed in _allowed(cls):
+            given = getattr(self, name)
+            if isinstance(allowed, Range) and allowed.ascending and list(given) != sorted(given):
+                raise InputError(f"{name}: expected ascending numbers, got {given!r}")
+            for where, value in _values(name, given):
+                if isinstance(allowed, Range) and value not in allowed:
+                    raise InputError(f"{where}: expected a {allowed}, got {value!r}")
+                if isinstance(allowed, tuple) and value not in allowed:
+                    raise InputError(f"{where}: expected one of {', '.join(allowed)}, got {value!r}")
+
+
+@cache
+def _allowed(cls: type) -> list[tuple[str, Range | tuple[str, ...]]]:
+    """The range or the choices of each field that has some."""
+    found = [(name, range_of(hint)) for name, hint in get_type_hints(cls, include_extras=True).items()]
+    return [(name, allowed) for name, allowed in found if allowed is not None]
+
+
+def range_of(hint: Any) -> Range | tuple[str, ...] | None:
+    """The range, or the choices, of a type hint: its own, or that of its entries; None: it has none."""
+    if get_origin(hint) is Annotated:
+        return next((one for one in hint.__metadata__ if isinstance(one, Range)), None)
+    if get_origin(hint) is Literal:
+        return get_args(hint)
+    return next((one for one in map(range_of, get_args(hint)) if one is not None), None)
+
+
+def _values(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """A setting's value, or those of its entries, each with its dotted name; none for None."""
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            yield from _values(f"{name}.{key}", entry)
+    elif isinstance(value, tuple | list):
+        for entry in value:
+            yield from _values(name, entry)
+    elif value is not None:
+        yield name, value
 
 
 def setting(default: Any, comment: str) -> Any:
@@ -31,27 +110,3 @@ def required_setting(comment: str) -> Any:
 def settings_group(factory: Callable[[], Any], comment: str) -> Any:
     """A dataclass field that holds further settings (a nested dataclass, a mapping, a tuple), made by `factory`."""
     return field(default_factory=factory, metadata={"comment": comment})
-
-
-def require_positive(settings: Any, *names: str, infinite: bool = False) -> None:
-    """Raises `InputError` unless these settings are numbers > 0, finite ones unless `infinite` is allowed."""
-    for name in names:
-        value = getattr(settings, name)
-        if not (value > 0 and (infinite or math.isfinite(value))):
-            raise InputError(f"{name}: expected a {'' if infinite else 'finite '}number > 0, got {value!r}")
-
-
-def require_between(settings: Any, low: float, high: float, *names: str) -> None:
-    """Raises `InputError` unless these settings are finite numbers from `low` to `high` (may be infinite)."""
-    for name in names:
-        value = getattr(settings, name)
-        if not (low <= value <= high and math.isfinite(value)):
-            expected = f"a finite number >= {low:g}" if high == math.inf else f"a number from {low:g} to {high:g}"
-            raise InputError(f"{name}: expected {expected}, got {value!r}")
-
-
-def require_one_of(settings: Any, name: str, choices: tuple[str, ...]) -> None:
-    """Raises `InputError` unless the setting is one of `choices`."""
-    value = getattr(settings, name)
-    if value not in choices:
-        raise InputError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")

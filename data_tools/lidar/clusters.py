@@ -22,7 +22,7 @@ import numpy as np
 from data_tools.lidar.components import connected_from_above
 from data_tools.lidar.ground import segment_ground
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.settings import Positive, PositiveInt, Settings, setting, settings_group
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections
 
@@ -49,19 +49,16 @@ def _sizes() -> dict[str, ObjectSize]:
 
 
 @dataclass(frozen=True)
-class ClusterSettings:
+class ClusterSettings(Settings):
     """How points become boxes; the first class whose sizes fit is taken."""
 
-    cell: float = setting(0.3, "of the grid on which points are joined, m")
-    lowest: float = setting(0.25, "height above the ground from which points count, m")
-    highest: float = setting(2.6, "and up to which, m")
-    reach: float = setting(40.0, "from the sensor, m")
-    foot: float = setting(0.6, "height above the ground that the lowest point must not exceed, m")
-    points: int = setting(10, "least points")
+    cell: Positive = setting(0.3, "of the grid on which points are joined, m")
+    lowest: Positive = setting(0.25, "height above the ground from which points count, m")
+    highest: Positive = setting(2.6, "and up to which, m")
+    reach: Positive = setting(40.0, "from the sensor, m")
+    foot: Positive = setting(0.6, "height above the ground that the lowest point must not exceed, m")
+    points: PositiveInt = setting(10, "least points")
     classes: Mapping[str, ObjectSize] = settings_group(_sizes, "sizes by class")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "cell", "lowest", "highest", "reach", "foot", "points")
 
 
 def detect_clusters(points: FloatArray, settings: ClusterSettings | None = None) -> Detections:

@@ -13,22 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
 @dataclass(frozen=True)
-class CurbSettings:
+class CurbSettings(Settings):
     """What counts as a curb; lengths in m."""
 
-    sectors: int = setting(180, "the horizon is cut into")
-    spacing: float = setting(0.25, "of the profile, m")
-    nearest: float = setting(2.5, "from the sensor, m")
-    farthest: float = setting(20.0, "beyond, rings are too far apart, m")
-    low: float = setting(0.05, "least step, m")
-    high: float = setting(0.3, "largest step, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "sectors", "spacing", "nearest", "farthest", "low", "high")
+    sectors: PositiveInt = setting(180, "the horizon is cut into")
+    spacing: Positive = setting(0.25, "of the profile, m")
+    nearest: Positive = setting(2.5, "from the sensor, m")
+    farthest: Positive = setting(20.0, "beyond, rings are too far apart, m")
+    low: Positive = setting(0.05, "least step, m")
+    high: Positive = setting(0.3, "largest step, m")
 
 
 def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings | None = None) -> FloatArray:

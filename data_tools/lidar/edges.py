@@ -13,29 +13,25 @@ lies, and rings cross a curb at the same angle.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 
 
 @dataclass(frozen=True)
-class EdgeSettings:
+class EdgeSettings(Settings):
     """What counts as a straight edge; lengths in m."""
 
-    width: float = setting(0.2, "points this far from the line belong to it, m")
-    gap: float = setting(4.0, "longest stretch without a point, m")
-    length: float = setting(6.0, "least length, m")
-    points: int = setting(8, "least points")
-    noise: float = setting(0.1, "least deviation of a point across the line, m")
-    bias: float = setting(0.1, "deviation of either end that its points have in common, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "width", "gap", "length", "noise", "bias")
-        require_between(self, 3, math.inf, "points")
+    width: Positive = setting(0.2, "points this far from the line belong to it, m")
+    gap: Positive = setting(4.0, "longest stretch without a point, m")
+    length: Positive = setting(6.0, "least length, m")
+    points: Annotated[int, Range(3)] = setting(8, "least points")
+    noise: Positive = setting(0.1, "least deviation of a point across the line, m")
+    bias: Positive = setting(0.1, "deviation of either end that its points have in common, m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,22 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
 @dataclass(frozen=True)
-class GroundSettings:
+class GroundSettings(Settings):
     """For roads and pavements; lengths in m."""
 
-    sectors: int = setting(60, "the horizon is cut into")
-    ring: float = setting(1.5, "width of a ring, m")
-    reach: float = setting(80.0, "outer radius of the last ring, m")
-    slope: float = setting(0.15, "steepest rise, m per m")
-    step: float = setting(0.1, "change of height that is no slope, m")
-    clearance: float = setting(0.2, "from the ground, within which a point belongs to it, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "sectors", "ring", "reach", "slope", "step", "clearance")
+    sectors: PositiveInt = setting(60, "the horizon is cut into")
+    ring: Positive = setting(1.5, "width of a ring, m")
+    reach: Positive = setting(80.0, "outer radius of the last ring, m")
+    slope: Positive = setting(0.15, "steepest rise, m per m")
+    step: Positive = setting(0.1, "change of height that is no slope, m")
+    clearance: Positive = setting(0.2, "from the ground, within which a point belongs to it, m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,38 +24,23 @@ from scipy.spatial import cKDTree
 from data_tools.lidar.surfels import surfels_of
 from data_tools.lidar.voxels import voxel_downsample
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
 @dataclass(frozen=True)
-class PlaneSettings:
+class PlaneSettings(Settings):
     """What counts as a wall; lengths in m."""
 
-    surfel: float = setting(1.0, "voxel of the surfels, m")
-    reach: float = setting(50.0, "from the sensor, m")
-    upright: float = setting(0.15, "largest share of z in the normal of a wall")
-    aligned: float = setting(0.97, "least cosine between normals of one wall")
-    thickness: float = setting(0.15, "of a wall, to either side, m")
-    gap: float = setting(3.0, "largest gap within a wall, m")
-    surfels: int = setting(8, "least surfels of a wall")
-    length: float = setting(3.0, "least length of a wall, m")
-    noise: float = setting(0.03, "of a surfel across its wall: ranges, bricks, windows, m")
-    ground_noise: float = setting(0.02, "of the ground's surfels, m")
-
-    def __post_init__(self) -> None:
-        require_positive(
-            self,
-            "surfel",
-            "reach",
-            "upright",
-            "aligned",
-            "thickness",
-            "gap",
-            "surfels",
-            "length",
-            "noise",
-            "ground_noise",
-        )
+    surfel: Positive = setting(1.0, "voxel of the surfels, m")
+    reach: Positive = setting(50.0, "from the sensor, m")
+    upright: Positive = setting(0.15, "largest share of z in the normal of a wall")
+    aligned: Positive = setting(0.97, "least cosine between normals of one wall")
+    thickness: Positive = setting(0.15, "of a wall, to either side, m")
+    gap: Positive = setting(3.0, "largest gap within a wall, m")
+    surfels: PositiveInt = setting(8, "least surfels of a wall")
+    length: Positive = setting(3.0, "least length of a wall, m")
+    noise: Positive = setting(0.03, "of a surfel across its wall: ranges, bricks, windows, m")
+    ground_noise: Positive = setting(0.02, "of the ground's surfels, m")
 
 
 @dataclass(frozen=True, eq=False)

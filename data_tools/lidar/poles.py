@@ -18,42 +18,27 @@ from scipy.spatial import cKDTree
 from data_tools.lidar.components import connected_from_above
 from data_tools.lidar.planes import Plane, near_walls
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
 @dataclass(frozen=True)
-class PoleSettings:
+class PoleSettings(Settings):
     """What counts as a pole; lengths in m."""
 
-    cell: float = setting(0.2, "of the grid on which points are joined, m")
-    reach: float = setting(40.0, "from the sensor, m")
-    lowest: float = setting(0.3, "height above the ground from which points count, m")
-    height: float = setting(1.2, "least height from the lowest to the highest point, m")
-    width: float = setting(0.6, "largest extent from above, m")
-    points: int = setting(8, "least points")
-    filled: float = setting(0.5, "least share of half-metre steps of the height that hold points")
-    alone: float = setting(0.6, "nothing else within this distance of the axis, m")
-    alone_share: float = setting(0.1, "nor within this share of the range: columns of a wall seen aslant are no poles")
-    noise: float = setting(0.05, "of the axis: ranges, radius, bent trunks, m")
-    bearing_noise: float = setting(0.006, "across the line of sight: rays hit or miss a thin pole, rad")
-    depth_noise: float = setting(0.1, "along it: how much of a round pole lies behind is guessed from its width, m")
-
-    def __post_init__(self) -> None:
-        require_positive(
-            self,
-            "cell",
-            "reach",
-            "lowest",
-            "height",
-            "width",
-            "points",
-            "filled",
-            "alone",
-            "alone_share",
-            "noise",
-            "bearing_noise",
-            "depth_noise",
-        )
+    cell: Positive = setting(0.2, "of the grid on which points are joined, m")
+    reach: Positive = setting(40.0, "from the sensor, m")
+    lowest: Positive = setting(0.3, "height above the ground from which points count, m")
+    height: Positive = setting(1.2, "least height from the lowest to the highest point, m")
+    width: Positive = setting(0.6, "largest extent from above, m")
+    points: PositiveInt = setting(8, "least points")
+    filled: Positive = setting(0.5, "least share of half-metre steps of the height that hold points")
+    alone: Positive = setting(0.6, "nothing else within this distance of the axis, m")
+    alone_share: Positive = setting(
+        0.1, "nor within this share of the range: columns of a wall seen aslant are no poles"
+    )
+    noise: Positive = setting(0.05, "of the axis: ranges, radius, bent trunks, m")
+    bearing_noise: Positive = setting(0.006, "across the line of sight: rays hit or miss a thin pole, rad")
+    depth_noise: Positive = setting(0.1, "along it: how much of a round pole lies behind is guessed from its width, m")
 
 
 @dataclass(frozen=True, eq=False)

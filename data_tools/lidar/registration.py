@@ -28,7 +28,7 @@ from data_tools.lidar.surfels import SurfelMap, Surfels
 from saga_fg.errors import SagaError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 LEAST_PAIRS = 12  # twice the unknowns
 OPEN = 1e-3  # smallest share of the best-known direction's information in the worst-known one's
@@ -39,15 +39,12 @@ class RegistrationError(SagaError):
 
 
 @dataclass(frozen=True)
-class RegistrationSettings:
+class RegistrationSettings(Settings):
     """When to stop."""
 
-    iterations: int = setting(30, "at most so many")
-    translation: float = setting(1e-3, "step below which the pose is reached, m")
-    rotation: float = setting(1e-4, "the same for the rotation, rad")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "iterations", "translation", "rotation")
+    iterations: PositiveInt = setting(30, "at most so many")
+    translation: Positive = setting(1e-3, "step below which the pose is reached, m")
+    rotation: Positive = setting(1e-4, "the same for the rotation, rad")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,7 @@
 """A seedable traffic simulator: queues, platoons and merges on roads, seen by several sensors on one of the cars."""
 
-from data_tools.simulator.dataset import SimulatedTraffic
 from data_tools.simulator.nuscenes_export import write_nuscenes
-from data_tools.simulator.scene import simulate_scene
+from data_tools.simulator.scene import SimulatedTraffic, simulate_scene
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, camera, lidar, radar
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What makes everybody brake: traffic lights, and zones that are slow for a while. Both start waves that run back."""
+"""Disturbances of the traffic flow: stop lines of traffic lights, and temporary slow zones."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class StopLine:
     red: FloatArray
 
     def closed(self, time: float) -> bool:
-        """Whether the light is red at `time`."""
+        """True while the light is red."""
         return bool(((self.red[:, 0] <= time) & (time < self.red[:, 1])).any())
 
 
 @dataclass(frozen=True, eq=False)
 class SlowZone:
-    """A stretch [start, end), m, of some lanes where nobody wants to exceed `speed`, m/s, in intervals (K, 2), s."""
+    """Section [start, end), m, of some lanes with a speed limit `speed`, m/s, during intervals `active` (K, 2), s."""
 
     lanes: IntArray
     start: float
@@ -40,10 +40,10 @@ class SlowZone:
         return np.where(inside, self.speed, np.inf)
 
 
-def draw_intervals(
+def sample_intervals(
     on: tuple[float, float], off: tuple[float, float], until: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Alternating on and off durations, s, from a random phase at time 0 up to `until`: the on intervals (K, 2)."""
+    """On intervals (K, 2), s, of alternating on and off durations, from a random phase at time 0 up to `until`."""
     time = -rng.uniform(0, on[1] + off[1])
     intervals = []
     while time < until:

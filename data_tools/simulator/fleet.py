@@ -1,4 +1,4 @@
-"""Vehicles and their drivers: kinds, sizes, and the parameters each driver keeps for the whole scene."""
+"""Vehicles and their drivers: kinds, sizes, and driver parameters, which stay constant during a scene."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.simulator.idm import Drivers
+from data_tools.simulator.driver_models import Drivers
 from data_tools.simulator.settings import DriverSettings, TrafficSettings
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of vehicle: the label it carries, mean and spread of its size, m, and how it drives compared to a car."""
+    """Kind of vehicle: class label, mean and deviation of its size, m, and driver parameters relative to a car."""
 
     name: str
     label: str
@@ -53,24 +53,24 @@ class Fleet:
         return len(self.kind)
 
 
-def draw_sizes(kind: IntArray, rng: np.random.Generator) -> FloatArray:
-    """Sizes (N, 3), m, of vehicles of some kinds, within two deviations of the mean."""
+def sample_sizes(kind: IntArray, rng: np.random.Generator) -> FloatArray:
+    """Random sizes (N, 3), m, of vehicles of the given kinds, within two deviations of the mean."""
     mean = np.array([k.size for k in KINDS])[kind]
     spread = np.array([k.spread for k in KINDS])[kind]
     return np.asarray(mean + spread * np.clip(rng.standard_normal(mean.shape), -2, 2))
 
 
-def draw_kinds(count: int, settings: TrafficSettings, rng: np.random.Generator) -> IntArray:
-    """Kinds (count,) of moving vehicles."""
+def sample_kinds(count: int, settings: TrafficSettings, rng: np.random.Generator) -> IntArray:
+    """Random kinds (count,) of moving vehicles."""
     shares = np.array([settings.van_share, settings.truck_share, settings.bus_share])
     return rng.choice(len(KINDS), size=count, p=[1 - shares.sum(), *shares])
 
 
-def draw_fleet(
+def sample_fleet(
     count: int, desired_speed: float, drivers: DriverSettings, traffic: TrafficSettings, rng: np.random.Generator
 ) -> Fleet:
-    """`count` vehicles whose car drivers on average like to drive at `desired_speed`, m/s."""
-    kind = draw_kinds(count, traffic, rng)
+    """`count` random vehicles; `desired_speed`, m/s, is the mean over the drivers of cars."""
+    kind = sample_kinds(count, traffic, rng)
 
     def spread(mean: float, factor: FloatArray | float = 1.0) -> FloatArray:
         deviation = np.clip(rng.standard_normal(count), -2.5, 2.5)
@@ -81,7 +81,7 @@ def draw_fleet(
     )
     return Fleet(
         kind,
-        draw_sizes(kind, rng),
+        sample_sizes(kind, rng),
         Drivers(
             spread(desired_speed, speed),
             spread(drivers.time_headway, headway),

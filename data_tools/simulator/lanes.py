@@ -1,9 +1,8 @@
-"""Lanes beside the centre line of a road, each with a direction of travel, and a lane that joins and ends.
+"""Lanes along the centre line of a road, each with a direction of travel; one of them may join and end.
 
 Along a lane, distance is measured in its direction of travel: road s for forward lanes, length - s for oncoming ones.
-An ending lane approaches the road from `approach` m outside and runs beside it for a while before it ends: an
-on-ramp; with approach 0 it is a lane drop. Or it is closed by cones: over the last `taper` m they push its traffic into
-the lane beside.
+An ending lane that starts `approach` m outside the road is an on-ramp; with approach 0 it is a lane drop. It may also
+be closed by cones, which move its traffic into the adjacent lane over the last `taper` m.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ import numpy as np
 
 from data_tools.simulator.road import Road
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+
+SPAN = 1.0e6  # m, longer than any road
 
 
 def smooth_step(share: FloatArray) -> FloatArray:
@@ -36,10 +37,10 @@ class Lanes:
     offset     (L,) distance of each lane to the left of the centre line, m (where it runs beside the road)
     direction  (L,) +1 forward, -1 oncoming
     ending     the lane that ends, or -1
-    end        where it ends, m
-    opening    from where on one may change out of it, m
-    approach   how far outside it starts, m
-    taper      length over which cones push its traffic into the lane beside, m; 0: drivers change when they like
+    end        distance at which it ends, m
+    opening    distance from which vehicles may leave it, m
+    approach   lateral distance from the road at which it starts, m
+    taper      length over which cones move its traffic into the adjacent lane, m; 0: no cones
     """
 
     road: Road
@@ -61,7 +62,7 @@ class Lanes:
         return np.flatnonzero(self.direction < 0)
 
     @property
-    def beside(self) -> int:
+    def adjacent(self) -> int:
         """The lane that traffic of the ending lane joins."""
         return self.ending - 1
 
@@ -70,7 +71,7 @@ class Lanes:
         d = self.offset[lane]
         if self.taper > 0:
             share = (s - self.end) / self.taper + 1
-            aside = np.where(lane == self.ending, self.offset[self.beside] - self.offset[self.ending], 0.0)
+            aside = np.where(lane == self.ending, self.offset[self.adjacent] - self.offset[self.ending], 0.0)
             return d + aside * smooth_step(share), aside * smooth_step_slope(share) / self.taper
         if self.ending < 0 or self.approach == 0:
             return d, np.zeros_like(d)
@@ -92,7 +93,7 @@ class Lanes:
         return np.where(exists & (self.direction[other] == self.direction[lane]), other, -1)
 
     def may_change(self, lane: IntArray, target: IntArray, s: FloatArray) -> BoolArray:
-        """Whether the road allows to change from a lane to its neighbour here; nobody enters a lane that ends."""
+        """True where a change from `lane` to the neighbour `target` is allowed at s; nobody enters an ending lane."""
         allowed = (target >= 0) & (target != self.ending if self.ending >= 0 else True)
         if self.taper > 0:
             return np.asarray(allowed & (lane != self.ending))
@@ -110,3 +111,34 @@ class Lanes:
     def metric(self, lane: IntArray, s: FloatArray, d: FloatArray, slope: FloatArray) -> FloatArray:
         """Length travelled over ground per unit of s, at places as in `pose`."""
         return np.hypot(1 - self.road.curvature_at(self.road_s(lane, s)) * d, slope)
+
+
+@dataclass(frozen=True, eq=False)
+class LaneOrder:
+    """Vehicles sorted by lane and distance, to find leaders and followers: keys lane * SPAN + s (E,), vehicles (E,)."""
+
+    key: FloatArray
+    vehicle: IntArray
+
+    @classmethod
+    def of(cls, s: FloatArray, lanes: IntArray) -> LaneOrder:
+        """From s (N,), m, and the lanes that each vehicle occupies (N, 2), -1 for none; two during a lane change."""
+        rows, columns = np.nonzero(lanes >= 0)
+        key = lanes[rows, columns] * SPAN + s[rows]
+        order = np.argsort(key, kind="stable")
+        return cls(key[order], rows[order])
+
+    def ahead(self, lane: IntArray, s: FloatArray) -> IntArray:
+        """First vehicle (N,) beyond s (N,) in lane (N,), or -1; lanes may be -1."""
+        return self._at(np.searchsorted(self.key, lane * SPAN + s, side="right"), lane)
+
+    def behind(self, lane: IntArray, s: FloatArray) -> IntArray:
+        """Last vehicle (N,) before s (N,) in lane (N,), or -1."""
+        return self._at(np.searchsorted(self.key, lane * SPAN + s, side="left") - 1, lane)
+
+    def _at(self, place: IntArray, lane: IntArray) -> IntArray:
+        if len(self.key) == 0:
+            return np.full(len(place), -1)
+        inside = np.clip(place, 0, len(self.key) - 1)
+        same = (inside == place) & (lane >= 0) & (np.floor_divide(self.key[inside], SPAN) == lane)
+        return np.where(same, self.vehicle[inside], -1)

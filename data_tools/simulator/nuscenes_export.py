@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_directory
-from data_tools.simulator.dataset import SimulatedTraffic
 from data_tools.simulator.nuscenes_tables import (
     Tables,
     channel_of,
@@ -29,6 +28,7 @@ from data_tools.simulator.nuscenes_tables import (
     scene_tables,
     shared_tables,
 )
+from data_tools.simulator.scene import SimulatedTraffic
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_quaternion
 from saga_fg.types.dataset import Scene

@@ -1,4 +1,4 @@
-"""How much of an object a sensor sees past everything that stands in between.
+"""Visible share of an object behind other objects, as seen from a sensor.
 
 The azimuth interval an object's footprint fills, seen from the sensor, is cut into equal cells, one ray through the
 middle of each. A ray enters the object's footprint at range r. A nearer box on the ray of height h, between ranges r0

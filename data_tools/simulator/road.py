@@ -1,6 +1,6 @@
 """Roads: a smooth centre line, and coordinates along and across it.
 
-A place is given by s, the distance along the centre line, and d, the distance to its left (Frenet coordinates):
+A position is given by s, the distance along the centre line, and d, the distance to its left (Frenet coordinates):
 
     p(s, d) = c(s) + d n(s),      c'(s) = t(s),      heading'(s) = kappa(s),      dp/ds at constant d = (1 - kappa d) t
 
@@ -43,7 +43,7 @@ class Road:
         return np.interp(s, GRID * np.arange(len(self.heading)), self.heading)
 
     def position(self, s: FloatArray, d: FloatArray) -> FloatArray:
-        """World coordinates (..., 2) of places s, d (...), m."""
+        """World coordinates (..., 2) of positions s, d (...), m."""
         grid = GRID * np.arange(len(self.heading))
         inside = np.clip(s, 0, self.length)
         heading = self.heading_at(inside)

@@ -1,4 +1,4 @@
-"""A turning LiDAR in a world of boxes, poles and level ground: scans with known poses.
+"""A spinning LiDAR in a world of boxes, poles and level ground: scans with known poses.
 
 A ray from o in direction u (|u| = 1) meets, at the least positive s,
 
@@ -6,8 +6,8 @@ A ray from o in direction u (|u| = 1) meets, at the least positive s,
     an upright pole    | (o + s u - c)_xy | = r,   0 <= z <= h
     an oriented box    the slabs | x | <= l/2, | y | <= w/2, | z | <= h/2 of its own frame   (Kay and Kajiya, 1986)
 
-The head turns clockwise once a period, looks ahead at the scan's moment, and moves on with constant velocity while it
-turns, so that the scans are skewed as real ones are. Ranges have Gaussian noise.
+The head turns clockwise once a period and looks ahead at the scan's timestamp. It moves with constant velocity while it
+turns, which skews the scans like real ones. Ranges have Gaussian noise.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 
 from data_tools.lidar import Scan
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 from saga_fg.types.boxes import Boxes
 
 
 @dataclass(frozen=True, eq=False)
-class StandingWorld:
-    """What stands on the level ground z = 0, in world coordinates.
+class StaticWorld:
+    """Static objects on the level ground z = 0, in world coordinates.
 
     boxes  walls, houses, parked vehicles, kerbs
     poles  (M, 4) x, y, radius, height, m; upright cylinders from the ground
@@ -39,31 +39,28 @@ class StandingWorld:
 
 
 @dataclass(frozen=True)
-class ScannerSettings:
-    """A small sensor, so that tests are quick; 64 rings and 2000 columns make a Velodyne HDL-64E."""
+class ScannerSettings(Settings):
+    """Resolution and noise of the LiDAR; 64 rings and 2000 columns are those of a Velodyne HDL-64E."""
 
-    rings: int = setting(32, "beams, one above the other")
-    columns: int = setting(720, "firings a turn")
+    rings: PositiveInt = setting(32, "number of beams, one above the other")
+    columns: PositiveInt = setting(720, "number of firings a turn")
     lowest: float = setting(-0.44, "elevation of the lowest beam, rad")
-    highest: float = setting(0.06, "and of the highest, rad")
-    reach: float = setting(80.0, "longest range, m")
+    highest: float = setting(0.06, "elevation of the highest beam, rad")
+    reach: Positive = setting(80.0, "longest range, m")
     noise: float = setting(0.02, "standard deviation of a range, m")
-    period: float = setting(0.1, "of a turn, s")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "rings", "columns", "reach", "period")
+    period: Positive = setting(0.1, "duration of a turn, s")
 
 
 def simulate_scan(
-    world: StandingWorld,
+    world: StaticWorld,
     world_T_lidar: FloatArray,
     rng: np.random.Generator,
     settings: ScannerSettings | None = None,
     velocity: FloatArray | None = None,
 ) -> Scan:
-    """The scan taken at `world_T_lidar` (4, 4), the sensor's pose when it looks ahead.
+    """The scan at `world_T_lidar` (4, 4), the sensor's pose when it looks ahead.
 
-    velocity  (6,) turn rate, rad/s, and velocity, m/s, in the sensor's frame; None while it stands
+    velocity  (6,) turn rate, rad/s, and velocity, m/s, in the sensor's frame; None for a static sensor
     """
     s = settings or ScannerSettings()
     turn = -np.pi + 2 * np.pi * (np.arange(s.columns) + 0.5) / s.columns
@@ -87,8 +84,8 @@ def simulate_scan(
     return Scan(beam.reshape(-1, 3)[hit] * noisy[:, None], np.full(len(noisy), np.nan), np.repeat(time, s.rings)[hit])
 
 
-def ranges(world: StandingWorld, origin: FloatArray, direction: FloatArray) -> FloatArray:
-    """Distance (N,), m, that rays from `origin` (N, 3) in unit `direction` (N, 3) go; infinite for those that miss."""
+def ranges(world: StaticWorld, origin: FloatArray, direction: FloatArray) -> FloatArray:
+    """Ranges (N,), m, of rays from `origin` (N, 3) in unit `direction` (N, 3); infinite for rays that hit nothing."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = np.where(direction[:, 2] < 0, -origin[:, 2] / direction[:, 2], np.inf)
         nearest = np.where(ground > 0, ground, np.inf)

@@ -1,4 +1,4 @@
-"""A scene: the world looked at by the sensors of the ego vehicle, with ground truth."""
+"""Simulated scenes: frames of the ego vehicle's sensors, and ground truth."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import zlib
 import numpy as np
 
 from data_tools.simulator.annotation import annotate
-from data_tools.simulator.lights import see_lights
-from data_tools.simulator.sensors import observe, viewpoint
+from data_tools.simulator.lights import detect_lights
+from data_tools.simulator.sensors import detect, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import World, build_world
 from saga_fg.errors import InputError
@@ -16,30 +16,63 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Detections, Frame
 
-EPOCH = 1_600_000_000.0  # s, when the scene of seed 0 takes place
+EPOCH = 1_600_000_000.0  # s, time of the scene of seed 0
 
 
 def simulate_scene(settings: SimulatorSettings, seed: int, name: str = "") -> Scene:
-    """One scene, the same for the same settings and seed; its `name` is made from the seed unless given.
+    """Simulate one scene; the seed determines it, and its default name.
 
     Frames are in world coordinates and carry the pose of the vehicle. Raises `InputError` for a negative seed.
     """
     if seed < 0:
         raise InputError(f"seed: expected a number of at least 0, got {seed}")
-    return scene_in(build_world(settings, seed), settings, seed, name)
+    return scene_from_world(build_world(settings, seed), settings, seed, name)
 
 
-def scene_in(world: World, settings: SimulatorSettings, seed: int, name: str = "") -> Scene:
-    """The scene in a world that was built with the same settings and seed."""
+class SimulatedTraffic:
+    """A dataset of simulated scenes, each simulated when it is requested; settings and seed determine them.
+
+    A larger dataset begins with the scenes of a smaller one. Raises `InputError` for less than one scene and
+    for a negative seed.
+    """
+
+    def __init__(self, settings: SimulatorSettings | None = None, scenes: int = 4, seed: int = 0) -> None:
+        for name, value, least in (("scenes", scenes, 1), ("seed", seed, 0)):
+            if value < least:
+                raise InputError(f"{name}: expected a number of at least {least}, got {value}")
+        self._settings = settings or SimulatorSettings()
+        self._seeds = {
+            f"scene-{k + 1:04d}": int(np.random.SeedSequence([seed, k]).generate_state(1)[0]) for k in range(scenes)
+        }
+
+    @property
+    def settings(self) -> SimulatorSettings:
+        """The settings of all scenes."""
+        return self._settings
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The names of the scenes."""
+        return tuple(self._seeds)
+
+    def scene(self, name: str) -> Scene:
+        """Simulate one scene; raises `InputError` for an unknown name."""
+        if name not in self._seeds:
+            raise InputError(f"scene {name!r}: expected one of {', '.join(self._seeds)}")
+        return simulate_scene(self._settings, self._seeds[name], name)
+
+
+def scene_from_world(world: World, settings: SimulatorSettings, seed: int, name: str = "") -> Scene:
+    """Simulate the sensors in a world built with the same settings and seed."""
     date = EPOCH + 60.0 * (seed % 100_000) - world.start
     frames = []
     for sensor_name, sensor in settings.sensors.items():
-        rng = np.random.default_rng([seed, zlib.crc32(sensor_name.encode())])  # no sensor disturbs another
+        rng = np.random.default_rng([seed, zlib.crc32(sensor_name.encode())])  # independent of the other sensors
         for time in world.start + _times(settings.duration, sensor.rate, sensor.offset):
             pose = world.ego_pose(time)
-            boxes, near, share = world.seen_from(viewpoint(sensor, pose), time, sensor.max_range)
-            detections = observe(sensor, pose, boxes.select(near), share, rng)
-            lights = see_lights(sensor, pose, world.signals, time, settings.lights, rng)
+            boxes, near, share = world.visible_from(sensor_position(sensor, pose), time, sensor.max_range)
+            detections = detect(sensor, pose, boxes.select(near), share, rng)
+            lights = detect_lights(sensor, pose, world.signals, time, settings.lights, rng)
             if len(lights):
                 detections = Detections.concatenate([detections, lights])
             frames.append(Frame(round(date + time, 6), sensor_name, detections, pose, road_map=world.road_map))
@@ -57,5 +90,5 @@ def scene_in(world: World, settings: SimulatorSettings, seed: int, name: str = "
 
 
 def _times(duration: float, rate: float, offset: float) -> FloatArray:
-    """Times offset + k / rate, s, up to and without the end."""
+    """Times offset + k / rate, s, before the end."""
     return offset + np.arange(max(0, int(np.ceil((duration - offset) * rate - 1e-9)))) / rate

@@ -1,9 +1,9 @@
-"""What a sensor reports of the boxes around it: detections with noise, misses, false detections and scores.
+"""Sensor and detector model: detections of boxes with noise, misses, false detections and scores.
 
 Noise is Gaussian along the line of sight and across it, with standard deviations base + slope * range, and
-independent from frame to frame. A radar adds the range rate: the velocity over ground along the line of sight, of what
-is not there around 0, as of a return from the roadside. Classes are mistaken from frame to frame, too. The logit of a
-score is, for a true detection,
+independent from frame to frame. A radar adds the range rate: the velocity over ground along the line of sight; that of
+false detections is around 0, as of a static object. Classes are confused independently from frame to frame. The logit
+of a score is, for a true detection,
 
     true_logit + 2 (visible share - 1) - range / 40 m + noise,          for a false one    clutter_logit + noise.
 """
@@ -26,55 +26,53 @@ CLUTTER = (("pedestrian", BODY), *((kind.label, kind.size) for kind in KINDS))
 CLUTTER_SHARES = (0.4, 0.4, 0.1, 0.07, 0.03)
 
 
-def viewpoint(sensor: SensorSettings, world_T_ego: FloatArray) -> FloatArray:
-    """Where the sensor is in the world (3,), m."""
+def sensor_position(sensor: SensorSettings, world_T_ego: FloatArray) -> FloatArray:
+    """Position (3,) of the sensor in the world, m."""
     return np.asarray(transform_points(world_T_ego, np.array([sensor.position]))[0])
 
 
 def in_view(sensor: SensorSettings, world_T_ego: FloatArray, points: FloatArray) -> BoolArray:
-    """Whether points (N, 3), world coordinates, lie within the sensor's field of view and range."""
-    offset = (points - viewpoint(sensor, world_T_ego))[:, :2]
+    """Mask (N,) of the points (N, 3), world coordinates, within the sensor's field of view and range."""
+    offset = (points - sensor_position(sensor, world_T_ego))[:, :2]
     bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - yaw_of(world_T_ego))
     near = np.linalg.norm(offset, axis=1) <= sensor.max_range
     return np.asarray(near & (np.abs(bearing) <= sensor.field_of_view / 2))
 
 
 def detection_probability(sensor: SensorSettings, distance: FloatArray, share: FloatArray) -> FloatArray:
-    """Chance (N,) to detect objects at `distance` (N,), m, of which a `share` (N,) is visible."""
+    """Detection probability (N,) of objects at `distance` (N,), m, of which a `share` (N,) is visible."""
     ramp = np.clip((share - sensor.hidden_share) / (sensor.clear_share - sensor.hidden_share), 0.0, 1.0)
     return np.asarray(sensor.detection_probability * ramp / (1 + np.exp((distance - sensor.reach) / sensor.fading)))
 
 
-def observe(
+def detect(
     sensor: SensorSettings, world_T_ego: FloatArray, boxes: Boxes, share: FloatArray, rng: np.random.Generator
 ) -> Detections:
-    """Detections, in world coordinates, of `boxes` of which a `share` (N,) is visible, and of nothing at all."""
-    origin = viewpoint(sensor, world_T_ego)
+    """Detections of `boxes`, of which a `share` (N,) is visible, and false detections; in world coordinates."""
+    origin = sensor_position(sensor, world_T_ego)
     offset = (boxes.position - origin)[:, :2]
     distance = np.linalg.norm(offset, axis=1)
     chance = detection_probability(sensor, distance, share) * in_view(sensor, world_T_ego, boxes.position)
     seen = np.flatnonzero(rng.random(len(boxes)) < chance)
     n = len(seen)
-    sight = offset[seen] / np.maximum(distance[seen], 0.1)[:, None]
-    across = np.stack([-sight[:, 1], sight[:, 0]], axis=1)
-    r = distance[seen]
-    along_error = (sensor.range_noise[0] + sensor.range_noise[1] * r) * rng.standard_normal(n)
-    across_error = (sensor.bearing_noise[0] + sensor.bearing_noise[1] * r) * rng.standard_normal(n)
+    error, line_of_sight = position_errors(sensor, offset[seen], distance[seen], rng)
     position = boxes.position[seen].copy()
-    position[:, :2] += along_error[:, None] * sight + across_error[:, None] * across
+    position[:, :2] += error
     position[:, 2] += sensor.height_noise * rng.standard_normal(n)
     velocity = np.full((n, 2), np.nan)
     if sensor.velocity_noise is not None:
         velocity = boxes.velocity[seen] + sensor.velocity_noise * rng.standard_normal((n, 2))
-    logit = sensor.true_logit + 2 * (share[seen] - 1) - r / 40 + sensor.logit_noise * rng.standard_normal(n)
+    logit = (
+        sensor.true_logit + 2 * (share[seen] - 1) - distance[seen] / 40 + sensor.logit_noise * rng.standard_normal(n)
+    )
     true = Boxes(
-        _told_classes(sensor, boxes.label[seen], rng),
+        _reported_classes(sensor, boxes.label[seen], rng),
         position,
         boxes.size[seen] * np.exp(sensor.size_noise * rng.standard_normal((n, 3))),
         boxes.yaw[seen] + sensor.yaw_noise * rng.standard_normal(n),
         velocity,
     )
-    rate = np.sum(boxes.velocity[seen] * sight, axis=1)
+    rate = np.sum(boxes.velocity[seen] * line_of_sight, axis=1)
     false, false_logit = _clutter(sensor, world_T_ego, rng)
     order = rng.permutation(n + len(false))
     logits = np.concatenate([logit, false_logit])
@@ -88,8 +86,19 @@ def observe(
     return Detections(reported, 1 / (1 + np.exp(-logits)), rates).select(order)
 
 
-def _told_classes(sensor: SensorSettings, label: StrArray, rng: np.random.Generator) -> StrArray:
-    """The classes (n,) that are reported of objects of classes `label` (n,): vehicles are mistaken for one another."""
+def position_errors(
+    sensor: SensorSettings, offset: FloatArray, distance: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Random position errors (n, 2), m, and lines of sight (n, 2), at `offset` (n, 2) and `distance` (n,) from here."""
+    line_of_sight = offset / np.maximum(distance, 0.1)[:, None]
+    across = np.stack([-line_of_sight[:, 1], line_of_sight[:, 0]], axis=1)
+    along_error = (sensor.range_noise[0] + sensor.range_noise[1] * distance) * rng.standard_normal(len(distance))
+    across_error = (sensor.bearing_noise[0] + sensor.bearing_noise[1] * distance) * rng.standard_normal(len(distance))
+    return along_error[:, None] * line_of_sight + across_error[:, None] * across, line_of_sight
+
+
+def _reported_classes(sensor: SensorSettings, label: StrArray, rng: np.random.Generator) -> StrArray:
+    """Reported classes (n,) of objects of classes `label` (n,): vehicles are confused with one another."""
     if sensor.class_accuracy == 1:
         return label
     kinds = np.array(sorted({kind.label for kind in KINDS}))
@@ -101,13 +110,13 @@ def _told_classes(sensor: SensorSettings, label: StrArray, rng: np.random.Genera
 
 
 def _clutter(sensor: SensorSettings, world_T_ego: FloatArray, rng: np.random.Generator) -> tuple[Boxes, FloatArray]:
-    """A Poisson number of false boxes, evenly spread over the area in view, and the logits of their scores."""
+    """False detections, Poisson in number and uniform over the area in view, and the logits of their scores."""
     n = int(rng.poisson(sensor.clutter_rate))
     bearing = yaw_of(world_T_ego) + sensor.field_of_view * (rng.random(n) - 0.5)
     distance = sensor.max_range * np.sqrt(rng.random(n))
     kind = rng.choice(len(CLUTTER), size=n, p=CLUTTER_SHARES)
     size = np.array([size for _, size in CLUTTER])[kind] * np.exp(0.1 * rng.standard_normal((n, 3)))
-    origin = viewpoint(sensor, world_T_ego)
+    origin = sensor_position(sensor, world_T_ego)
     position = np.column_stack(
         [
             origin[0] + distance * np.cos(bearing),

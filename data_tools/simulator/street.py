@@ -1,11 +1,11 @@
-"""A street for a LiDAR to drive along: houses on both sides, parked cars and poles, all drawn from a seed."""
+"""A simulated LiDAR drive along a random street with houses on both sides, parked cars and poles."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from data_tools.lidar import Scan, constant_velocity
-from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
+from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -15,10 +15,10 @@ KERB = 6.4  # m, from the middle of the road to its edge
 SMALL = ScannerSettings(rings=24, columns=360)
 
 
-def street(seed: int = 0, kerbs: bool = False) -> StandingWorld:
+def street(seed: int = 0, kerbs: bool = False) -> StaticWorld:
     """Houses of different depth along a street on the x axis, 16 m wide, and across its end.
 
-    kerbs: whether the road ends, on both sides, in pavements that are higher, `KERB` m from its middle
+    kerbs: raised pavements on both sides, `KERB` m from the middle of the road
     """
     rng = np.random.default_rng(seed)
     label, position, size = [], [], []
@@ -43,7 +43,7 @@ def street(seed: int = 0, kerbs: bool = False) -> StandingWorld:
         size.append((170.0, 1.5, 0.15))
     poles = np.array([[x, side * 7.0, 0.15, 5.0] for side in (-1, 1) for x in np.arange(-30.0, 80.0, 17.0) + 4 * side])
     n = len(label)
-    return StandingWorld(Boxes.of(label, position, size, np.zeros(n), np.zeros((n, 2))), poles)
+    return StaticWorld(Boxes.of(label, position, size, np.zeros(n), np.zeros((n, 2))), poles)
 
 
 def drive(count: int, speed: float = 8.0, turn_rate: float = 0.05, period: float = 0.1) -> FloatArray:
@@ -56,7 +56,7 @@ def drive(count: int, speed: float = 8.0, turn_rate: float = 0.05, period: float
 
 
 def scans(
-    world: StandingWorld, poses: FloatArray, seed: int = 0, settings: ScannerSettings = SMALL, skewed: bool = True
+    world: StaticWorld, poses: FloatArray, seed: int = 0, settings: ScannerSettings = SMALL, skewed: bool = True
 ) -> list[Scan]:
     """One scan at each pose (K, 4, 4), K >= 2, skewed by the motion to the next unless `skewed` is False."""
     rng = np.random.default_rng(seed)
@@ -67,3 +67,31 @@ def scans(
         velocity = constant_velocity(inverse_transform(poses[a]) @ poses[b], period) if skewed else None
         taken.append(simulate_scan(world, pose, rng, settings, velocity))
     return taken
+
+
+class SimulatedScans:
+    """Scans of a drive along the street of a seed: `pipelines.scan_sequence.ScanSequence` with the true poses.
+
+    world_T_lidar  (K, 4, 4), K >= 2, true poses; None for a drive of `count` scans
+    kerbs          pavements with kerbs on both sides
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        count: int = 60,
+        world_T_lidar: FloatArray | None = None,
+        settings: ScannerSettings = SMALL,
+        kerbs: bool = False,
+    ) -> None:
+        self.world_T_ego: FloatArray = drive(count, period=settings.period) if world_T_lidar is None else world_T_lidar
+        self.timestamps: FloatArray = settings.period * np.arange(len(self.world_T_ego), dtype=np.float64)
+        self.ego_T_lidar: FloatArray = np.eye(4)
+        self.world = street(seed, kerbs)
+        self._scans = scans(self.world, self.world_T_ego, seed, settings)
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def __getitem__(self, row: int) -> Scan:
+        return self._scans[row]

@@ -1,4 +1,4 @@
-"""What stands beside and between the lanes: parked vehicles, hedges, buildings. All as boxes in world coordinates."""
+"""Static objects beside and between the lanes, as boxes in world coordinates: parked cars, hedges, buildings, cones."""
 
 from __future__ import annotations
 
@@ -6,40 +6,43 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, draw_sizes
+from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, sample_sizes
+from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import Road
-from data_tools.simulator.settings import Range, SurroundingSettings
+from data_tools.simulator.settings import RoadworkSettings, SurroundingSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 
 PARKING_WIDTH = 2.4  # m
 PAVEMENT_WIDTH = 3.5  # m
-SEGMENT = 8.0  # m, longest straight piece of a hedge
+SEGMENT = 8.0  # m, longest straight segment of a hedge
+CONE = (0.45, 0.45, 0.75)  # length, width, height, m
+CONE_DEVIATION = 0.1  # standard deviation of a cone's position, m
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Parked vehicles (labelled as such), things that only hide others, and the pavements (low, high offset d, m)."""
+    """Parked vehicles, objects that only hide others, and pavements (lowest and highest offset d, m)."""
 
     parked: Boxes
     occluders: Boxes
     pavements: list[tuple[float, float]]
 
 
-def draw_surroundings(
+def sample_surroundings(
     road: Road,
     edges: tuple[float, float],
     hedge: float | None,
-    window: Range,
+    window: tuple[float, float],
     walkable: tuple[bool, bool],
     settings: SurroundingSettings,
     rng: np.random.Generator,
 ) -> Surroundings:
-    """Furnish the road between road s of `window`, m.
+    """Random surroundings of the road for s within `window`, m.
 
     edges     offsets d of the outermost lanes' outer borders, m: right (negative) and left (positive)
     hedge     offset of the hedge between the directions, or None
-    walkable  whether there is parking and a pavement on the right, on the left
+    walkable  parking and a pavement on the right, on the left
     """
     parked, occluders, pavements = [], [], []
     for side, edge, walk in zip((-1.0, 1.0), edges, walkable, strict=True):
@@ -52,13 +55,13 @@ def draw_surroundings(
             pavements.append((min(inner, outer), max(inner, outer)))
         border += PAVEMENT_WIDTH
         depth = 10.0
-        stretches = _stretches(window, settings.building_length, settings.building_gap, rng)
-        occluders.append(_row(road, stretches, side * (border + depth / 2), depth, 9.0, "building"))
+        intervals = _intervals(window, settings.building_length, settings.building_gap, rng)
+        occluders.append(_row(road, intervals, side * (border + depth / 2), depth, 9.0, "building"))
     if hedge is not None:
-        stretches = _stretches(window, settings.hedge_length, settings.hedge_gap, rng)
+        intervals = _intervals(window, settings.hedge_length, settings.hedge_gap, rng)
         pieces = [
             piece
-            for start, end in stretches
+            for start, end in intervals
             for piece in np.lib.stride_tricks.sliding_window_view(
                 np.linspace(start, end, int(np.ceil((end - start) / SEGMENT)) + 1), 2
             )
@@ -67,32 +70,55 @@ def draw_surroundings(
     return Surroundings(Boxes.concatenate(parked), Boxes.concatenate(occluders), pavements)
 
 
-def _stretches(window: Range, length: Range, gap: Range, rng: np.random.Generator) -> FloatArray:
-    """Alternating stretches and gaps over the window: starts and ends (K, 2), m."""
-    s, stretches = window[0] - rng.uniform(0, length[1]), []
+def sample_cones(lanes: Lanes, settings: RoadworkSettings, rng: np.random.Generator) -> Boxes:
+    """Cones that close the ending lane: a taper to its inner border, then a row along it; none for an open lane."""
+    if lanes.taper == 0:
+        return Boxes.empty()
+    inner = (lanes.offset[lanes.ending] + lanes.offset[lanes.adjacent]) / 2
+    outer = 2 * lanes.offset[lanes.ending] - inner
+    end = lanes.end + rng.uniform(*settings.row)
+    s = np.arange(lanes.end - lanes.taper, end, settings.spacing)
+    d = np.interp(s, [lanes.end - lanes.taper, lanes.end], [outer, inner])
+    n = len(s)
+    horizontal = lanes.road.position(s, d) + CONE_DEVIATION * rng.standard_normal((n, 2))
+    position = np.column_stack([horizontal, np.full(n, CONE[2] / 2)])
+    size = np.tile(np.array(CONE), (n, 1))
+    return Boxes(np.full(n, "traffic_cone"), position, size, np.zeros(n), np.zeros((n, 2)))
+
+
+def _intervals(
+    window: tuple[float, float], length: tuple[float, float], gap: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
+    """Random intervals over the window, separated by gaps: starts and ends (K, 2), m."""
+    s, intervals = window[0] - rng.uniform(0, length[1]), []
     while s < window[1]:
         end = s + rng.uniform(*length)
-        stretches.append((s, end))
+        intervals.append((s, end))
         s = end + rng.uniform(*gap)
-    return np.array(stretches)
+    return np.array(intervals)
 
 
-def _row(road: Road, stretches: FloatArray, d: float, width: float, height: float, label: str) -> Boxes:
-    middle = stretches.mean(axis=1)
+def _row(road: Road, intervals: FloatArray, d: float, width: float, height: float, label: str) -> Boxes:
+    middle = intervals.mean(axis=1)
     offset = np.full(len(middle), d)
-    length = (stretches[:, 1] - stretches[:, 0]) * (1 - road.curvature_at(middle) * d)
+    length = (intervals[:, 1] - intervals[:, 0]) * (1 - road.curvature_at(middle) * d)
     return _boxes(
         road, middle, offset, np.stack([length, np.full_like(length, width), np.full_like(length, height)], 1), label
     )
 
 
 def _parked(
-    road: Road, d: float, side: float, window: Range, settings: SurroundingSettings, rng: np.random.Generator
+    road: Road,
+    d: float,
+    side: float,
+    window: tuple[float, float],
+    settings: SurroundingSettings,
+    rng: np.random.Generator,
 ) -> Boxes:
     place = np.arange(window[0], window[1], 6.5)
     place = place[rng.random(len(place)) < settings.parking_occupancy]
     kind = rng.choice([CAR, VAN, TRUCK], size=len(place), p=[0.74, 0.2, 0.06])
-    size = draw_sizes(kind, rng)
+    size = sample_sizes(kind, rng)
     trucks = np.flatnonzero(kind == TRUCK)
     clear = np.ones(len(place), dtype=np.bool_)
     for row in trucks:  # a truck takes the neighbouring places too

@@ -18,21 +18,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.simulator.disturbances import SlowZone, StopLine
+from data_tools.simulator.driver_models import (
+    HARDEST_BRAKING,
+    best_lane_changes,
+    following_acceleration,
+    free_acceleration,
+    lane_change_gain,
+)
 from data_tools.simulator.fleet import Fleet
-from data_tools.simulator.idm import HARDEST_BRAKING, following_acceleration, free_acceleration
-from data_tools.simulator.lane_change import advantage, choose
-from data_tools.simulator.lanes import Lanes, smooth_step, smooth_step_slope
-from data_tools.simulator.neighbours import LaneOrder
+from data_tools.simulator.lanes import LaneOrder, Lanes, smooth_step, smooth_step_slope
 from data_tools.simulator.settings import DriverSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
-CHANGE_INTERVAL = 0.5  # s between two looks into the mirror
-SLOWEST_CHANGE = 2.0  # m/s below which nobody starts to change lanes
+CHANGE_INTERVAL = 0.5  # s between two decisions to change lanes
+SLOWEST_CHANGE = 2.0  # m/s, lowest speed at which a voluntary lane change starts
 
 
 @dataclass(frozen=True, eq=False)
 class TrafficHistory:
-    """What N vehicles did at T moments: time (T,) s and arrays (T, N).
+    """States of N vehicles at T time steps: time (T,) s and arrays (T, N).
 
     s m, speed m/s, lane, offset d m, slope dd/ds, on_road; leader: the vehicle ahead in the lane, or -1.
     """
@@ -48,7 +52,7 @@ class TrafficHistory:
 
 
 class Traffic:
-    """Vehicles that drive on; `step` moves them all."""
+    """Vehicles in traffic, advanced by `step`."""
 
     def __init__(
         self,
@@ -74,7 +78,7 @@ class Traffic:
         self._share = np.zeros(n)
         self._change_length = np.ones(n)
         self._noise = settings.acceleration_noise * rng.standard_normal(n)
-        self._passes = np.zeros((len(stop_lines), n), dtype=np.bool_)  # who runs the light as it turns red
+        self._passes = np.zeros((len(stop_lines), n), dtype=np.bool_)  # vehicles too close to stop for a red light
         self._was_closed = [False] * len(stop_lines)
         self._pending = [np.zeros(n)] * round(settings.reaction_time / step)
         self._steps = 0
@@ -85,19 +89,19 @@ class Traffic:
         return self.s < self._lanes.road.length
 
     def order(self) -> LaneOrder:
-        """Who is where, of those still on the road."""
+        """Lane order of the vehicles still on the road."""
         lanes = np.where(self.on_road[:, None], np.stack([self.lane, self._also_in()], axis=1), -1)
         return LaneOrder.of(self.s, lanes)
 
     def _also_in(self) -> IntArray:
-        """The lane each is partly in besides its own, or -1: while it changes, and where cones push it aside."""
+        """Second lane (N,) that each vehicle occupies while it changes or is moved aside by cones, or -1."""
         if self._lanes.taper == 0:
             return self._from
         pushed = (self.lane == self._lanes.ending) & (self.s + self._early >= self._lanes.end - self._lanes.taper)
-        return np.where(pushed, self._lanes.beside, self._from)
+        return np.where(pushed, self._lanes.adjacent, self._from)
 
     def lateral(self) -> tuple[FloatArray, FloatArray]:
-        """Offsets d (N,), m, and slopes dd/ds (N,)."""
+        """Lateral offsets d (N,), m, and slopes dd/ds (N,)."""
         d, slope = self._lanes.lateral(self.lane, self.s + self._early)
         d0, slope0 = self._lanes.lateral(np.where(self._from >= 0, self._from, self.lane), self.s)
         q = np.where(self._from >= 0, self._share, 1.0)
@@ -105,10 +109,9 @@ class Traffic:
         turn = smooth_step_slope(q) / self._change_length
         return d0 + weight * (d - d0), slope0 + weight * (slope - slope0) + turn * (d - d0)
 
-    def react(self) -> None:
-        """Everybody does already what he wants now, as who has had his reaction time to look around."""
-        wish = self._wish(self.order(), self._metric())
-        self._pending = [wish] * len(self._pending)
+    def settle(self) -> None:
+        """Fill the reaction delay with the accelerations desired now, as if the reaction time had passed."""
+        self._pending = [self._desired_acceleration(self.order(), self._metric())] * len(self._pending)
 
     def _metric(self) -> FloatArray:
         """Length over ground per unit of s (N,)."""
@@ -116,14 +119,14 @@ class Traffic:
         return self._lanes.metric(self.lane, self.s, d, slope)
 
     def step(self) -> None:
-        """Move everybody by one step of time."""
+        """Advance all vehicles by one time step."""
         h = self._step
         order = self.order()
         metric = self._metric()
-        wish = self._wish(order, metric)
+        desired = self._desired_acceleration(order, metric)
         if self._steps % max(1, round(CHANGE_INTERVAL / h)) == 0:
-            self._start_changes(wish, order)
-        self._pending.append(wish)
+            self._start_changes(desired, order)
+        self._pending.append(desired)
         acceleration = self._pending.pop(0)
         decay = np.exp(-h / self._settings.noise_time)
         kick = self._settings.acceleration_noise * np.sqrt(1 - decay**2)
@@ -136,12 +139,12 @@ class Traffic:
         self._share = self._share + travelled / self._change_length
         self._from = np.where(self._share < 1, self._from, -1)
         if self._lanes.taper > 0:
-            self.lane[(self.lane == self._lanes.ending) & (self.s >= self._lanes.end)] = self._lanes.beside
+            self.lane[(self.lane == self._lanes.ending) & (self.s >= self._lanes.end)] = self._lanes.adjacent
         self.time += h
         self._steps += 1
 
-    def _wish(self, order: LaneOrder, metric: FloatArray) -> FloatArray:
-        """Acceleration (N,), m/s^2, that the drivers want now; `metric` (N,) turns differences of s into metres."""
+    def _desired_acceleration(self, order: LaneOrder, metric: FloatArray) -> FloatArray:
+        """Acceleration (N,), m/s^2, that the drivers want now; `metric` (N,) converts differences of s to metres."""
         drivers, s, v = self._fleet.drivers, self.s, self.speed
         limit = np.full(len(s), np.inf)
         for zone in self._slow_zones:
@@ -176,15 +179,15 @@ class Traffic:
         return pull
 
     def _courtesy(self, order: LaneOrder) -> FloatArray:
-        """Zip merging (N,), m/s^2: whoever has to leave a lane that ends fits himself in behind the next vehicle of the
-        other lane, and the one behind that place opens it for him, both braking comfortably at most.
+        """Zip merging (N,), m/s^2: a vehicle in the ending lane follows the next vehicle of the adjacent lane, and the
+        vehicle behind it in that lane follows it; both brake comfortably at most.
         """
         pull = np.zeros(len(self.s))
         if self._lanes.ending < 0:
             return pull
         merging = (self.lane == self._lanes.ending) & (self.s >= self._lanes.opening) & self.on_road
         rows = np.flatnonzero(merging)
-        target = np.full(len(rows), self._lanes.beside)
+        target = np.full(len(rows), self._lanes.adjacent)
         pairs = ((rows, order.ahead(target, self.s[rows])), (order.behind(target, self.s[rows]), rows))
         for behind, front in pairs:
             both = (behind >= 0) & (front >= 0)
@@ -195,26 +198,29 @@ class Traffic:
             np.minimum.at(pull, i, np.maximum(term, -drivers.comfortable_deceleration))
         return pull
 
-    def _start_changes(self, wish: FloatArray, order: LaneOrder) -> None:
+    def _start_changes(self, desired: FloatArray, order: LaneOrder) -> None:
         ending = self.lane == self._lanes.ending if self._lanes.ending >= 0 else np.zeros(len(self.s), dtype=np.bool_)
         free = (self._from < 0) & self.on_road & ((self.speed > SLOWEST_CHANGE) | ending)
         gains, targets = [], []
         for side in (-1, 1):
             target = self._lanes.neighbour(self.lane, side)
             target = np.where(free & self._lanes.may_change(self.lane, target, self.s), target, -1)
-            gains.append(advantage(self._fleet, self.s, self.speed, wish, target, ending, order, self._settings))
+            drivers, length = self._fleet.drivers, self._fleet.length
+            gains.append(
+                lane_change_gain(drivers, length, self.s, self.speed, desired, target, ending, order, self._settings)
+            )
             targets.append(target)
         better = gains[1] > gains[0]
         gain, target = np.where(better, gains[1], gains[0]), np.where(better, targets[1], targets[0])
-        rows = choose(gain, target)
+        rows = best_lane_changes(gain, target)
         self._from[rows] = self.lane[rows]
         self.lane[rows] = target[rows]
         self._share[rows] = 0.0
         self._change_length[rows] = np.maximum(np.maximum(4.0 * self.speed[rows], 3.0 * self._fleet.length[rows]), 20.0)
 
 
-def drive(traffic: Traffic, steps: int) -> TrafficHistory:
-    """Let the vehicles drive and note `steps` + 1 moments, the present one first."""
+def record_traffic(traffic: Traffic, steps: int) -> TrafficHistory:
+    """Advance the traffic by `steps` time steps and record all of them, the present state first."""
     columns: list[tuple[object, ...]] = []
     for k in range(steps + 1):
         if k:

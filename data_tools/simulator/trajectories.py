@@ -1,4 +1,4 @@
-"""Where everything was: sampled motion of N objects, and what lies between the samples.
+"""Trajectories of N objects, sampled in time and interpolated between the samples.
 
 Between two samples positions follow the cubic with the given positions and velocities at both ends (Hermite);
 velocities and headings are interpolated linearly.
@@ -17,7 +17,7 @@ from saga_fg.types.boxes import Boxes
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """N objects on the ground at T moments of equal spacing, in world coordinates.
+    """N objects on the ground at T equally spaced times, in world coordinates.
 
     id, label  (N,)
     size       (N, 3) m
@@ -25,7 +25,7 @@ class Trajectories:
     position   (T, N, 2) m
     velocity   (T, N, 2) m/s
     yaw        (T, N) rad, not wrapped
-    present    (T, N) whether the object exists
+    present    (T, N) True while the object exists
     """
 
     id: StrArray
@@ -41,7 +41,7 @@ class Trajectories:
         return len(self.id)
 
     def at(self, time: float) -> tuple[Boxes, BoolArray]:
-        """All N boxes at `time`, standing on the ground z = 0, and which of them exist (N,)."""
+        """All N boxes at `time`, on the ground z = 0, and a mask (N,) of those that exist."""
         step = self.time[1] - self.time[0]
         k = int(np.clip(np.floor((time - self.time[0]) / step), 0, len(self.time) - 2))
         u = (time - self.time[k]) / step
@@ -59,7 +59,7 @@ class Trajectories:
         return boxes, self.present[k] & self.present[k + 1]
 
     def select(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Trajectories:
-        """Some of the objects."""
+        """The objects of some rows."""
         return replace(
             self,
             **{name: getattr(self, name)[rows] for name in ("id", "label", "size")},
@@ -67,7 +67,7 @@ class Trajectories:
         )
 
 
-def together(parts: Sequence[Trajectories]) -> Trajectories:
+def concatenated(parts: Sequence[Trajectories]) -> Trajectories:
     """All objects of `parts`, which share their times."""
     return Trajectories(
         **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("id", "label", "size")},
@@ -79,8 +79,8 @@ def together(parts: Sequence[Trajectories]) -> Trajectories:
     )
 
 
-def standing(id: StrArray, boxes: Boxes, time: FloatArray) -> Trajectories:  # noqa: A002
-    """Objects that never move."""
+def static_objects(id: StrArray, boxes: Boxes, time: FloatArray) -> Trajectories:  # noqa: A002
+    """Trajectories of objects that never move."""
     shape = (len(time), len(boxes))
     return Trajectories(
         id,

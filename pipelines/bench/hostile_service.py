@@ -36,7 +36,7 @@ from pipelines.bench.served import Served
 from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
 from saga_fg.errors import SagaError
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 VALID = 0.2  # share of the messages that are frames of the good clients
 BEAT = 0.01  # s
@@ -45,16 +45,13 @@ MOST_STALL, MOST_GROWTH = 0.5, 1.05  # s; memory at the end by memory at the sta
 
 
 @dataclass(frozen=True)
-class HostileBenchSettings:
+class HostileBenchSettings(Settings):
     """How long, and how fast."""
 
-    messages: int = setting(20_000, "messages in all, a fifth of them valid frames of two good clients")
-    objects: int = setting(50, "objects in each valid frame")
-    pace: float = setting(50.0, "frames a good client sends in a second; their own clocks show 10 a second")
+    messages: PositiveInt = setting(20_000, "messages in all, a fifth of them valid frames of two good clients")
+    objects: PositiveInt = setting(50, "objects in each valid frame")
+    pace: Positive = setting(50.0, "frames a good client sends in a second; their own clocks show 10 a second")
     seed: int = setting(0, "of messages and mishaps")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "messages", "objects", "pace")
 
     @property
     def frames(self) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from pipelines.bench.circling_objects import INTERVAL, CirclingObjects
 from pipelines.bench.served import Served
 from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import PositiveInt, Range, Settings, setting
 
 BROKEN = (
     b"{",
@@ -31,18 +31,14 @@ ANSWERS = ("tracks", "held", "repeat")
 
 
 @dataclass(frozen=True)
-class ServiceBenchSettings:
+class ServiceBenchSettings(Settings):
     """How long, and how rough."""
 
-    frames: int = setting(100_000, "frames to send")
-    objects: int = setting(50, "objects in each")
-    malformed: float = setting(0.01, "share of messages that are broken")
-    late: float = setting(0.05, "share of frames that come after younger ones")
+    frames: PositiveInt = setting(100_000, "frames to send")
+    objects: PositiveInt = setting(50, "objects in each")
+    malformed: Annotated[float, Range(0.0, 0.5)] = setting(0.01, "share of messages that are broken")
+    late: Annotated[float, Range(0.0, 0.5)] = setting(0.05, "share of frames that come after younger ones")
     seed: int = setting(0, "of objects and mishaps")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "frames", "objects")
-        require_between(self, 0.0, 0.5, "malformed", "late")
 
 
 @dataclass(frozen=True)

@@ -80,11 +80,11 @@ def serve(
     from pipelines.configuration import load_settings
     from pipelines.process import one_thread, return_large_blocks
     from pipelines.serving import StopRequest, StreamSettings, StreamTracker
-    from pipelines.serving.seldom import SeldomFilter
+    from pipelines.serving.log_limit import LogLimitFilter
 
     if not verbose:
         for handler in logging.getLogger().handlers:
-            handler.addFilter(SeldomFilter())
+            handler.addFilter(LogLimitFilter())
     settings = how.configured("file", config, method, estimator, lag, association, interactions)
     bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
     if reorder is not None:

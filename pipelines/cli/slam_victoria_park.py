@@ -37,7 +37,7 @@ def victoria_park(
     from data_tools.datasets.victoria_park import read_victoria_park
     from data_tools.files.atomic_files import check_writable_folder
     from data_tools.metrics.grouping import pairwise_agreement
-    from pipelines.slam.landmark_results import planar_trajectory, records, write_landmark_results
+    from pipelines.slam.results import landmark_rows, planar_trajectory, write_landmark_map
     from pipelines.slam.victoria_park import ParkSettings, map_park
 
     if odometry_scale is not None and not 0 < odometry_scale < np.inf:
@@ -61,7 +61,7 @@ def victoria_park(
         "log evidence by odometry scale": {f"{scale:g}": value for scale, value in park.log_evidence.items()},
     }
     poses = planar_trajectory(np.arange(len(park.map.world_T_pose), dtype=np.float64), park.map.world_T_pose)
-    write_landmark_results(output, poses, records(park.map.landmarks), figures)
+    write_landmark_map(output, poses, landmark_rows(park.map.landmarks), figures)
     typer.echo(
         f"{output}: {counted(len(poses), 'pose')}, {counted(len(drive.tree), 'sighting')}, "
         f"{counted(len(park.map.landmarks), 'landmark')} ({named} in the file)"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.kitti.labels import KittiObjects
+from data_tools.kitti_objects import KittiObjects
 from data_tools.metrics import (
     HotaFigures,
     KittiSimilarity,

@@ -10,9 +10,9 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import (
     FORMS_OF_TRACKERS,
+    FilterNoise,
+    FilterNoiseLikelihood,
     GapSettings,
-    OwnMotion,
-    OwnMotionLikelihood,
     Trajectories,
     fit_by_held_out,
     fit_interactions,
@@ -33,14 +33,14 @@ def learn_interactions(
     classes = tuple(sorted({str(c) for t in recordings.values() for c in np.unique(t.label)}))
     likelihoods = []
     for done, (name, trajectories) in enumerate(recordings.items()):
-        likelihoods.append(OwnMotionLikelihood(trajectories, classes, settings))
+        likelihoods.append(FilterNoiseLikelihood(trajectories, classes, settings))
         if progress is not None:
-            progress(f"own motion {name}", done + 1, len(recordings))
+            progress(f"classical filter {name}", done + 1, len(recordings))
     if not any(n for of in likelihoods for n in of.count.values()):
         raise InputError(f"{origin}: expected objects that are followed for {settings.followed:g} s and more")
-    own = OwnMotion.most_likely(likelihoods)
+    classical = FilterNoise.most_likely(likelihoods)
     fit = fit_networks if network else fit_interactions
-    fitted = fit_by_held_out(list(recordings.values()), classes, own, fit, settings, FORMS_OF_TRACKERS)
+    fitted = fit_by_held_out(list(recordings.values()), classes, classical, fit, settings, FORMS_OF_TRACKERS)
     return LearnedInteractions(
         learned_from=origin,
         edges=fitted.rules,

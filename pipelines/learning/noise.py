@@ -1,7 +1,7 @@
 """Sensors' models and process noise from recordings, with ground truth or without.
 
-With ground truth, detections are compared with the true objects next to them. Without, the tracker says what belongs
-together, by the settings that are there; what is learned so replaces these settings, and the tracker says it again.
+With ground truth, detections are compared with the true objects next to them. Without, the tracker with the present
+settings assigns detections to objects; then once more with the settings learned from that.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.sightings import sightings
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import (
     GATE,
+    DetectedTrajectory,
     DetectionSample,
-    Sightings,
-    Trail,
+    MeasuredTrajectory,
     fit_acceleration_noise_by_class,
     fit_sensor,
-    fit_trail_noise,
-    follow,
+    fit_trajectory_noise,
     learn_confusion,
+    measured_trajectories,
+    sample_with_tracker,
     sample_with_truth,
 )
 from saga_fg.model.node import ConstantVelocity
@@ -36,9 +36,9 @@ from saga_fg.types.sensor import NoiseModel, Sensor, sensor_model
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 2  # of following by what the round before learned
+ROUNDS = 2  # of tracking, each with the noise learned in the one before
 FEW_DETECTIONS = 200  # of a sensor, that a standard deviation is known to 5 %
-FEWEST_TRAILS = 5  # a class with fewer has the noise of all trails together
+FEWEST_TRAJECTORIES = 5  # a class with fewer has the noise of all together
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ def learn_noise(
     rounds = 1 if with_truth else ROUNDS
     for k in range(rounds):
         reported = _reported(dataset, scenes, f" {k + 1}/{rounds}" if rounds > 1 else "", progress)
-        learned = _from_truth(reported, learned.config) if with_truth else _from_trails(reported, learned.config)
+        learned = _from_truth(reported, learned.config) if with_truth else _from_tracker(reported, learned.config)
     if not any(learned.detections.values()):
         raise InputError(f"{', '.join(scenes)}: expected detections to learn from, there is none")
     for name, count in learned.detections.items():
@@ -89,26 +89,23 @@ def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
     for name, tables in (learn_confusion(kept, config.sensors, groups) if groups else {}).items():
         learned[name] = replace(learned[name], confusion={**learned[name].confusion, **tables})
     config = replace(config, sensors={**config.sensors, **learned})
-    objects: dict[str, list[Sightings]] = {}
-    for scene in kept:
-        for label, found in sightings(scene, config.sensors).items():
-            objects.setdefault(label, []).extend(found.values())
+    objects = measured_trajectories(kept, config.sensors)
     noise = fit_acceleration_noise_by_class(objects) if _enough(objects) else {}
     return _with_process_noise(config, noise, pooled)
 
 
-def _from_trails(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
-    trails: list[Trail] = []
+def _from_tracker(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
+    trajectories: list[DetectedTrajectory] = []
     samples: dict[str, list[DetectionSample]] = {}
     for scene in scenes:
         tracker = config.new_tracker("kf")
         assert isinstance(tracker, Tracker)
-        found, of_sensors = follow(scene, tracker, config.sensors)
-        trails += found
+        found, of_sensors = sample_with_tracker(scene, tracker, config.sensors)
+        trajectories += found
         for name, sample in of_sensors.items():
             samples.setdefault(name, []).append(sample)
     pooled = {name: DetectionSample.pool(parts) for name, parts in samples.items()}
-    noise, process = _trail_noise(trails, config)
+    noise, process = _trajectory_noise(trajectories, config)
     sensors: dict[str, Sensor] = {}
     for name, sample in pooled.items():
         base = sensor_model(config.sensors, name)
@@ -116,26 +113,26 @@ def _from_trails(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
     return _with_process_noise(replace(config, sensors={**config.sensors, **sensors}), process, pooled)
 
 
-def _trail_noise(
-    trails: Sequence[Trail], config: TrackConfig
+def _trajectory_noise(
+    trajectories: Sequence[DetectedTrajectory], config: TrackConfig
 ) -> tuple[dict[str, dict[str, NoiseModel]], dict[str, float]]:
-    """Sensor -> class -> noise, and class -> acceleration noise, of the classes followed often enough and `default`."""
-    labels, count = np.unique([trail.label for trail in trails], return_counts=True)
-    groups = {DEFAULT: trails} if trails else {}
-    for label in labels[count >= FEWEST_TRAILS].tolist():
-        groups[label] = [trail for trail in trails if trail.label == label]
+    """Sensor -> class -> noise, and class -> acceleration noise, of classes seen often enough and `default`."""
+    labels, count = np.unique([one.label for one in trajectories], return_counts=True)
+    groups = {DEFAULT: trajectories} if trajectories else {}
+    for label in labels[count >= FEWEST_TRAJECTORIES].tolist():
+        groups[label] = [one for one in trajectories if one.label == label]
     noise: dict[str, dict[str, NoiseModel]] = {}
     process: dict[str, float] = {}
     for label, group in groups.items():
         settings = class_settings(config.tracker.classes, ClassSettings, label)
         q = settings.motion.acceleration_noise if isinstance(settings.motion, ConstantVelocity) else 1.0
-        of_sensors, process[label] = fit_trail_noise(group, config.sensors, label, q, settings.birth_speed)
+        of_sensors, process[label] = fit_trajectory_noise(group, config.sensors, label, q, settings.birth_speed)
         for name, model in of_sensors.items():
             noise.setdefault(name, {})[label] = model
     return noise, process
 
 
-def _enough(objects: dict[str, list[Sightings]]) -> bool:
+def _enough(objects: dict[str, list[MeasuredTrajectory]]) -> bool:
     return any(len(found) >= 3 for same in objects.values() for found in same)
 
 
@@ -148,5 +145,5 @@ def _with_process_noise(
         for label, q in noise.items()
         if isinstance(class_settings(config.tracker.classes, ClassSettings, label).motion, ConstantVelocity)
     }
-    counts = {name: len(sample) for name, sample in samples.items()}
+    counts = {name: len(sample.detections) for name, sample in samples.items()}
     return LearnedNoise(config.with_acceleration_noise(of_class), counts, tuple(of_class))

@@ -9,8 +9,8 @@ socket; `StateKeeper` keeps the state in a file.
 from pipelines.serving.address import Address, parse_address
 from pipelines.serving.client import StreamClient
 from pipelines.serving.pipe import serve_pipe
+from pipelines.serving.server import SocketServer
 from pipelines.serving.settings import StreamSettings
-from pipelines.serving.sockets import SocketServer
 from pipelines.serving.state_keeper import StateKeeper
 from pipelines.serving.stopping import StopRequest
 from pipelines.serving.stream import StreamTracker

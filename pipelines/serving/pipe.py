@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import queue
-import threading
-from typing import IO
+import os
+import select
+from collections.abc import Iterable
+from typing import IO, Any
 
-from pipelines.serving.lines import LineSplitter
-from pipelines.serving.messages import encode
+from pipelines.serving.messages import LineSplitter, encode
 from pipelines.serving.stopping import StopRequest
 from pipelines.serving.stream import StreamTracker
 
@@ -17,46 +17,40 @@ log = logging.getLogger(__name__)
 PIECE = 2**16  # bytes read at once
 
 
-class _End:
-    """Stands after the last line."""
-
-
 def serve_pipe(
     stream: StreamTracker[None], source: IO[bytes], sink: IO[bytes], stop: StopRequest | None = None
 ) -> None:
-    """Answer lines until the source ends or `stop` is asked for; what is held back is taken in then.
+    """Answer lines until the source ends or `stop` is requested, then the frames that are held back.
 
-    Whoever reads the answers slowly slows the reading: nothing piles up. Raises `BrokenPipeError` when he goes away.
+    source: a file with a descriptor; nothing may have been read from its buffer. A slow reader of the answers slows the
+    reading: nothing piles up. Raises `BrokenPipeError` when that reader goes away.
     """
-    lines: queue.SimpleQueue[bytes | _End | None] = queue.SimpleQueue()
-    room = threading.Semaphore(stream.settings.max_queue)
-    threading.Thread(target=_read, args=(source, stream.settings.max_message, lines, room), daemon=True).start()
-    if stop is not None:
-        stop.notify(lambda: lines.put(_End()))
-    while not isinstance(line := lines.get(), _End):
-        for _, answer in stream.handle(line, None):
+
+    def send(answers: Iterable[tuple[None, dict[str, Any]]]) -> None:
+        for _, answer in answers:
             sink.write(encode(answer))
         sink.flush()
-        room.release()
-    for _, answer in stream.flush():
-        sink.write(encode(answer))
-    sink.flush()
+
+    splitter, descriptor = LineSplitter(stream.settings.max_message), source.fileno()
+    stopped, wake = os.pipe()  # stays open: a signal may come at any time
+    if stop is not None:
+        stop.notify(lambda: os.write(wake, b"."))
+    ended = False
+    while not ended:
+        ready, _, _ = select.select([descriptor, stopped], [], [])
+        ended = stopped in ready
+        if descriptor in ready:
+            piece = _read(descriptor)
+            ended |= not piece
+            for line in splitter.feed(piece) if piece else splitter.finish():
+                send(stream.handle(line, None))
+    send(stream.flush())
 
 
-def _read(
-    source: IO[bytes], limit: int, lines: queue.SimpleQueue[bytes | _End | None], room: threading.Semaphore
-) -> None:
-    """All lines of a source; waits while there is no room."""
-    splitter = LineSplitter(limit)
-    unbuffered = getattr(source, "raw", source)  # a thread that waits in a buffered file cannot be left behind
+def _read(descriptor: int) -> bytes:
+    """The next bytes, none at the end or where they cannot be read."""
     try:
-        while piece := unbuffered.read(PIECE):
-            for line in splitter.feed(piece):
-                room.acquire()
-                lines.put(line)
-        for line in splitter.finish():
-            lines.put(line)
+        return os.read(descriptor, PIECE)
     except OSError as error:
         log.warning("standard input: %s", error)
-    finally:
-        lines.put(_End())
+        return b""

@@ -2,48 +2,51 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import (
+    NonNegative,
+    Positive,
+    PositiveInt,
+    PositiveOrInf,
+    Settings,
+    setting,
+)
 
 MB = 2**20
 
 
 @dataclass(frozen=True)
-class StreamSettings:
+class StreamSettings(Settings):
     """Limits of a stream and of its connections. `reorder` counts on the frames' clock, other times on the wall's."""
 
-    reorder: float = setting(0.0, "s a frame is held back, so that frames of several sensors go in in order of time")
-    max_held: int = setting(256, "frames held back at most; beyond, the oldest goes in")
-    max_sensors: int = setting(
+    reorder: NonNegative = setting(
+        0.0, "s a frame is held back, so that frames of several sensors go in in order of time"
+    )
+    max_held: PositiveInt = setting(256, "frames held back at most; beyond, the oldest goes in")
+    max_sensors: PositiveInt = setting(
         1000, "sensors whose frames are numbered at most; beyond, the one silent for longest loses its number"
     )
-    max_seq_jump: int = setting(
+    max_seq_jump: PositiveInt = setting(
         1_000_000,
         "a `seq` further than this beyond the last one of its sensor is refused; the first may be any",
     )
-    max_detections: int = setting(
+    max_detections: PositiveInt = setting(
         500, "detections of a frame at most; one frame of so many takes up to 0.2 s, for which all clients wait"
     )
-    max_message: int = setting(4 * MB, "bytes of a message at most")
-    max_queue: int = setting(64, "messages of one client that wait at most; beyond, its reading pauses")
-    max_failures: int = setting(3, "internal errors of the tracker in a row that start a fresh tracker")
-    max_clients: int = setting(256, "connections at most, fewer where the process may not open as many files")
-    max_unfinished: int = setting(
+    max_message: PositiveInt = setting(4 * MB, "bytes of a message at most")
+    max_failures: PositiveInt = setting(3, "internal errors of the tracker in a row that start a fresh tracker")
+    max_clients: PositiveInt = setting(256, "connections at most, fewer where the process may not open as many files")
+    max_unfinished: PositiveInt = setting(
         64 * MB, "bytes of unfinished and waiting lines of all clients; beyond, the client that holds most is closed"
     )
-    max_outbox: int = setting(8 * MB, "bytes of answers that wait for one client to read them; beyond, it is closed")
-    client_timeout: float = setting(
+    max_outbox: PositiveInt = setting(
+        8 * MB, "bytes of answers that wait for one client to read them; beyond, it is closed"
+    )
+    client_timeout: Positive = setting(
         0.5, "a client whose answers pile up and that reads nothing for this long is closed, s"
     )
-    idle_timeout: float = setting(3600.0, "a client without a message or an answer for this long is closed, s")
-    stop_timeout: float = setting(5.0, "time to finish after SIGTERM or SIGINT; then the process ends all the same, s")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0.0, math.inf, "reorder")
-        require_positive(self, "max_held", "max_sensors", "max_seq_jump", "max_detections", "max_message", "max_queue")
-        require_positive(
-            self, "max_failures", "max_clients", "max_unfinished", "max_outbox", "client_timeout", "stop_timeout"
-        )
-        require_positive(self, "idle_timeout", infinite=True)
+    idle_timeout: PositiveOrInf = setting(3600.0, "a client without a message or an answer for this long is closed, s")
+    stop_timeout: Positive = setting(
+        5.0, "time to finish after SIGTERM or SIGINT; then the process ends all the same, s"
+    )

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.files.atomic_files import check_writable, remove_leftovers
-from pipelines.serving.seldom import Seldom
+from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.state_file import read_state, write_state
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError
@@ -42,7 +42,7 @@ class StateKeeper:
         self._thread = threading.Thread(target=self._run, name="state keeper", daemon=True)
         self._version = -1  # that is on the disk
         self._written_at: float | None = None
-        self._seldom = Seldom()
+        self._log_limit = LogLimit()
         self._error: str | None = None
         self._lock: int | None = None
 
@@ -123,7 +123,7 @@ class StateKeeper:
 
     def _warn(self, error: Exception) -> None:
         self._error = " ".join(f"{error}".split())[:300]
-        if self._seldom.due(type(error).__name__):
+        if self._log_limit.due(type(error).__name__):
             unexpected = None if isinstance(error, InputError | OSError) else error
             log.warning("the state is not kept: %s", self._error, exc_info=unexpected)
 

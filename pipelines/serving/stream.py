@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pipelines.process import resident_memory
 from pipelines.serving.latency import Latencies
+from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.messages import (
     FrameMessage,
     SensorReset,
@@ -24,7 +25,6 @@ from pipelines.serving.messages import (
 )
 from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
-from pipelines.serving.seldom import Seldom
 from pipelines.serving.session_tracker import SessionTracker
 from pipelines.serving.settings import StreamSettings
 from saga_fg.errors import InputError
@@ -76,7 +76,7 @@ class StreamTracker(Generic[Client]):
         self._numbering = Numbering(self.settings.max_sensors)
         self._durable: dict[str, int] = {}
         self._failed_in_a_row = 0
-        self._seldom = Seldom()
+        self._log_limit = LogLimit()
         self._started = time.monotonic()
         self._lock = threading.Lock()
 
@@ -225,7 +225,7 @@ class StreamTracker(Generic[Client]):
         if number is not None:
             for silent in self._numbering.take(frame.sensor, number):
                 self._forget(silent)
-                if self._seldom.due("sensors"):
+                if self._log_limit.due("sensors"):
                     most = self.settings.max_sensors
                     log.warning("more than %d numbered sensors: the number of %r is forgotten", most, silent)
         if verdict == "late":
@@ -254,12 +254,12 @@ class StreamTracker(Generic[Client]):
 
     def _failed(self, error: Exception) -> Answer:
         """Count an error that is no fault of the message, and answer it; after some in a row, begin anew."""
-        if self._seldom.due(_origin(error)):
+        if self._log_limit.due(_origin(error)):
             log.error("message %d: internal error, the service goes on", self.counts["messages"], exc_info=error)
         self.counts["failures"] += 1
         self._failed_in_a_row += 1
         if self._failed_in_a_row >= self.settings.max_failures:
-            if self._seldom.due("restart"):
+            if self._log_limit.due("restart"):
                 log.error("%d internal errors in a row: a fresh tracker begins", self._failed_in_a_row)
             self.counts["restarts"] += 1
             self._begin_anew()

@@ -27,14 +27,14 @@ from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.drive import LEAST, Drive, drive_by_lidar, drive_by_poses
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, find_loops
 from pipelines.slam.odometry import OdometrySettings
-from pipelines.slam.sightings import Seen, SightingSettings, landmarks_seen
+from pipelines.slam.scan_landmarks import ObservedLandmark, ScanLandmarkSettings, observe_landmarks
 from pipelines.tracking import Progress
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import Additions, FactorProvider, GraphView
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import LandmarkMapper, MapperSettings, MeasuredMotion, Sighting, Sightings, pose_key
 from saga_fg.types.landmark import Landmark, Observation
@@ -55,23 +55,20 @@ CALIBRATED = OdometryNoise(
 
 
 @dataclass(frozen=True)
-class LidarSlamSettings:
+class LidarSlamSettings(Settings):
     """All that shapes a run."""
 
     odometry: OdometrySettings = settings_group(OdometrySettings, "of the LiDAR")
-    sightings: SightingSettings = settings_group(SightingSettings, "of landmarks in a scan")
+    observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "of landmarks in a scan")
     mapper: MapperSettings = settings_group(lambda: MapperSettings(confirm=4), "telling landmarks apart")
     loops: LoopSettings = settings_group(LoopSettings, "closing loops")
     landmarks: bool = setting(True, "whether landmarks are nodes of the graph")
     loop_closures: bool = setting(True, "whether loops are looked for")
-    robust_scale: float = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
-    map_spacing: float = setting(0.25, "a scan is thinned to this for the accumulated map, m")
+    robust_scale: Positive = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
+    map_spacing: Positive = setting(0.25, "a scan is thinned to this for the accumulated map, m")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "of objects in the same graph")
-    oxts_rotation: float = setting(1e-3, "standard deviation of a motion by GPS/IMU between scans, rad")
-    oxts_translation: float = setting(0.03, "and of its translation, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "robust_scale", "map_spacing", "oxts_rotation", "oxts_translation")
+    oxts_rotation: Positive = setting(1e-3, "standard deviation of a motion by GPS/IMU between scans, rad")
+    oxts_translation: Positive = setting(0.03, "and of its translation, m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +80,8 @@ class LidarSlam:
                  when the keyframe came
     covariances  (M, 6, 6) of the sensor's pose at the keyframes, (rotation, translation) in its frame, rad^2, m^2
     landmarks    of the map, those seen more than once
-    sightings    what was seen, of which of them, from which keyframe
-    extents      (2, 3) of each sighting: ends of the piece that was seen, m, in the sensor's frame
+    observations of landmarks, with the landmark and the keyframe of each
+    extents      (2, 3) of each observation: ends of the observed piece, m, in the sensor's frame
     loops        that were closed
     clouds       M arrays (N, 3), thinned, without skew, in the sensor's frame; world_T_lidar (M, 4, 4) their places
     """
@@ -95,7 +92,7 @@ class LidarSlam:
     online: Trajectory
     covariances: FloatArray
     landmarks: Sequence[Landmark]
-    sightings: Sequence[Sighting]
+    observations: Sequence[Sighting]
     extents: Sequence[FloatArray]
     loops: Sequence[LoopClosure]
     clouds: Sequence[FloatArray]
@@ -127,12 +124,12 @@ def lidar_slam(
         drive = drive_by_poses(scans, s.oxts_rotation, s.oxts_translation, s.odometry, progress)
     motions = drive.motions(drive.keyframes)
     mapper = LandmarkMapper(drive.poses[0], _START, s.mapper)
-    online, seen = [], list[list[Seen]]()
+    online, seen = [], list[list[ObservedLandmark]]()
     for k, points in enumerate(drive.points):
         if k:
             mapper.move(*motions[k - 1])
         if s.landmarks:
-            seen.append(landmarks_seen(points, s.sightings, detectors))
+            seen.append(observe_landmarks(points, s.observations, detectors))
             mapper.observe([each.observation for each in seen[-1]])
         online.append(mapper.estimate.pose.matrix())
         if progress is not None:

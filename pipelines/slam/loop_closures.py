@@ -10,33 +10,38 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from data_tools.lidar import RegistrationError, RegistrationSettings, SurfelMap, register, voxel_downsample
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import (
+    Fraction,
+    Positive,
+    Range,
+    Settings,
+    setting,
+    settings_group,
+)
 
 
 @dataclass(frozen=True)
-class LoopSettings:
+class LoopSettings(Settings):
     """When two keyframes are looked at, and when they are taken for one place."""
 
-    distance: float = setting(8.0, "largest distance of the two places by the present estimate, m")
-    path: float = setting(30.0, "least way driven between them, m")
-    every: float = setting(5.0, "least way between two searches, m")
-    around: int = setting(4, "keyframes to either side whose scans make the map that is registered with")
-    surfel: float = setting(1.0, "voxel of that map, m")
-    spacing: float = setting(1.0, "a scan is thinned to this before it is registered, m")
-    overlap: float = setting(0.5, "least share of the points that have a surfel")
-    residual: float = setting(0.3, "largest mean distance of points from their surfels, m")
+    distance: Positive = setting(8.0, "largest distance of the two places by the present estimate, m")
+    path: Positive = setting(30.0, "least way driven between them, m")
+    every: Positive = setting(5.0, "least way between two searches, m")
+    around: Annotated[int, Range(0, 1000)] = setting(
+        4, "keyframes to either side whose scans make the map that is registered with"
+    )
+    surfel: Positive = setting(1.0, "voxel of that map, m")
+    spacing: Positive = setting(1.0, "a scan is thinned to this before it is registered, m")
+    overlap: Fraction = setting(0.5, "least share of the points that have a surfel")
+    residual: Positive = setting(0.3, "largest mean distance of points from their surfels, m")
     registration: RegistrationSettings = settings_group(RegistrationSettings, "of the scan with the map")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "distance", "path", "every", "surfel", "spacing", "residual")
-        require_between(self, 0.0, 1.0, "overlap")
-        require_between(self, 0, 1000, "around")
 
 
 @dataclass(frozen=True, eq=False)

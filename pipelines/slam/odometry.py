@@ -35,32 +35,26 @@ from data_tools.trajectories import rotation_angle
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting, settings_group
 
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class OdometrySettings:
+class OdometrySettings(Settings):
     """Sizes for a vehicle among houses; halve `surfel` indoors."""
 
-    nearest: float = setting(3.0, "points nearer than this are the vehicle's own, m")
-    reach: float = setting(100.0, "points and surfels farther than this are left out, m")
-    surfel: float = setting(1.0, "voxel of the local map, m")
-    map_spacing: float = setting(0.25, "a scan is thinned to this before it goes into the map, m")
-    scan_spacing: float = setting(1.5, "and to this before it is registered, m")
-    first_deviation: float = setting(1.0, "of the first motion from standing still, m")
-    deviation_floor: float = setting(0.1, "sigma is never below this, m")
-    keyframe_distance: float = setting(0.5, "a scan this far from the last keyframe is the next, m")
-    keyframe_rotation: float = setting(0.05, "or turned by this, rad")
-    lost_deviation: float = setting(1.0, "standard deviation of a motion that was only predicted, m and rad")
+    nearest: Positive = setting(3.0, "points nearer than this are the vehicle's own, m")
+    reach: Positive = setting(100.0, "points and surfels farther than this are left out, m")
+    surfel: Positive = setting(1.0, "voxel of the local map, m")
+    map_spacing: Positive = setting(0.25, "a scan is thinned to this before it goes into the map, m")
+    scan_spacing: Positive = setting(1.5, "and to this before it is registered, m")
+    first_deviation: Positive = setting(1.0, "of the first motion from standing still, m")
+    deviation_floor: Positive = setting(0.1, "sigma is never below this, m")
+    keyframe_distance: Positive = setting(0.5, "a scan this far from the last keyframe is the next, m")
+    keyframe_rotation: Positive = setting(0.05, "or turned by this, rad")
+    lost_deviation: Positive = setting(1.0, "standard deviation of a motion that was only predicted, m and rad")
     registration: RegistrationSettings = settings_group(RegistrationSettings, "of a scan with the map")
-
-    def __post_init__(self) -> None:
-        require_positive(
-            self, "nearest", "reach", "surfel", "map_spacing", "scan_spacing", "first_deviation", "deviation_floor",
-            "keyframe_distance", "keyframe_rotation", "lost_deviation",
-        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

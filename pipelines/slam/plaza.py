@@ -14,19 +14,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import accumulate
+from typing import Annotated
 
 import numpy as np
 
 from data_tools.datasets.plaza import BeaconRanges
 from data_tools.trajectories import absolute_errors, matched, rigid_alignment
 from factors import Robust, SolverSettings, calibrated_range_factors, prior_factor
-from pipelines.slam.landmark_results import planar_trajectory
+from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
@@ -36,25 +38,20 @@ _CALIBRATION = key_of(EGO_ERROR, 0, None)
 
 
 @dataclass(frozen=True)
-class PlazaSettings:
+class PlazaSettings(Settings):
     """How odometry and ranges are believed."""
 
-    distance_noise: float = setting(0.05, "standard deviation of the distance of a step, as a share of it")
-    least_noise: float = setting(0.005, "m, of a step's distance, and sideways, at least")
-    turn_noise: float = setting(0.01, "rad, of a step's heading change")
-    range_noise: float = setting(0.5, "m, standard deviation of a range")
-    robust: float = setting(2.0, "standard deviations beyond which ranges are believed less (Cauchy)")
-    scale_noise: float = setting(0.1, "standard deviation of the radio's scale before anything is measured")
-    offset_noise: float = setting(1.0, "m, the same of its offset")
-    beginning: float = setting(100.0, "m driven before the beacons are placed")
-    growth: float = setting(1.3, "by which each part of the drive is longer than the one before")
-
-    def __post_init__(self) -> None:
-        require_positive(
-            self, "distance_noise", "least_noise", "turn_noise", "range_noise", "robust", "scale_noise",
-            "offset_noise", "beginning",
-        )  # fmt: skip
-        require_between(self, 1.01, 100.0, "growth")
+    distance_noise: Positive = setting(0.05, "standard deviation of the distance of a step, as a share of it")
+    least_noise: Positive = setting(0.005, "m, of a step's distance, and sideways, at least")
+    turn_noise: Positive = setting(0.01, "rad, of a step's heading change")
+    range_noise: Positive = setting(0.5, "m, standard deviation of a range")
+    robust: Positive = setting(2.0, "standard deviations beyond which ranges are believed less (Cauchy)")
+    scale_noise: Positive = setting(0.1, "standard deviation of the radio's scale before anything is measured")
+    offset_noise: Positive = setting(1.0, "m, the same of its offset")
+    beginning: Positive = setting(100.0, "m driven before the beacons are placed")
+    growth: Annotated[float, Range(1.01, 100.0)] = setting(
+        1.3, "by which each part of the drive is longer than the one before"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +72,7 @@ def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> B
     """Estimate all of a drive. Raises `InputError` for a beacon without ranges enough to place it."""
     settings = settings or PlazaSettings()
     steps = _steps(drive.distance, drive.turn)
-    reckoned = _chained(np.eye(3), steps[1:])
+    reckoned = np.stack(list(accumulate(steps[1:], np.matmul, initial=np.eye(3))))
     at = np.clip(np.searchsorted(drive.time, drive.measured), 0, len(drive.time) - 1)
     end = int(np.searchsorted(np.cumsum(np.abs(drive.distance)), settings.beginning)) + 1
     graph, numbers = SceneFactorGraph(), np.unique(drive.beacon).tolist()
@@ -177,11 +174,3 @@ def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
     T[:, :2, :2] = np.stack([np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)], axis=1).reshape(-1, 2, 2)
     T[:, :2, 2] = distance[:, None] * np.stack([np.cos(turn / 2), np.sin(turn / 2)], axis=1)
     return T
-
-
-def _chained(start: FloatArray, steps: FloatArray) -> FloatArray:
-    """The poses (K + 1, 3, 3) that K increments lead to."""
-    poses = [start]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return np.stack(poses)

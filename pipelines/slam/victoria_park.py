@@ -8,13 +8,14 @@ on the beginning of the drive (`LandmarkMapper.log_evidence`); the identities in
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from data_tools.datasets.victoria_park import TreeSightings
 from pipelines.tracking import Progress
 from saga_fg.model.landmarks.point import PointLandmark
-from saga_fg.settings import require_between, setting, settings_group
+from saga_fg.settings import Range, Settings, setting, settings_group
 from saga_fg.slam.mapping import LandmarkMap, LandmarkMapper, MapperSettings
 from saga_fg.types.landmark import Observation
 
@@ -22,7 +23,7 @@ _START = 1e-6  # variance of the first pose, m^2 and rad^2
 
 
 @dataclass(frozen=True)
-class ParkSettings:
+class ParkSettings(Settings):
     """How a drive past trees is mapped."""
 
     mapper: MapperSettings = settings_group(lambda: MapperSettings(smooth_every=300), "how trees are told apart")
@@ -32,10 +33,7 @@ class ParkSettings:
     odometry_scales: tuple[float, ...] = setting(
         (1.0, 4.0, 16.0, 64.0, 256.0), "factors on the covariance to choose of"
     )
-    beginning: int = setting(2000, "poses on which that is chosen")
-
-    def __post_init__(self) -> None:
-        require_between(self, 1, 10**9, "beginning")
+    beginning: Annotated[int, Range(1, 10**9)] = setting(2000, "poses on which that is chosen")
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,27 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True)
-class StretchSettings:
+class StretchSettings(Settings):
     """How a long recording is cut."""
 
-    length: float = setting(30.0, "of a stretch, s")
-    margin: float = setting(7.0, "that is smoothed with it at either end, s")
-    detections: int = setting(60_000, "a stretch that has so many is long enough")
-    shortest: float = setting(5.0, "and is cut then, though not shorter than this, s")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "length", "margin")
-        require_between(self, 1, 10**9, "detections")
-        require_between(self, 0.0, np.inf, "shortest")
+    length: Positive = setting(30.0, "of a stretch, s")
+    margin: Positive = setting(7.0, "that is smoothed with it at either end, s")
+    detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "a stretch that has so many is long enough")
+    shortest: NonNegative = setting(5.0, "and is cut then, though not shorter than this, s")
 
 
 @dataclass(frozen=True, eq=False)

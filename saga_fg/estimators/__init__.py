@@ -12,11 +12,11 @@ from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.kalman import JointKalmanFilter
+from saga_fg.estimators.measurements import Observations
 from saga_fg.estimators.protocol import Estimator, Measurements
+from saga_fg.estimators.recorded_smoother import SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
-from saga_fg.estimators.sighting import Observations
-from saga_fg.estimators.smoothed import Smoothed
 from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 
 __all__ = [
@@ -39,7 +39,7 @@ __all__ = [
     "Measurements",
     "Observations",
     "RelinearisationSettings",
-    "Smoothed",
+    "SmoothedState",
     "WindowSettings",
     "WindowedSmoother",
     "kalman_predict",

@@ -66,9 +66,7 @@ class BlockGaussian:
             left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, gone, strict=True))
             blocks = tuple(P for P in left if len(P))
         else:
-            where = np.full(len(keep), -1)
-            where[kept] = np.arange(len(kept))
-            blocks = regrouped(self.blocks, old, partition, where)
+            blocks = regrouped(self.blocks, old, partition, kept)
         return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
 
     def decoupled(self) -> BlockGaussian:
@@ -149,17 +147,10 @@ def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray)
 
 def joint_block(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
     """The block of all nodes at `rows`, in this order, of any sizes: (D', D')."""
-    some = Layout(np.arange(len(rows)), partition.layout.dims[rows])
-    target = Partition(some, np.zeros(len(rows), dtype=np.int64))
     if len(rows) == 0:
         return np.empty((0, 0))
-    if len(np.unique(rows)) < len(rows):  # a node named twice
-        distinct, inverse = np.unique(rows, return_inverse=True)
-        places = Layout(distinct, partition.layout.dims[distinct]).places(inverse)
-        return np.asarray(joint_block(blocks, partition, distinct)[np.ix_(places, places)])
-    where = np.full(len(partition.layout), -1)
-    where[rows] = np.arange(len(rows))
-    joint: FloatArray = regrouped(blocks, partition, target, where)[0][0]
+    some = Layout(np.arange(len(rows)), partition.layout.dims[rows])
+    joint: FloatArray = regrouped(blocks, partition, Partition(some, np.zeros(len(rows), dtype=np.int64)), rows)[0][0]
     return joint
 
 

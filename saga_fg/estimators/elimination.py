@@ -123,16 +123,16 @@ def width(tree: gtsam.GaussianBayesTree) -> int:
 def marginal_covariances(
     blocks: Mapping[int, FloatArray], keys: Sequence[Mapping[int, int]], layouts: Sequence[Layout]
 ) -> list[MarginalCovariances]:
-    """The same by moment; keys of each moment's nodes."""
-    moments = []
+    """The same by epoch; keys of each epoch's nodes."""
+    epochs = []
     for own, layout in zip(keys, layouts, strict=True):
         by_size, place = {}, np.empty(len(layout), dtype=np.int64)
         for d in np.unique(layout.dims).tolist():
             rows = np.flatnonzero(layout.dims == d)
             by_size[d] = np.array([blocks[own[node]] for node in layout.nodes[rows].tolist()])
             place[rows] = np.arange(len(rows))
-        moments.append(MarginalCovariances(layout, by_size, place))
-    return moments
+        epochs.append(MarginalCovariances(layout, by_size, place))
+    return epochs
 
 
 def _joint(R: FloatArray, S: FloatArray, separator: FloatArray) -> FloatArray:

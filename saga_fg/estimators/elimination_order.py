@@ -1,9 +1,9 @@
 """In which order to eliminate a recording, chosen by what each would cost.
 
-    time              moment by moment: a chain of dense joint states, carried out as filter and smoother
-    colamd, metis     sparse elimination of all states at once, one variable a node and moment, by GTSAM
+    time              epoch by epoch: a chain of dense joint states, carried out as filter and smoother
+    colamd, metis     sparse elimination of all states at once, one variable a node and epoch, by GTSAM
 
-Elimination in time costs the cube of a component's size at every moment, whatever its graph. Where a component is a
+Elimination in time costs the cube of a component's size at every epoch, whatever its graph. Where a component is a
 long queue rather than a crowd, cutting it across space is cheaper by orders of magnitude; where everybody interacts
 with everybody it is dearer. The sparse orders are eliminated symbolically, which tells the size of every clique (f
 variables with s that remain: f^3/3 + f^2 s + f s^2 multiplications), and the seconds follow from speeds as measured.
@@ -20,8 +20,8 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
+from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.moment import Moment
 from saga_fg.estimators.motion import Motion
 from saga_fg.numerics.arrays import IntArray
 
@@ -29,18 +29,18 @@ log = logging.getLogger(__name__)
 
 Order = Literal["time", "colamd", "metis"]
 
-_SWEEP_SPEED, _SWEEP_CALLS = 3e10, 2e-3  # multiplications a second; seconds a moment
-_SWEEP_WORK = 8  # multiplications a moment over the cube of a component's size, filter and smoother
+_SWEEP_SPEED, _SWEEP_CALLS = 3e10, 2e-3  # multiplications a second; seconds an epoch
+_SWEEP_WORK = 8  # multiplications an epoch over the cube of a component's size, filter and smoother
 _SPARSE_SPEED, _SPARSE_CALLS = 5e9, 1e-4  # multiplications a second; seconds a factor and clique
 _SPARSE_WORK = 3  # over those of the elimination itself: covariances, and once more for the last digits
 _WORTH_A_LOOK = 0.5  # seconds of elimination in time above which the others are looked at
 
 
-def cheapest_order(moments: Sequence[Moment], layouts: Sequence[Layout]) -> Order:
+def cheapest_order(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> Order:
     """The order that would take least time."""
-    estimates: dict[Order, float] = {"time": _seconds_in_time(moments, layouts)}
+    estimates: dict[Order, float] = {"time": _seconds_in_time(epochs, layouts)}
     if estimates["time"] > _WORTH_A_LOOK:
-        factors, dims = _structure(moments, layouts)
+        factors, dims = _structure(epochs, layouts)
         graph = _symbolic(factors)
         sparse: tuple[Order, ...] = ("colamd", "metis")
         for name in sparse:
@@ -51,13 +51,13 @@ def cheapest_order(moments: Sequence[Moment], layouts: Sequence[Layout]) -> Orde
     return min(estimates, key=lambda name: estimates[name])
 
 
-def _seconds_in_time(moments: Sequence[Moment], layouts: Sequence[Layout]) -> float:
-    """Of filter and smoother over components joined through all moments."""
+def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> float:
+    """Of filter and smoother over components joined through all epochs."""
     nodes = np.unique(np.concatenate([layout.nodes for layout in layouts]))
     a, b = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
-    for moment in moments:
-        if isinstance(moment.motion, Motion):
-            for target, source in _heard(moment.motion):
+    for epoch in epochs:
+        if isinstance(epoch.motion, Motion):
+            for target, source in _heard(epoch.motion):
                 a.append(np.searchsorted(nodes, target))
                 b.append(np.searchsorted(nodes, source))
     i, j = np.concatenate(a), np.concatenate(b)
@@ -67,7 +67,7 @@ def _seconds_in_time(moments: Sequence[Moment], layouts: Sequence[Layout]) -> fl
     for layout in layouts:
         sizes = np.bincount(label[np.searchsorted(nodes, layout.nodes)], weights=layout.dims)
         work += _SWEEP_WORK * float((sizes**3).sum())
-    return _SWEEP_CALLS * len(moments) + work / _SWEEP_SPEED
+    return _SWEEP_CALLS * len(epochs) + work / _SWEEP_SPEED
 
 
 def _heard(motion: Motion) -> list[tuple[IntArray, IntArray]]:
@@ -102,16 +102,16 @@ def _symbolic(factors: Sequence[Sequence[int]]) -> gtsam.SymbolicFactorGraph:
     return graph
 
 
-def _structure(moments: Sequence[Moment], layouts: Sequence[Layout]) -> tuple[list[list[int]], IntArray]:
-    """Which states each interaction is about; keys count through the nodes of all moments, whose sizes come with it."""
+def _structure(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> tuple[list[list[int]], IntArray]:
+    """Which states each interaction is about; keys count through the nodes of all epochs, whose sizes come with it."""
     first = np.concatenate([[0], np.cumsum([len(layout) for layout in layouts])]).tolist()
     factors: list[list[int]] = [[key] for key in range(first[1])]  # what was known before
-    for k, moment in enumerate(moments[:-1]):
+    for k, epoch in enumerate(epochs[:-1]):
         here, there = layouts[k], layouts[k + 1]
-        gone = set(moment.gone)
+        gone = set(epoch.gone)
         listens = {node: [first[k] + row] for row, node in enumerate(here.nodes.tolist()) if node not in gone}
-        if isinstance(moment.motion, Motion):
-            for targets, sources in _heard(moment.motion):
+        if isinstance(epoch.motion, Motion):
+            for targets, sources in _heard(epoch.motion):
                 for target, source in zip(targets.tolist(), (first[k] + here.rows(sources)).tolist(), strict=True):
                     listens[target].append(source)
         rows = first[k + 1] + there.rows(list(listens))

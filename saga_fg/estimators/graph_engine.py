@@ -9,6 +9,7 @@ import contextlib
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import gtsam
 import numpy as np
@@ -21,23 +22,21 @@ from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class RelinearisationSettings:
+class RelinearisationSettings(Settings):
     """When factors are linearised anew."""
 
-    threshold: float = setting(
+    threshold: Positive = setting(
         0.001, "linearise factors anew when a variable has moved by this many of its standard deviations"
     )
-    max_iterations: int = setting(25, "linearisations in a frame, before Levenberg-Marquardt solves the whole graph")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "threshold")
-        require_between(self, 1, 1000, "max_iterations")
+    max_iterations: Annotated[int, Range(1, 1000)] = setting(
+        25, "linearisations in a frame, before Levenberg-Marquardt solves the whole graph"
+    )
 
 
 class Engine:

@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.graph_moments import condense, in_moments, lossy
+from saga_fg.estimators.graph_moments import by_covariance, condense, lossy
 from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.motion import Motion
-from saga_fg.estimators.newest import NewestMarginals
-from saga_fg.estimators.protocol import Measurements, require_kind
-from saga_fg.estimators.sighting import Observations, Sighting
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -42,7 +41,7 @@ class GraphState:
     beside: tuple[int, ...]
 
 
-class GraphFilter(NewestMarginals):
+class GraphFilter(LatestMarginals):
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame
@@ -51,7 +50,7 @@ class GraphFilter(NewestMarginals):
                where measurements put it; else it is linearised at the prediction, as by the extended Kalman filter
 
     What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
-    stands still; where noise is so small that factors would lose digits, it is predicted in moments.
+    stands still; where noise is so small that factors would lose digits, it is predicted by covariances.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, relinearised: bool = False) -> None:
@@ -148,12 +147,12 @@ class GraphFilter(NewestMarginals):
 
     def update(self, measurements: Measurements | Observations) -> float:
         require_kind("measurements", measurements, Measurements, Observations)
-        sighting = Sighting(measurements)
-        sighting.check(self._layout)
+        recorded = RecordedMeasurements(measurements)
+        recorded.check(self._layout)
         if len(measurements) == 0:
             return 0.0
         x = self.posterior()
-        likelihood = innovation_likelihood(x, *sighting.linearised(x.layout, x.mean))
+        likelihood = innovation_likelihood(x, *recorded.linearised(x.layout, x.mean))
         self._changed().extend([DetectionFactors(measurements, self._keys)])
         return likelihood
 
@@ -193,12 +192,12 @@ class GraphFilter(NewestMarginals):
     def _in_moments(
         self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
     ) -> Callable[[SceneFactorGraph], None]:
-        """What is to be done to the graph to move the components of the `chosen` nodes (n,) in moments."""
+        """What is to be done to the graph to move the components of the `chosen` nodes (n,) by covariances."""
         every = self._smoother.graph().variables
         beside = {key: key for key, one in every.items() if one.epoch is None or key in self._beside}
         x = self._joint(beside)
         others = np.arange(len(self._layout), len(x.layout))
-        moved = in_moments(x, dynamics.beside(x.layout, others), chosen)
+        moved = by_covariance(x, dynamics.beside(x.layout, others), chosen)
         earlier, now = ({**beside, **nodes} for nodes in (self._keys, keys))
         return lambda graph: condense(graph, moved, earlier, now)
 

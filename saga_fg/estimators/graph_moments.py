@@ -1,9 +1,9 @@
 """The running graph as a joint Gaussian by components, and intervals that are carried out on it, P <- F P F^T + Q.
 
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of variance
-P costs QR digits, Cholesky twice as many. Components with a node that has lost too many are predicted in moments: all
-that is known of them becomes one prior on their newest states. A node that stays as it is, x' = x, needs neither: it
-keeps its variable.
+P costs QR digits, Cholesky twice as many. Components with a node that would lose too many are predicted by covariances:
+their posterior becomes one prior on their newest states. A node that stays as it is, x' = x, needs neither: it keeps
+its variable.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) 
     return np.isin(label, label[(prediction.ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
 
 
-def in_moments(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:
+def by_covariance(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:
     """The prediction of those components of `x` that have one of the first nodes, which are `chosen` (n,)."""
     label = dynamics.joined(x.partition).label
     mine = np.isin(label, label[: len(chosen)][chosen])

@@ -16,9 +16,9 @@ import numpy as np
 from factors import detection_factors, gaussian_factors, prior_factors
 from saga_fg.estimators.factor_graph import motion_factors
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.measurements import Observations
 from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.estimators.sighting import Observations
 from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView

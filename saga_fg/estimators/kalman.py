@@ -22,9 +22,8 @@ from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.kalman_factors import Beside, asked
 from saga_fg.estimators.layout import checked_prior
-from saga_fg.estimators.newest import NewestMarginals
-from saga_fg.estimators.protocol import Measurements, require_kind
-from saga_fg.estimators.sighting import Observations, Sighting
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.providers import FactorProvider, beginnings
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
@@ -47,7 +46,7 @@ class KalmanState:
     beside: Beside | None
 
 
-class JointKalmanFilter(NewestMarginals):
+class JointKalmanFilter(LatestMarginals):
     """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask`, once a frame, for factors on the newest variables: an extended Kalman filter
@@ -108,11 +107,11 @@ class JointKalmanFilter(NewestMarginals):
         self._time += transition.dt
 
     def update(self, measurements: Measurements | Observations) -> float:
-        sighting = Sighting(measurements)
-        sighting.check(self._state.layout)
+        recorded = RecordedMeasurements(measurements)
+        recorded.check(self._state.layout)
         if len(measurements) == 0:
             return 0.0
-        seen = sighting.linearised(self._state.layout, self._state.mean)
+        seen = recorded.linearised(self._state.layout, self._state.mean)
         self._state, _, log_likelihood = correct(self._state, *seen)
         return log_likelihood
 

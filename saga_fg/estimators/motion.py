@@ -85,7 +85,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Standstill:
-    """No time passes: what divides two moments at the same time."""
+    """No time steps: what divides two epochs at the same time."""
 
     dt: float = 0.0
     linear: bool = True

@@ -195,32 +195,32 @@ def zeros(partition: Partition) -> BlockDiagonal:
     return tuple(np.zeros((*places.shape, places.shape[1])) for places in partition.groups)
 
 
-def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, rows: IntArray) -> BlockDiagonal:
-    """The blocks of the same matrix for another partition.
+def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: IntArray) -> BlockDiagonal:
+    """Copy the blocks of a matrix over to another partition.
 
-    rows: for each node of `old` its row in `new`, -1 for one that is gone. Entries between nodes that are in different
-    components of `new` are left out, those between nodes that were in different components of `old` are zero.
+    source: for each node of `new` its row in `old`, -1 for none; a row may serve several nodes. Entries between nodes
+    in different components of either partition are zero.
     """
     result = zeros(new)
-    kept = np.flatnonzero(rows >= 0)
-    if len(kept) == 0:
+    to = np.flatnonzero(source >= 0)
+    if len(to) == 0:
         return result
-    moved = rows[kept]
     # a piece: nodes that share a component, before and after
-    _, piece = np.unique(old.label[kept] * new.count + new.label[moved], return_inverse=True)
+    _, piece = np.unique(old.label[source[to]] * new.count + new.label[to], return_inverse=True)
     order = np.argsort(piece, kind="stable")
-    kept, moved, piece = kept[order], moved[order], piece[order]
-    dims = old.layout.dims[kept]
+    to, piece = to[order], piece[order]
+    origin = source[to]
+    dims = old.layout.dims[origin]
     within = np.arange(dims.sum()) - np.repeat(np.cumsum(dims) - dims, dims)
-    before = np.repeat(old.offset[kept], dims) + within
-    after = np.repeat(new.offset[moved], dims) + within
+    before = np.repeat(old.offset[origin], dims) + within
+    after = np.repeat(new.offset[to], dims) + within
     size = np.bincount(piece, weights=dims).astype(np.int64)
     start = np.cumsum(size) - size
-    node = kept[np.searchsorted(piece, np.arange(len(size)))]  # one of each piece
-    kind = (old.group[node] * len(new.groups) + new.group[rows[node]]) * (old.layout.size + 1) + size
+    first = np.searchsorted(piece, np.arange(len(size)))  # a node of each piece
+    kind = (old.group[origin[first]] * len(new.groups) + new.group[to[first]]) * (new.layout.size + 1) + size
     for number in np.unique(kind).tolist():
         alike = np.flatnonzero(kind == number)
-        i, j = node[alike], rows[node[alike]]
+        i, j = origin[first[alike]], to[first[alike]]
         places = start[alike][:, None] + np.arange(size[alike[0]])
         a, b = before[places], after[places]
         result[new.group[j[0]]][new.row[j][:, None, None], b[:, :, None], b[:, None, :]] = blocks[old.group[i[0]]][

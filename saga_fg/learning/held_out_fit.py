@@ -6,7 +6,7 @@ because the pose of the vehicle errs move alike; errors of labels that were set 
 the recordings are dealt into two parts, and what one taught is tried by the joint filter (`joint_gaps`) on the other:
 
     everywhere           edges act as fitted, with the process noise that was fitted with them
-    hidden               edges count by what they have to tell (`News`): nothing to those in view, soon all to the rest
+    hidden               edges are weighted by their information gain (`EdgeInformation`), low into objects in view
     hidden, own noise    the same with the process noise of the classical filter
     nowhere              the classical filter
 
@@ -27,25 +27,25 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.learning.filter_noise import FilterNoise
 from saga_fg.learning.gap_prediction import errors_alone
 from saga_fg.learning.gaps import GapSample, GapSettings, sample_gaps
 from saga_fg.learning.interaction_fit import MOST_GAPS, FittedInteractions, fit_interactions
 from saga_fg.learning.joint_gaps import JointGaps
-from saga_fg.learning.own_motion_fit import OwnMotion
 from saga_fg.learning.trajectories import Trajectories
-from saga_fg.model.edge_information import News
+from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 
 TRIED_GAPS = 40  # of a recording
-HIDDEN = News(spread=0.5, unseen_acceleration=2.0)
+HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
 
 
 class Form(NamedTuple):
     """How fitted interactions act: what makes edges count, if anything, and whether the fitted noise is taken."""
 
-    news: News | None
+    news: EdgeInformation | None
     fitted_noise: bool
 
 
@@ -61,7 +61,7 @@ Trial = tuple[StrArray, dict[str, FloatArray]]
 def fit_by_held_out(
     recordings: Sequence[Trajectories],
     classes: tuple[str, ...],
-    own: OwnMotion,
+    own: FilterNoise,
     fit: Fit = fit_interactions,
     settings: GapSettings | None = None,
     forms: Mapping[str, Form] = FORMS,
@@ -114,7 +114,7 @@ def coupled_classes(rules: Rules) -> list[set[str]]:
 
 
 def _gaps(
-    recordings: Sequence[Trajectories], classes: tuple[str, ...], own: OwnMotion, settings: GapSettings
+    recordings: Sequence[Trajectories], classes: tuple[str, ...], own: FilterNoise, settings: GapSettings
 ) -> GapSample:
     return GapSample.concatenate(
         [sample_gaps(each, own.filtered(each), classes, settings, k) for k, each in enumerate(recordings)]
@@ -125,7 +125,7 @@ def _trial(
     of: Trajectories,
     taught: FittedInteractions,
     classes: tuple[str, ...],
-    own: OwnMotion,
+    own: FilterNoise,
     settings: GapSettings,
     forms: Mapping[str, Form],
 ) -> Trial:

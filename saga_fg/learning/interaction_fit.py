@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from scipy.optimize import minimize
@@ -18,7 +19,6 @@ from scipy.optimize import minimize
 from saga_fg.errors import InputError
 from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
 from saga_fg.learning.gaps import GapSample
-from saga_fg.learning.rule_parameters import Rule, RuleParameters
 from saga_fg.model.edge_features import EdgeFeatures
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
@@ -27,6 +27,16 @@ from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.types.by_class import DEFAULT
 
+Rule = Following | Neighbours
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "rate": (1e-3, 5.0),
+    "distance_scale": (0.5, 100.0),
+    "gap_scale": (3.0, 100.0),
+    "lateral_scale": (0.3, 5.0),
+    "heading_scale": (0.05, 3.0),
+    "speed_scale": (0.1, 10.0),
+}
+"""Of the rates and widths of rules; an infinite width stays infinite."""
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s
 PRIOR = 2e-2  # weight of a unit of squared difference from the template, against the mean over the gaps
@@ -68,6 +78,33 @@ TEMPLATE: tuple[Rule, ...] = (
 )
 """Following a leader, moving or perhaps parked; turning after a moving one; parked objects, which share errors of the
 pose; groups of people."""
+
+
+@dataclass(frozen=True, eq=False)
+class RuleParameters:
+    """n parameters of some rules: `names` tell rule and setting of each, `start` (n,) logarithms, `bounds` of these."""
+
+    rules: tuple[Rule, ...]
+    names: tuple[tuple[int, str], ...]
+    start: FloatArray
+    bounds: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, rules: Sequence[Rule]) -> Self:
+        """All rates and widths that are finite, clipped to their bounds."""
+        names = tuple(
+            (k, name) for k, rule in enumerate(rules) for name in BOUNDS if math.isfinite(getattr(rule, name, math.inf))
+        )
+        bounds = tuple((math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for _, name in names)
+        values = [math.log(max(getattr(rules[k], name), 1e-9)) for k, name in names]
+        return cls(tuple(rules), names, np.clip(values, *np.array(bounds).reshape(-1, 2).T), bounds)
+
+    def valued(self, x: FloatArray) -> list[Rule]:
+        """The rules with parameters x (n,)."""
+        values: list[dict[str, Any]] = [{} for _ in self.rules]
+        for (k, name), value in zip(self.names, np.exp(x), strict=True):
+            values[k][name] = float(value)
+        return [replace(rule, **changes) for rule, changes in zip(self.rules, values, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ WRONG_REACH = 4.0  # m
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class MeasuredTrajectory:
     """Measured positions of one object: time (T,) s, not decreasing; position (T, 2) m; R (T, 2, 2) m^2."""
 
     time: FloatArray
@@ -45,11 +45,11 @@ class Sightings:
 
 
 def fit_acceleration_noise(
-    objects: Sequence[Sightings], birth_speed: float = 10.0, bounds: tuple[float, float] = (1e-4, 1e2)
+    objects: Sequence[MeasuredTrajectory], birth_speed: float = 10.0, bounds: tuple[float, float] = (1e-4, 1e2)
 ) -> float:
     """The most likely `ConstantVelocity.acceleration_noise`, m^2/s^3, of some objects.
 
-    birth_speed: standard deviation of a velocity component before the second sighting, m/s. Raises `InputError` when
+    birth_speed: standard deviation of a velocity component before the second measurement, m/s. Raises `InputError` when
     no object was seen at least three times.
     """
     useful = [o for o in objects if len(o) >= 3]
@@ -62,7 +62,7 @@ def fit_acceleration_noise(
     return float(np.exp(found.x))
 
 
-def fit_acceleration_noise_by_class(objects: Mapping[str, Sequence[Sightings]]) -> dict[str, float]:
+def fit_acceleration_noise_by_class(objects: Mapping[str, Sequence[MeasuredTrajectory]]) -> dict[str, float]:
     """The acceleration noise, m^2/s^3, of each class with at least ten objects, and of all together as `default`.
 
     Raises `InputError` when no object was seen at least three times.
@@ -74,8 +74,10 @@ def fit_acceleration_noise_by_class(objects: Mapping[str, Sequence[Sightings]]) 
     return noise
 
 
-def log_likelihood(objects: Sequence[Sightings], acceleration_noise: float, birth_speed: float = 10.0) -> float:
-    """Log-likelihood of all sightings but each object's first, under independent constant-velocity motion."""
+def log_likelihood(
+    objects: Sequence[MeasuredTrajectory], acceleration_noise: float, birth_speed: float = 10.0
+) -> float:
+    """Log-likelihood of all measurements but each object's first, under independent constant-velocity motion."""
     order = sorted(objects, key=len, reverse=True)
     columns = [np.concatenate([getattr(o, name) for o in order]) for name in ("time", "position", "R")]
     return innovation_likelihood(
@@ -92,10 +94,10 @@ def innovation_likelihood(
     birth_speed: float,
     wrong: float = 0.0,
 ) -> float:
-    """Log-likelihood of all sightings but each object's first, of objects of these lengths (n,), the longest first.
+    """Log-likelihood of all measurements but each object's first, of objects of these lengths (n,), the longest first.
 
-    time (N,), position (N, 2) and R (N, 2, 2) hold one object after another. wrong: share of sightings that are of
-    something else, anywhere within `WRONG_REACH`; a sighting that is more likely one of those is not taken in.
+    time (N,), position (N, 2) and R (N, 2, 2) hold one object after another. wrong: share of measurements that are of
+    something else, anywhere within `WRONG_REACH`; a measurement that is more likely one of those does not update.
     """
     start = np.concatenate([[0], np.cumsum(lengths)[:-1]])
     diffusion = ConstantVelocity(acceleration_noise).diffusion[2:, 2:]

@@ -1,18 +1,19 @@
-"""Which true object each detection of a recording is of: one to one, least distances, within a gate.
+"""Match the detections of a recording to the true objects: one to one, by least distances, within a gate.
 
-True places between two annotated moments are interpolated. An object was there to be seen where the annotations call it
+True positions between two annotated times are interpolated. An object was in view where the annotations call it
 visible.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.learning.detection_sample import DetectionSample
+from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
+from saga_fg.learning.process_noise import MeasuredTrajectory
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.geometry import wrap_angle
@@ -21,7 +22,7 @@ from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
 from saga_fg.types.sensor import Sensor, sensor_model
 
-GATE = 4.0  # m; poor sensors err by metres, and wrong matches are taken account of
+GATE = 4.0  # m; poor sensors err by metres, and the fits allow for wrong matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +71,36 @@ def match_to_truth(
 def sample_with_truth(
     scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE, groups: Sequence[Sequence[str]] = ()
 ) -> dict[str, DetectionSample]:
-    """What a recording with annotations shows of each of its sensors. Raises `InputError` without annotations."""
+    """A sample of each sensor of an annotated scene. Raises `InputError` for a scene without ground truth."""
     parts: dict[str, list[DetectionSample]] = {}
     for matched in match_to_truth(scene, sensors, gate, groups):
         sensor = sensor_model(sensors, matched.frame.sensor)
         parts.setdefault(matched.frame.sensor, []).append(_sample(matched, sensor))
     return {name: DetectionSample.pool(part) for name, part in parts.items()}
+
+
+def measured_trajectories(
+    scenes: Iterable[Scene], sensors: Mapping[str, Sensor], gate: float = 2.0, step: float = 0.05
+) -> dict[str, list[MeasuredTrajectory]]:
+    """Class -> the measured positions of each of its objects, by the nearest detection of the class within `gate` m.
+
+    Of detections of one object closer in time than `step` s only the first is taken. Their covariances are those of the
+    sensors' models. Raises `InputError` for a scene without ground truth.
+    """
+    found: dict[str, list[MeasuredTrajectory]] = {}
+    for scene in scenes:
+        objects: dict[tuple[str, str], list[tuple[float, FloatArray, FloatArray]]] = {}
+        for matched in match_to_truth(scene, sensors, gate):
+            truth, sensor = matched.annotations, sensor_model(sensors, matched.frame.sensor)
+            time = matched.frame.timestamp + sensor.time_offset
+            R = sensor.detection_covariance(matched.detections, matched.origin)
+            for j, i in zip(matched.detection.tolist(), matched.truth.tolist(), strict=True):
+                rows = objects.setdefault((str(truth.boxes.label[i]), str(truth.id[i])), [])
+                if not rows or time - rows[-1][0] >= step:
+                    rows.append((time, matched.detections.boxes.position[j, :2], R[j]))
+        for (label, _), rows in objects.items():
+            found.setdefault(label, []).append(MeasuredTrajectory(*map(np.array, zip(*rows, strict=True))))
+    return found
 
 
 def _sample(matched: MatchedFrame, sensor: Sensor) -> DetectionSample:
@@ -86,32 +111,24 @@ def _sample(matched: MatchedFrame, sensor: Sensor) -> DetectionSample:
     sight = boxes.position[d, :2] - (np.nan if matched.origin is None else matched.origin)
     u = sight / np.maximum(distance[d], 1e-9)[:, None]
     error = boxes.position[d] - truth.position[t]
-    along, across, velocity, yaw, height = (np.full(shape, np.nan) for shape in (n, n, (n, 2), n, n))
-    along[d] = (error[:, :2] * u).sum(axis=1)
-    across[d] = error[:, 1] * u[:, 0] - error[:, 0] * u[:, 1]
-    velocity[d] = boxes.velocity[d] - truth.velocity[t]
-    yaw[d] = wrap_angle(2 * (boxes.yaw[d] - truth.yaw[t])) / 2
-    height[d] = error[:, 2]
     true, detected = np.zeros(n, dtype=bool), np.zeros(len(truth), dtype=bool)
     true[d], detected[t] = True, True
-    there = matched.annotations.visible
-    object_range, object_azimuth = sensor.polar(truth.position[:, :2], pose)
-    return DetectionSample(
-        boxes.label,
-        sensor.logit(matched.detections.score),
-        distance,
-        azimuth,
-        true,
-        along,
-        across,
-        velocity,
-        yaw,
-        height,
-        truth.label[there],
-        object_range[there],
-        object_azimuth[there],
-        detected[there],
+    detections = SampledDetections.without_errors(
+        boxes.label, sensor.logit(matched.detections.score), distance, azimuth, true
     )
+    errors = {
+        "along": (error[:, :2] * u).sum(axis=1),
+        "across": error[:, 1] * u[:, 0] - error[:, 0] * u[:, 1],
+        "velocity": boxes.velocity[d] - truth.velocity[t],
+        "yaw": wrap_angle(2 * (boxes.yaw[d] - truth.yaw[t])) / 2,
+        "height": error[:, 2],
+    }
+    for name, values in errors.items():
+        column = np.full((n, *values.shape[1:]), np.nan)
+        column[d] = values
+        errors[name] = column
+    objects = SampledObjects(truth.label, *sensor.polar(truth.position[:, :2], pose), detected)
+    return DetectionSample(replace(detections, **errors), objects.select(matched.annotations.visible))
 
 
 def _truth_at(scene: Scene, k: int, time: float) -> Annotations:

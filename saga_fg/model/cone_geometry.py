@@ -1,8 +1,8 @@
-r"""The edge that cones and barriers form before a vehicle.
+r"""The line that cones and barriers form ahead of a vehicle.
 
-In the frame of the vehicle (a ahead, y to the left), the cones near its path, in order of a, are an edge y(a). They
-stand on the side of the nearest of them, so that the vehicle has to pass on the other: with m = +1 if that is the left,
-else -1, and the distance c that drivers keep between cones and the middle of their vehicle,
+In the frame of the vehicle (a ahead, y to the left), the cones near its path, in order of a, are a line y(a). Its side
+is that of the nearest cone, and the vehicle has to pass on the other one: with m = +1 if that is the left, else -1, and
+the distance c that drivers keep between cones and the middle of their vehicle,
 
     demand(a) = m y(a) + c         how far to the side the vehicle has to be by a; above 0: it is pushed
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from saga_fg.model.interactions import NodeTable, unit
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 CONES = ("traffic_cone", "barrier")
 MIN_SPEED = 1.0  # m/s; who is slower is not pushed, since he goes nowhere
@@ -24,21 +24,20 @@ BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still be
 
 
 @dataclass(frozen=True)
-class ConeGeometry:
+class ConeGeometry(Settings):
     """Which cones concern a vehicle, and how it passes them."""
 
-    clearance: float = setting(1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m")
-    preview: float = setting(1.5, "time by which drivers look ahead along the edge, s")
-    reach: float = setting(45.0, "cones further ahead are not seen as an edge yet, m")
-    corridor: float = setting(6.0, "cones further aside than this do not concern a vehicle, m")
-    classes: tuple[str, ...] = setting(CONES, "classes that form an edge")
+    clearance: Positive = setting(
+        1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m"
+    )
+    preview: Positive = setting(1.5, "time by which drivers look ahead along the line, s")
+    reach: Positive = setting(45.0, "cones further ahead do not belong to the line yet, m")
+    corridor: Positive = setting(6.0, "cones further aside than this do not concern a vehicle, m")
+    classes: tuple[str, ...] = setting(CONES, "classes that form a line")
 
-    def __post_init__(self) -> None:
-        require_positive(self, "clearance", "preview", "reach", "corridor")
 
-
-class Edge(NamedTuple):
-    """The cones before n vehicles, nearest first: rows (n, m) of nodes; ahead, demand (n, m), m; known (n, m) whether
+class ConesAhead(NamedTuple):
+    """The cones ahead of n vehicles, nearest first: rows (n, m) of nodes; ahead, demand (n, m), m; known (n, m) whether
     there is one; side (n,) m; speed (n,) along the heading, m/s."""
 
     row: IntArray
@@ -49,8 +48,8 @@ class Edge(NamedTuple):
     speed: FloatArray
 
 
-def edge_before(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) -> Edge:
-    """The edge that cones form before `vehicles` (n,), rows of `nodes`."""
+def cones_ahead(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) -> ConesAhead:
+    """The cones ahead of `vehicles` (n,), rows of `nodes`."""
     cones = np.flatnonzero(of_classes(nodes.label, geometry.classes))
     u = unit(nodes.heading[vehicles])
     offset = nodes.position[cones] - nodes.position[vehicles, None]
@@ -63,7 +62,7 @@ def edge_before(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) ->
     side = np.where(first < 0, 1.0, -1.0)
     demand = side[:, None] * left + geometry.clearance
     speed = np.einsum("ni,ni->n", nodes.velocity[vehicles], u)
-    return Edge(cones[order], ahead, demand, known, side, speed)
+    return ConesAhead(cones[order], ahead, demand, known, side, speed)
 
 
 def anticipated(nodes: NodeTable, classes: tuple[str, ...], geometry: ConeGeometry) -> FloatArray:
@@ -72,9 +71,9 @@ def anticipated(nodes: NodeTable, classes: tuple[str, ...], geometry: ConeGeomet
     vehicles = np.flatnonzero(of_classes(nodes.label, classes))
     if len(vehicles) == 0 or not of_classes(nodes.label, geometry.classes).any():
         return position
-    edge = edge_before(nodes, vehicles, geometry)
-    pushed = np.where(edge.known & (edge.ahead > 0), edge.demand, 0.0).max(axis=1, initial=0.0)
-    pushed = np.where(edge.speed > MIN_SPEED, pushed, 0.0)
+    line = cones_ahead(nodes, vehicles, geometry)
+    pushed = np.where(line.known & (line.ahead > 0), line.demand, 0.0).max(axis=1, initial=0.0)
+    pushed = np.where(line.speed > MIN_SPEED, pushed, 0.0)
     u = unit(nodes.heading[vehicles])
-    position[vehicles] += (edge.side * pushed)[:, None] * np.stack([-u[:, 1], u[:, 0]], axis=-1)
+    position[vehicles] += (line.side * pushed)[:, None] * np.stack([-u[:, 1], u[:, 0]], axis=-1)
     return position

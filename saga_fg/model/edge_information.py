@@ -1,16 +1,16 @@
-r"""What an edge has to tell: how much there is to learn of its target's velocity from its source's.
+r"""Information gain of an edge: how much the velocity of its source says about that of its target.
 
-    share_ij = s_i^2 / ( s_i^2 + s_j^2 + spread^2 ),     s^2 = variance of the velocity + ( unseen_acceleration t )^2
+    gain_ij = s_i^2 / ( s_i^2 + s_j^2 + spread^2 ),     s^2 = variance of the velocity + ( unseen_acceleration t )^2
 
-That is the gain of a Kalman filter that took the velocity of j, off by the spread, for a measurement of that of i. Of
-what is in view, detections tell more than neighbours do, who pull a bus that brakes for its stop; what is hidden soon
-has nobody else to go by. t is how long nobody has seen an object: the variance a filter states rests on the noise of
-what detections correct, and who is out of sight may have braked since. So it tells nothing to those who are in view.
+This is the gain of a Kalman filter that takes the velocity of j, off by the spread, for a measurement of that of i. A
+detected object learns more from its detections than from neighbours, who pull on a bus that brakes for its stop; a
+hidden one soon has nothing else to go by. t is the time since an object was last detected: the variance that a filter
+states rests on the noise of corrected states, and an object out of sight may have braked since. The gain of edges into
+detected objects is therefore low.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,33 +18,32 @@ import numpy as np
 
 from saga_fg.model.interactions import NodeTable
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, setting, settings_group
+from saga_fg.settings import NonNegative, Settings, setting, settings_group
 
 
-def news_setting() -> Any:
-    """The field `news` of an edge rule."""
+def information_setting() -> Any:
+    """The field of an edge rule that holds its `EdgeInformation`."""
     return settings_group(lambda: None, "edges count by what they have to tell; null: whatever is known of their ends")
 
 
-def counted(news: News | None, rate: FloatArray, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
-    """Rates (E,) of edges source[k] -> target[k] (rows of `nodes`) as far as they have something to tell."""
-    return rate if news is None else rate * news.shares(nodes, target, source)
+def weighted_by_gain(
+    rate: FloatArray, information: EdgeInformation | None, nodes: NodeTable, target: IntArray, source: IntArray
+) -> FloatArray:
+    """Rates (E,) of edges source[k] -> target[k] (rows of `nodes`) times their information gain; None: as they are."""
+    return rate if information is None else rate * information.gains(nodes, target, source)
 
 
 @dataclass(frozen=True)
-class News:
-    """Edges count by what they have to tell."""
+class EdgeInformation(Settings):
+    """Weight edges by their information gain."""
 
-    spread: float = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
-    unseen_acceleration: float = setting(
+    spread: NonNegative = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
+    unseen_acceleration: NonNegative = setting(
         0.0, "how much less sure a velocity is for every second in which nobody has seen its object, m/s^2"
     )
 
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "spread", "unseen_acceleration")
-
-    def shares(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
-        """(E,) in [0, 1], of the edges source[k] -> target[k] (rows of `nodes`)."""
+    def gains(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+        """Information gains (E,), in [0, 1], of the edges source[k] -> target[k] (rows of `nodes`)."""
         variance = nodes.velocity_variance
         if nodes.unseen is not None:
             variance = variance + (self.unseen_acceleration * nodes.unseen) ** 2

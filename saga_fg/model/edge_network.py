@@ -12,19 +12,25 @@ written once for NumPy, with which it runs, and JAX, with which it is trained.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.model.edge_features import EdgeFeatures, features_of
-from saga_fg.model.edge_information import News, counted, news_setting
+from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.edge_rules import VEHICLES, Pairs, close_pairs, strongest
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.numerics.arrays import of_classes
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import (
+    NonNegativeInt,
+    Positive,
+    Range,
+    Settings,
+    setting,
+    settings_group,
+)
 
 FEATURES = 12
 MAX_RATE = 5.0  # 1/s, of an edge: the highest that a network may be given
@@ -33,7 +39,7 @@ Matrix = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
-class EdgeNetwork:
+class EdgeNetwork(Settings):
     """The network as an edge rule, for the edges of one interaction; hidden size h.
 
     Raises `InputError` for weights whose sizes don't fit or that are not finite.
@@ -47,17 +53,15 @@ class EdgeNetwork:
     node_weights: Matrix = setting((), "W_node, h rows of h entries")
     output_weights: tuple[float, ...] = setting((), "w_out, 2 h entries")
     output_bias: float = setting(-3.0, "b_out")
-    max_rate: float = setting(3.0, "highest rate of an edge, 1/s")
-    max_distance: float = setting(40.0, "no edge beyond this distance, m")
-    max_degree: int = setting(4, "edges kept per influenced node, strongest first")
+    max_rate: Annotated[float, Range(0, MAX_RATE, above=True)] = setting(3.0, "highest rate of an edge, 1/s")
+    max_distance: Positive = setting(40.0, "no edge beyond this distance, m")
+    max_degree: NonNegativeInt = setting(4, "edges kept per influenced node, strongest first")
     ahead_only: bool = setting(False, "whether only nodes ahead lead, along the heading of the one that is led")
-    news: News | None = news_setting()
+    news: EdgeInformation | None = information_setting()
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
 
     def __post_init__(self) -> None:
-        require_positive(self, "max_rate", "max_distance")
-        require_between(self, 0, MAX_RATE, "max_rate")
-        require_between(self, 0, math.inf, "max_degree")
+        super().__post_init__()
         h = len(self.edge_bias)
         for name, given, shape in (
             ("edge_weights", self.edge_weights, (h, FEATURES)),
@@ -87,7 +91,7 @@ class EdgeNetwork:
         rate = edge_rates(weights, message, heard[target], self.max_rate)
         if self.ahead_only:
             rate = np.where(features.ahead > 0, rate, 0.0)
-        rate = counted(self.news, rate, nodes, target, source)
+        rate = weighted_by_gain(rate, self.news, nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
     def candidate_rates(self, weights: dict[str, Any], features: EdgeFeatures, able: Any, xp: Any = np) -> Any:

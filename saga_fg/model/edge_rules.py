@@ -7,10 +7,9 @@ A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,14 +17,21 @@ from scipy.spatial import cKDTree
 from saga_fg.errors import InputError
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
-from saga_fg.model.edge_information import News, counted, news_setting
+from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.node import distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
-from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+from saga_fg.settings import (
+    NonNegative,
+    NonNegativeInt,
+    PositiveOrInf,
+    Settings,
+    setting,
+    settings_group,
+)
 
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 Leaders = Literal["any", "moving", "standing"]
@@ -50,30 +56,26 @@ class EdgeRule(Protocol):
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class Neighbours(Settings):
     """Moving objects that are close and head the same way share something, by default their velocity."""
 
     interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
         SharedVelocity, "interaction function of the edges"
     )
-    rate: float = setting(0.3, "strength of an edge at distance and heading difference zero, 1/s")
-    distance_scale: float = setting(8.0, "sigma of the distance kernel, m")
-    heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
-    speed_scale: float = setting(3.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
-    max_distance: float = setting(20.0, "no edge beyond this distance, m")
-    min_speed: float = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
-    max_degree: int = setting(4, "edges kept per influenced node, strongest first")
-    news: News | None = news_setting()
+    rate: NonNegative = setting(0.3, "strength of an edge at distance and heading difference zero, 1/s")
+    distance_scale: PositiveOrInf = setting(8.0, "sigma of the distance kernel, m")
+    heading_scale: PositiveOrInf = setting(0.4, "sigma of the heading kernel, rad")
+    speed_scale: PositiveOrInf = setting(3.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
+    max_distance: NonNegative = setting(20.0, "no edge beyond this distance, m")
+    min_speed: NonNegative = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
+    max_degree: NonNegativeInt = setting(4, "edges kept per influenced node, strongest first")
+    news: EdgeInformation | None = information_setting()
     parked: bool = setting(
         False,
         "couples objects never seen moving whose velocity is known to within speed_scale, and no others; the "
         "speed of either is held against speed_scale as well",
     )
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate", "max_distance", "min_speed", "max_degree")
-        require_positive(self, "distance_scale", "heading_scale", "speed_scale", infinite=True)
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, whatever their ends are and is known of them."""
@@ -94,25 +96,25 @@ class Neighbours:
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
-        rate = counted(self.news, self.strength(features_of(nodes, target, source)), nodes, target, source)
+        rate = weighted_by_gain(self.strength(features_of(nodes, target, source)), self.news, nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
 
 @dataclass(frozen=True)
-class Following:
+class Following(Settings):
     """A vehicle is led by the nearest vehicle ahead in its lane, as far as headings tell the lane."""
 
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
-    rate: float = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
-    max_gap: float = setting(40.0, "no leader further ahead than this, centre to centre, m")
-    gap_scale: float = setting(25.0, "sigma of the kernel on the distance ahead, m")
-    lateral_scale: float = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
-    heading_scale: float = setting(0.4, "sigma of the heading kernel, rad")
-    news: News | None = news_setting()
+    rate: NonNegative = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
+    max_gap: NonNegative = setting(40.0, "no leader further ahead than this, centre to centre, m")
+    gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m")
+    lateral_scale: PositiveOrInf = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
+    heading_scale: PositiveOrInf = setting(0.4, "sigma of the heading kernel, rad")
+    news: EdgeInformation | None = information_setting()
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
-    apart: float = setting(
+    apart: NonNegative = setting(
         0.0,
         "leaders are ahead by at least this share of half of both lengths: nearer is itself, tracked twice",
     )
@@ -124,11 +126,6 @@ class Following:
     towed: tuple[str, ...] = setting(
         (), "those among them that lead and are not led: a trailer goes where its truck does"
     )
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate", "max_gap", "apart")
-        require_positive(self, "gap_scale", "lateral_scale", "heading_scale", infinite=True)
-        require_one_of(self, "leaders", get_args(Leaders))
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, whatever the classes of their ends and whoever is nearer."""
@@ -154,24 +151,21 @@ class Following:
         features = features_of(seen, target, source)
         near = self.apart * (nodes.length[target] + nodes.length[source]) / 2
         led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
-        rate = counted(self.news, np.where(led, self.strength(features), 0.0), nodes, target, source)
+        rate = weighted_by_gain(np.where(led, self.strength(features), 0.0), self.news, nodes, target, source)
         nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
 
 
 @dataclass(frozen=True)
-class Repulsion:
+class Repulsion(Settings):
     """Pedestrians keep away from each other; with `sources: [wall]`, from the walls of the road map."""
 
     interaction: SocialForce = settings_group(SocialForce, "how strongly")
-    rate: float = setting(1.0, "1/s; 1: with all of the force")
-    max_distance: float = setting(4.0, "nobody further away counts, m")
-    max_degree: int = setting(4, "sources kept per object, the nearest first")
+    rate: NonNegative = setting(1.0, "1/s; 1: with all of the force")
+    max_distance: NonNegative = setting(4.0, "nobody further away counts, m")
+    max_degree: NonNegativeInt = setting(4, "sources kept per object, the nearest first")
     classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
     sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate", "max_distance", "max_degree")
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         pushed, pushing = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.classes, self.sources))

@@ -25,7 +25,7 @@ import numpy as np
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import NonNegative, Positive, PositiveOrInf, Settings, setting
 
 LEAST_GAP = 0.5  # m; nearer, the estimate of a gap is all noise
 
@@ -44,27 +44,21 @@ class Linearised(NamedTuple):
 
 
 @dataclass(frozen=True)
-class IntelligentDriver:
+class IntelligentDriver(Settings):
     """A vehicle follows its leader as a driver does; the source is the leader.
 
     The defaults are those of city traffic in Treiber and Kesting, Traffic Flow Dynamics (2013), table 11.2.
     """
 
-    free_speed: float = setting(15.0, "v_free: speed of a driver whom nobody hinders, m/s")
-    headway: float = setting(1.0, "T: time headway that drivers want to keep, s")
-    standstill_gap: float = setting(2.0, "s0: gap that drivers keep when they stand, bumper to bumper, m")
-    acceleration: float = setting(1.0, "a: highest acceleration, m/s^2")
-    deceleration: float = setting(1.5, "b: comfortable deceleration, m/s^2")
-    hardest: float = setting(6.0, "no driver brakes harder, m/s^2")
-    halt_time: float = setting(0.4, "t_halt: time constant with which the last of the speed goes, s")
-    room: float = setting(7.0, "a gap of this length may hold a vehicle that nobody sees, m; .inf: never")
-    time_constant: float = setting(1.0, "tau: an edge of rate 1 / tau accelerates as the driver does, s")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "free_speed", "headway", "acceleration", "deceleration", "hardest", "halt_time")
-        require_positive(self, "time_constant")
-        require_positive(self, "room", infinite=True)
-        require_between(self, 0, math.inf, "standstill_gap")
+    free_speed: Positive = setting(15.0, "v_free: speed of a driver whom nobody hinders, m/s")
+    headway: Positive = setting(1.0, "T: time headway that drivers want to keep, s")
+    standstill_gap: NonNegative = setting(2.0, "s0: gap that drivers keep when they stand, bumper to bumper, m")
+    acceleration: Positive = setting(1.0, "a: highest acceleration, m/s^2")
+    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2")
+    hardest: Positive = setting(6.0, "no driver brakes harder, m/s^2")
+    halt_time: Positive = setting(0.4, "t_halt: time constant with which the last of the speed goes, s")
+    room: PositiveOrInf = setting(7.0, "a gap of this length may hold a vehicle that nobody sees, m; .inf: never")
+    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau accelerates as the driver does, s")
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """f (E,) where nobody hides in the gap; v, w >= 0 m/s, s m."""

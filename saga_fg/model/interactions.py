@@ -14,7 +14,6 @@ Car-following is Helly's linear law (Helly 1959); with the gap taken from the pr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
@@ -23,7 +22,12 @@ import numpy as np
 
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.settings import require_between, require_one_of, require_positive, setting
+from saga_fg.settings import (
+    NonNegative,
+    PositiveOrInf,
+    Settings,
+    setting,
+)
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
@@ -104,22 +108,17 @@ class SharedVelocity:
 
 
 @dataclass(frozen=True)
-class CarFollowing:
+class CarFollowing(Settings):
     """Helly's linear car-following law along the follower's heading; the source is the leader."""
 
-    time_constant: float = setting(
+    time_constant: PositiveOrInf = setting(
         4.0, "tau: time over which a wrong gap is made good, s; .inf: only speeds are shared"
     )
-    headway: float = setting(0.0, "part of the desired gap that grows with the follower's speed, s")
+    headway: NonNegative = setting(0.0, "part of the desired gap that grows with the follower's speed, s")
     gap: Literal["present", "standstill"] = setting(
         "present", "desired gap: the one of the present estimate (formation), or standstill_gap + headway * speed"
     )
-    standstill_gap: float = setting(2.0, "bumper to bumper, m; used with gap: standstill")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "time_constant", infinite=True)
-        require_between(self, 0, math.inf, "headway", "standstill_gap")
-        require_one_of(self, "gap", ("present", "standstill"))
+    standstill_gap: NonNegative = setting(2.0, "bumper to bumper, m; used with gap: standstill")
 
     def applies(self, target: NodeType, source: NodeType) -> bool:
         return all(t.has(POSITION + VELOCITY) for t in (target, source))

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
-
-import numpy as np
+from typing import Annotated, Literal
 
 from saga_fg.errors import InputError
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.stability import require_stable
-from saga_fg.settings import require_between, require_one_of, setting, settings_group
+from saga_fg.settings import Positive, Range, Settings, setting, settings_group
 
 FORMAT = "saga-fg interactions"
 VERSION = 1
@@ -23,7 +21,7 @@ HIGHEST_RATE = 20.0  # 1/s, of an edge: beyond, an interaction is a rigid bond
 
 
 @dataclass(frozen=True)
-class LearnedInteractions:
+class LearnedInteractions(Settings):
     """Edge rules with the noise that is left beside them.
 
     Raises `InputError` for another format or version, and for rules that would make the dynamics, or a step, unstable.
@@ -33,21 +31,17 @@ class LearnedInteractions:
     version: int = setting(VERSION, "of the format")
     learned_from: str = setting("", "what it was learned from")
     edges: tuple[Following | Neighbours | EdgeNetwork, ...] = settings_group(tuple, "edge rules of the scene graph")
-    explained_noise: float = setting(
+    explained_noise: Annotated[float, Range(0, 10)] = setting(
         0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
     )
-    acceleration_noise: Mapping[str, float] = settings_group(
+    acceleration_noise: Mapping[str, Positive] = settings_group(
         dict, "spectral density of the acceleration by class, m^2/s^3; default serves all others"
     )
 
     def __post_init__(self) -> None:
-        require_one_of(self, "format", (FORMAT,))
+        super().__post_init__()
         if self.version != VERSION:
             raise InputError(f"version: expected {VERSION}, the one this program writes, got {self.version}")
-        require_between(self, 0, 10, "explained_noise")
-        for label, q in self.acceleration_noise.items():
-            if not (np.isfinite(q) and q > 0):
-                raise InputError(f"acceleration_noise.{label}: expected a finite number > 0, got {q!r}")
         for k, rule in enumerate(self.edges):
             rate = rule.max_rate if isinstance(rule, EdgeNetwork) else rule.rate
             if rate > HIGHEST_RATE:

@@ -32,7 +32,6 @@ estimators agree.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any, NamedTuple
@@ -47,22 +46,18 @@ from saga_fg.model.node import ConstantAcceleration, ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import MatchedMotion, SceneGraph
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
 _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurement takes away
 
 
 @dataclass(frozen=True)
-class Stationary:
+class Stationary(Settings):
     """What stands: its position drifts, its velocity is forgotten."""
 
-    drift: float = setting(0.2, "how far the place drifts, standard deviation after one second, m")
-    speed: float = setting(0.1, "standard deviation of a component of the velocity, m/s")
-    halt_time: float = setting(0.1, "time constant with which a velocity is forgotten, s")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "drift")
-        require_positive(self, "speed", "halt_time")
+    drift: NonNegative = setting(0.2, "how far the place drifts, standard deviation after one second, m")
+    speed: Positive = setting(0.1, "standard deviation of a component of the velocity, m/s")
+    halt_time: Positive = setting(0.1, "time constant with which a velocity is forgotten, s")
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -78,7 +73,7 @@ class Stationary:
 
 
 @dataclass(frozen=True)
-class Mixture:
+class Mixture(Settings):
     """A motion that changes between several."""
 
     motions: tuple[Stationary | ConstantVelocity | ConstantAcceleration | CoordinatedTurn | Bicycle, ...] = (
@@ -86,11 +81,13 @@ class Mixture:
             lambda: (Stationary(), ConstantVelocity(), CoordinatedTurn()), "the modes, of which all have a velocity"
         )
     )
-    stay: float = setting(5.0, "mean time in a mode before it changes to one of the others, s")
-    unknown: float = setting(0.3, "standard deviation of what a mode has no use for, such as a turn rate, unit of it")
+    stay: Positive = setting(5.0, "mean time in a mode before it changes to one of the others, s")
+    unknown: Positive = setting(
+        0.3, "standard deviation of what a mode has no use for, such as a turn rate, unit of it"
+    )
 
     def __post_init__(self) -> None:
-        require_positive(self, "stay", "unknown")
+        super().__post_init__()
         if len(self.motions) < 2:
             raise InputError(f"motions: expected at least two modes, got {len(self.motions)}")
 

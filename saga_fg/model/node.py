@@ -11,7 +11,6 @@ nodes of different types, with states of different size, live in one graph.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting
 
 
 class Motion(Protocol):
@@ -56,13 +55,10 @@ def _planar(one_axis: ArrayLike) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class ConstantVelocity:
+class ConstantVelocity(Settings):
     """White noise acceleration in the plane (Bar-Shalom, Li, Kirubarajan 2001, section 6.2.2)."""
 
-    acceleration_noise: float = setting(1.0, "spectral density of the acceleration, m^2/s^3")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "acceleration_noise")
+    acceleration_noise: NonNegative = setting(1.0, "spectral density of the acceleration, m^2/s^3")
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -78,19 +74,17 @@ class ConstantVelocity:
 
 
 @dataclass(frozen=True)
-class ConstantAcceleration:
+class ConstantAcceleration(Settings):
     """White noise jerk in the plane, acceleration fading with a time constant (Singer 1970).
 
     Without fading (`fading_time` infinite) this is the Wiener-process acceleration model of Bar-Shalom, Li,
     Kirubarajan 2001, section 6.2.3; fading keeps a long prediction from running away.
     """
 
-    jerk_noise: float = setting(1.0, "spectral density of the jerk, m^2/s^5")
-    fading_time: float = setting(float("inf"), "time constant with which the acceleration fades, s; .inf for never")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "jerk_noise")
-        require_positive(self, "fading_time", infinite=True)
+    jerk_noise: NonNegative = setting(1.0, "spectral density of the jerk, m^2/s^5")
+    fading_time: PositiveOrInf = setting(
+        float("inf"), "time constant with which the acceleration fades, s; .inf for never"
+    )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -106,14 +100,11 @@ class ConstantAcceleration:
 
 
 @dataclass(frozen=True)
-class RandomWalk:
+class RandomWalk(Settings):
     """Components that drift without a velocity; with drift 0 they stand still (a stop line, a pole)."""
 
     names: tuple[str, ...] = setting(("x", "y"), "state components")
-    drift: float = setting(0.0, "spectral density of the drift, unit^2/s")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "drift")
+    drift: NonNegative = setting(0.0, "spectral density of the drift, unit^2/s")
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ from saga_fg.model.intelligent_driver import LEAST_GAP, IntelligentDriver, Linea
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting, settings_group
 
 _NEAREST = 1e-3  # m; nearer, there is no direction
 _HALT = 0.05  # m/s^2
@@ -69,14 +69,11 @@ class AccelerationLaw(Protocol):
 
 
 @dataclass(frozen=True)
-class SmoothDriver:
+class SmoothDriver(Settings):
     """A vehicle follows its leader, the source, as a driver does: an intelligent driver whose law has no corners."""
 
     driver: IntelligentDriver = settings_group(IntelligentDriver, "the driver; `room` plays no part")
-    length: float = setting(4.5, "of the gap that vehicles fill, between their centres, where boxes do not tell, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "length")
+    length: Positive = setting(4.5, "of the gap that vehicles fill, between their centres, where boxes do not tell, m")
 
     @property
     def time_constant(self) -> float:
@@ -108,15 +105,12 @@ class SmoothDriver:
 
 
 @dataclass(frozen=True)
-class SocialForce:
+class SocialForce(Settings):
     """A pedestrian keeps away from another, or from a wall: from the nearest point of the source's outline."""
 
-    strength: float = setting(2.0, "A: acceleration at the distance `reach`, m/s^2")
-    falloff: float = setting(0.5, "B: distance over which it falls to a third, m")
-    reach: float = setting(0.6, "sum of two radii, m; from a wall, one")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "strength", "falloff", "reach")
+    strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2")
+    falloff: Positive = setting(0.5, "B: distance over which it falls to a third, m")
+    reach: Positive = setting(0.6, "sum of two radii, m; from a wall, one")
 
     @property
     def time_constant(self) -> float:

@@ -8,7 +8,6 @@ two is seen to do, the other does as well. From one interval to the next the off
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,17 +17,22 @@ from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, n
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import (
+    NonNegative,
+    PositiveOrInf,
+    Settings,
+    setting,
+    settings_group,
+)
 
 
 @dataclass(frozen=True)
-class RigidCoupling:
+class RigidCoupling(Settings):
     """A node keeps the velocity of another and its present place relative to it."""
 
-    time_constant: float = setting(1.0, "tau: time over which a change of the offset is made good, s; .inf for never")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "time_constant", infinite=True)
+    time_constant: PositiveOrInf = setting(
+        1.0, "tau: time over which a change of the offset is made good, s; .inf for never"
+    )
 
     def applies(self, target: NodeType, source: NodeType) -> bool:
         return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
@@ -46,20 +50,16 @@ class RigidCoupling:
 
 
 @dataclass(frozen=True)
-class Attached:
+class Attached(Settings):
     """Every object of some classes is attached to the nearest of some others that touches it and moves as it does."""
 
     interaction: RigidCoupling = settings_group(RigidCoupling, "interaction function of the edges, which go both ways")
     attached: tuple[str, ...] = setting(("trailer",), "classes of what is attached")
     carriers: tuple[str, ...] = setting(("truck",), "classes of what it is attached to")
-    rate: float = setting(3.0, "strength of an edge, 1/s")
-    slack: float = setting(2.0, "largest distance between centres beyond half of both lengths, m")
-    heading_scale: float = setting(0.5, "sigma of the kernel on the difference of headings, rad; .inf for none")
-    speed_scale: float = setting(2.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate", "slack")
-        require_positive(self, "heading_scale", "speed_scale", infinite=True)
+    rate: NonNegative = setting(3.0, "strength of an edge, 1/s")
+    slack: NonNegative = setting(2.0, "largest distance between centres beyond half of both lengths, m")
+    heading_scale: PositiveOrInf = setting(0.5, "sigma of the kernel on the difference of headings, rad; .inf for none")
+    speed_scale: PositiveOrInf = setting(2.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         parts, carriers = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.attached, self.carriers))

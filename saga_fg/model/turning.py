@@ -21,29 +21,24 @@ state (Bar-Shalom, section 11.7.1): what the noise of c does to the velocity wit
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import NonNegative, Positive, Settings, setting
 
 _TINY = 1e-2  # rad; below, series
 _STRAIGHT = np.diag([1.0, 1.0, 0.0], k=2)  # dp/dt = v
 
 
 @dataclass(frozen=True)
-class CoordinatedTurn:
+class CoordinatedTurn(Settings):
     """A turn of nearly constant rate and speed."""
 
-    acceleration_noise: float = setting(2.0, "spectral density of the acceleration, m^2/s^3")
-    turn_noise: float = setting(0.05, "spectral density of the turn rate's random walk, rad^2/s^3")
-    turn_rate: float = setting(0.2, "standard deviation of the turn rate of a new object, rad/s")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "acceleration_noise", "turn_noise")
-        require_positive(self, "turn_rate")
+    acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3")
+    turn_noise: NonNegative = setting(0.05, "spectral density of the turn rate's random walk, rad^2/s^3")
+    turn_rate: Positive = setting(0.2, "standard deviation of the turn rate of a new object, rad/s")
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -74,17 +69,13 @@ class CoordinatedTurn:
 
 
 @dataclass(frozen=True)
-class Bicycle:
+class Bicycle(Settings):
     """The kinematic bicycle: a vehicle turns as it is steered, and not where it stands; to the left is positive."""
 
-    acceleration_noise: float = setting(2.0, "spectral density of the acceleration, m^2/s^3")
-    steering_noise: float = setting(0.02, "spectral density of the steering angle's random walk, rad^2/s")
-    wheelbase: float = setting(2.8, "distance between the axles, m")
-    steering: float = setting(0.1, "standard deviation of the steering angle of a new object, rad")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "acceleration_noise", "steering_noise")
-        require_positive(self, "wheelbase", "steering")
+    acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3")
+    steering_noise: NonNegative = setting(0.02, "spectral density of the steering angle's random walk, rad^2/s")
+    wheelbase: Positive = setting(2.8, "distance between the axles, m")
+    steering: Positive = setting(0.1, "standard deviation of the steering angle of a new object, rad")
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -14,26 +14,26 @@ from saga_fg.graph.keys import EGO_POSE
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.providers.start import NO_POSE
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting
 
 
 @dataclass(frozen=True)
-class Gps:
+class Gps(Settings):
     """Adds GPS fixes (`frame.ego.gps`) on the vehicle's pose, those that are near enough to where it is expected."""
 
-    deviation: float = setting(
+    deviation: Positive = setting(
         1.0, "fixes that come without a covariance: standard deviation of a horizontal coordinate, m"
     )
-    height_deviation: float = setting(2.0, "and of the height, m")
+    height_deviation: Positive = setting(2.0, "and of the height, m")
     antenna: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "its place in the vehicle's frame, m")
-    gate: float = setting(0.999, "share of true fixes that the chi-square gate lets through; 1: all")
-    outlier_scale: float = setting(math.inf, "deviations from which the Cauchy loss gives a fix up; .inf: never")
+    gate: Fraction = setting(0.999, "share of true fixes that the chi-square gate lets through; 1: all")
+    outlier_scale: PositiveOrInf = setting(
+        math.inf, "deviations from which the Cauchy loss gives a fix up; .inf: never"
+    )
     name: str = setting("gps", "what it is called in messages")
 
     def __post_init__(self) -> None:
-        require_positive(self, "deviation", "height_deviation")
-        require_positive(self, "outlier_scale", infinite=True)
-        require_between(self, 0, 1, "gate")
+        super().__post_init__()
         if len(self.antenna) != 3 or not all(map(math.isfinite, self.antenna)):
             raise InputError(f"antenna: expected three finite numbers, got {self.antenna!r}")
 

@@ -20,34 +20,31 @@ from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.start import StartSettings
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.types.ego_measurements import ImuSamples
 
 
 @dataclass(frozen=True)
-class Imu:
+class Imu(Settings):
     """Adds the vehicle's pose in space, velocity and biases at every epoch, and inertial samples (`frame.ego.imu`)."""
 
     start: StartSettings = settings_group(lambda: StartSettings(planar=False), "the first pose, in space")
     start_velocity: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "first velocity, world, m/s")
-    start_velocity_deviation: float = setting(10.0, "its standard deviation, m/s")
-    accelerometer_noise: float = setting(0.02, "of the accelerometer, m/s^2/sqrt(Hz)")
-    gyroscope_noise: float = setting(0.002, "of the gyroscope, rad/s/sqrt(Hz)")
-    integration_noise: float = setting(1e-4, "of integrating the position, m/s/sqrt(Hz)")
-    accelerometer_bias: float = setting(0.1, "standard deviation of the accelerometer's first bias, m/s^2")
-    gyroscope_bias: float = setting(0.01, "standard deviation of the gyroscope's first bias, rad/s")
-    accelerometer_drift: float = setting(1e-3, "random walk of the accelerometer's bias, m/s^2 after one second")
-    gyroscope_drift: float = setting(1e-4, "random walk of the gyroscope's bias, rad/s after one second")
-    unknown_acceleration: float = setting(3.0, "of the acceleration where there are no samples, m/s^2/sqrt(Hz)")
-    unknown_turn: float = setting(0.3, "of the rate of turn where there are no samples, rad/s/sqrt(Hz)")
-    gravity: float = setting(9.81, "m/s^2")
+    start_velocity_deviation: Positive = setting(10.0, "its standard deviation, m/s")
+    accelerometer_noise: Positive = setting(0.02, "of the accelerometer, m/s^2/sqrt(Hz)")
+    gyroscope_noise: Positive = setting(0.002, "of the gyroscope, rad/s/sqrt(Hz)")
+    integration_noise: Positive = setting(1e-4, "of integrating the position, m/s/sqrt(Hz)")
+    accelerometer_bias: Positive = setting(0.1, "standard deviation of the accelerometer's first bias, m/s^2")
+    gyroscope_bias: Positive = setting(0.01, "standard deviation of the gyroscope's first bias, rad/s")
+    accelerometer_drift: Positive = setting(1e-3, "random walk of the accelerometer's bias, m/s^2 after one second")
+    gyroscope_drift: Positive = setting(1e-4, "random walk of the gyroscope's bias, rad/s after one second")
+    unknown_acceleration: Positive = setting(3.0, "of the acceleration where there are no samples, m/s^2/sqrt(Hz)")
+    unknown_turn: Positive = setting(0.3, "of the rate of turn where there are no samples, rad/s/sqrt(Hz)")
+    gravity: NonNegative = setting(9.81, "m/s^2")
     name: str = setting("imu", "what it is called in messages")
 
     def __post_init__(self) -> None:
-        names = ("start_velocity_deviation", "accelerometer_noise", "gyroscope_noise", "integration_noise")
-        biases = ("accelerometer_bias", "gyroscope_bias", "accelerometer_drift", "gyroscope_drift")
-        require_positive(self, *names, *biases, "unknown_acceleration", "unknown_turn")
-        require_between(self, 0, np.inf, "gravity")
+        super().__post_init__()
         if self.start.planar:
             raise InputError("start.planar: expected false, inertial sensors move a pose in space")
 

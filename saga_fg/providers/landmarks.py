@@ -15,12 +15,12 @@ from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.providers.start import NO_POSE
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)
-class Landmarks:
+class Landmarks(Settings):
     """Adds sightings of landmarks (`frame.ego.landmarks`), and each landmark when it is first seen.
 
     Which one is seen is known; its kind is the observation's (`saga_fg.slam.mapping`).
@@ -29,11 +29,8 @@ class Landmarks:
     labels: tuple[str, ...] = setting(
         (), "detections in the vehicle's frame with one of these labels are sightings of a point, one point a label"
     )
-    deviation: float = setting(0.3, "standard deviation of such a sighting, m")
+    deviation: Positive = setting(0.3, "standard deviation of such a sighting, m")
     name: str = setting("landmarks", "what it is called in messages")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation")
 
     def factors(self, view: GraphView) -> Additions:
         pose = view.now(EGO_POSE).get(0)

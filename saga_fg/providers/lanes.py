@@ -19,7 +19,7 @@ from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.polyline import feet, on_it
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.types.road_map import Lane
 
 _ALONG = 0.9  # cosine of the angle between a course and a lane within which an object goes along it
@@ -27,19 +27,15 @@ _LETS_GO = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
-class Lanes:
+class Lanes(Settings):
     """Says of vehicles that go along a lane that they probably keep to it."""
 
     lanes: tuple[Lane, ...] = settings_group(tuple, "in the world")
-    deviation: float = setting(0.5, "standard deviation of an offset that a second in the lane leaves, m")
-    map_deviation: float = setting(0.3, "standard deviation of where the map has a lane, m")
-    min_speed: float = setting(1.0, "slower objects have no course, m/s")
+    deviation: Positive = setting(0.5, "standard deviation of an offset that a second in the lane leaves, m")
+    map_deviation: Positive = setting(0.3, "standard deviation of where the map has a lane, m")
+    min_speed: NonNegative = setting(1.0, "slower objects have no course, m/s")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that keep to lanes")
     name: str = setting("lanes", "what it is called in messages")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation", "map_deviation")
-        require_between(self, 0, np.inf, "min_speed")
 
     def factors(self, view: GraphView) -> Additions:
         if not self.lanes:

@@ -21,27 +21,24 @@ from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.start import StartSettings
-from saga_fg.settings import require_positive, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.types.ego_measurements import OdometryIncrement
 
 _SAME = 1e-4  # relative difference of two intervals that timestamps make
 
 
 @dataclass(frozen=True)
-class Odometry:
+class Odometry(Settings):
     """Adds the vehicle's pose at every epoch, and what odometry (`frame.ego.odometry`) says of its motion."""
 
     start: StartSettings = settings_group(StartSettings, "the first pose")
-    place_drift: float = setting(
+    place_drift: Positive = setting(
         0.1, "increments that come without a covariance: standard deviation of the place after one second, m"
     )
-    heading_drift: float = setting(0.01, "the same of the heading, and of roll and pitch, rad")
-    unknown_speed: float = setting(10.0, "standard deviation of the velocity where there is no increment, m/s")
-    unknown_turn: float = setting(0.3, "standard deviation of the rate of turn where there is no increment, rad/s")
+    heading_drift: Positive = setting(0.01, "the same of the heading, and of roll and pitch, rad")
+    unknown_speed: Positive = setting(10.0, "standard deviation of the velocity where there is no increment, m/s")
+    unknown_turn: Positive = setting(0.3, "standard deviation of the rate of turn where there is no increment, rad/s")
     name: str = setting("odometry", "what it is called in messages")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "place_drift", "heading_drift", "unknown_speed", "unknown_turn")
 
     def predict(self, view: GraphView) -> Additions:
         before = view.before(EGO_POSE)

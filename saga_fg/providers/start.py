@@ -15,26 +15,26 @@ from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_of, yaw_transform
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 from saga_fg.types.frame import Frame
 
 NO_POSE = "expected a provider that adds the vehicle's pose before it, such as saga_fg.providers:Odometry"
 
 
 @dataclass(frozen=True)
-class StartSettings:
+class StartSettings(Settings):
     """The vehicle's first pose."""
 
     place: tuple[float, float, float] | None = setting(
         None, "x, y (m) and yaw (rad) in the world; null: the first frame's world_T_ego, else its GPS fix, yaw 0"
     )
-    deviation: float = setting(1.0, "standard deviation of the place, m")
-    heading_deviation: float = setting(0.1, "of the heading, rad")
-    tilt_deviation: float = setting(0.02, "of roll and pitch, rad; for poses in space")
+    deviation: Positive = setting(1.0, "standard deviation of the place, m")
+    heading_deviation: Positive = setting(0.1, "of the heading, rad")
+    tilt_deviation: Positive = setting(0.02, "of roll and pitch, rad; for poses in space")
     planar: bool = setting(True, "a pose (x, y, heading), gtsam.Pose2; false: in space, gtsam.Pose3")
 
     def __post_init__(self) -> None:
-        require_positive(self, "deviation", "heading_deviation", "tilt_deviation")
+        super().__post_init__()
         if self.place is not None and not all(map(math.isfinite, self.place)):
             raise InputError(f"place: expected finite numbers, got {self.place!r}")
 

@@ -13,20 +13,17 @@ from factors import ResidualFactors, Robust
 from saga_fg.graph.keys import OBJECT
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class Stationary:
+class Stationary(Settings):
     """Says of objects of some classes that they probably stand."""
 
     classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of objects that stand")
-    deviation: float = setting(0.1, "standard deviation of a velocity that a second of standing leaves, m/s")
-    surely_moving: float = setting(4.0, "standard deviations from standing at which the loss gives an object up")
+    deviation: Positive = setting(0.1, "standard deviation of a velocity that a second of standing leaves, m/s")
+    surely_moving: Positive = setting(4.0, "standard deviations from standing at which the loss gives an object up")
     name: str = setting("stationary", "what it is called in messages")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation", "surely_moving")
 
     def factors(self, view: GraphView) -> Additions:
         dims: dict[int, list[list[int]]] = {}

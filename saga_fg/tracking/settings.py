@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import get_args
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -15,12 +14,21 @@ from saga_fg.model.modes import Mixture
 from saga_fg.model.node import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
-from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+from saga_fg.settings import (
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveInt,
+    PositiveOrInf,
+    Settings,
+    setting,
+    settings_group,
+)
 from saga_fg.tracking.names import AssociationName, EstimatorName
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.road_map import RoadMap
@@ -28,137 +36,133 @@ from saga_fg.types.signal import SignalSettings
 
 
 @dataclass(frozen=True)
-class ClassSettings:
+class ClassSettings(Settings):
     """How objects of one class move, are born, matched and given up."""
 
     motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
         lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
     )
-    birth_speed: float = setting(5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s")
-    birth_drift: float = setting(1.0, "standard deviation of an unmeasured velocity at birth, across the heading, m/s")
-    min_score: float = setting(0.0, "detections with a lower probability are not used at all")
-    birth_score: float = setting(0.1, "detections with a lower probability start no track")
-    duplicate_distance: float = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
-    shadow_distance: float = setting(0.0, "a detection this close to a much stronger one of the class is its shadow, m")
-    shadow_ratio: float = setting(0.5, "much stronger: the weaker has less than this share of its probability")
-    merge_distance: float = setting(0.0, "a track that is not seen ends this close to one of the class that is, m")
-    class_overlap: float = setting(
+    birth_speed: Positive = setting(
+        5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s"
+    )
+    birth_drift: Positive = setting(
+        1.0, "standard deviation of an unmeasured velocity at birth, across the heading, m/s"
+    )
+    min_score: Fraction = setting(0.0, "detections with a lower probability are not used at all")
+    birth_score: Fraction = setting(0.1, "detections with a lower probability start no track")
+    duplicate_distance: NonNegative = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
+    shadow_distance: NonNegative = setting(
+        0.0, "a detection this close to a much stronger one of the class is its shadow, m"
+    )
+    shadow_ratio: Fraction = setting(0.5, "much stronger: the weaker has less than this share of its probability")
+    merge_distance: NonNegative = setting(
+        0.0, "a track that is not seen ends this close to one of the class that is, m"
+    )
+    class_overlap: Fraction = setting(
         1.0, "a detection whose IoU, from above, with a more probable one of another class is larger goes; 1: never"
     )
-    overlap_weight: float = setting(
+    overlap_weight: NonNegative = setting(
         0.0, "what a whole unit of 3D GIoU counts in matching, as a squared distance in sigmas"
     )
-    gate: float = setting(0.999, "share of true pairs that the chi-square gate lets through")
-    max_distance: float = setting(4.0, "no match beyond this distance between prediction and detection, m")
-    max_coasting: float = setting(1.2, "a track without detection is given up after this time, s")
-    yaw_drift: float = setting(0.3, "how fast the heading changes, standard deviation after one second, rad")
+    gate: Fraction = setting(0.999, "share of true pairs that the chi-square gate lets through")
+    max_distance: PositiveOrInf = setting(4.0, "no match beyond this distance between prediction and detection, m")
+    max_coasting: PositiveOrInf = setting(1.2, "a track without detection is given up after this time, s")
+    yaw_drift: NonNegative = setting(0.3, "how fast the heading changes, standard deviation after one second, rad")
 
     def __post_init__(self) -> None:
-        require_positive(self, "birth_speed", "birth_drift")
-        require_between(self, 0, 1, "min_score", "birth_score", "shadow_ratio", "class_overlap", "gate")
-        require_between(self, 0, math.inf, "duplicate_distance", "shadow_distance", "overlap_weight", "yaw_drift")
-        require_between(self, 0, math.inf, "merge_distance")
-        require_positive(self, "max_distance", "max_coasting", infinite=True)
+        super().__post_init__()
         if self.gate == 1:
             raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
 
 
 @dataclass(frozen=True)
-class AssociationSettings:
+class AssociationSettings(Settings):
     """How detections are matched to tracks, see `saga_fg.tracking.matching`; gates and caps are the classes'."""
 
     method: AssociationName = setting(
         "hungarian", "least total cost, the cheapest pair first, or graph: what pairs say of each other counts too"
     )
-    pair_weight: float = setting(1.0, "how much that counts, 1 by its face value, 0 not; used with method: graph")
-    clutter_area: float = setting(
+    pair_weight: NonNegative = setting(1.0, "how much that counts, 1 by its face value, 0 not; used with method: graph")
+    clutter_area: PositiveOrInf = setting(
         math.inf, "what is false in a frame is spread over this area, m^2; .inf: any pair inside the gate is a match"
     )
-    existence_weight: float = setting(0.3, "how much the existence of a track counts, 1 by its face value, 0 not")
-    score_weight: float = setting(0.5, "how much the probability of a detection counts, 1 by its face value, 0 not")
-
-    def __post_init__(self) -> None:
-        require_one_of(self, "method", get_args(AssociationName))
-        require_positive(self, "clutter_area", infinite=True)
-        require_between(self, 0, math.inf, "existence_weight", "score_weight", "pair_weight")
+    existence_weight: NonNegative = setting(0.3, "how much the existence of a track counts, 1 by its face value, 0 not")
+    score_weight: NonNegative = setting(
+        0.5, "how much the probability of a detection counts, 1 by its face value, 0 not"
+    )
 
 
 @dataclass(frozen=True)
-class ExistenceSettings:
+class ExistenceSettings(Settings):
     """The probability that a track is a real object."""
 
-    lifetime: float = setting(30.0, "mean time after which an object leaves unseen, s")
-    clutter_score: float = setting(0.2, "probability score at which a matched detection neither helps nor hurts")
-    report: float = setting(0.0, "tracks are reported from this existence probability on")
-    confirm: float = setting(0.9, "from here on a track is confirmed: misses no longer end it, only time does")
-    newness: float = setting(0.0, "looks in vain a new track starts with in the share of looks that saw it")
-    steadiness_weight: float = setting(0.0, "power of that share that a track's score is multiplied by, 0 for none")
-    coasting_score: float = setting(1.0, "what a track's score is worth without a detection, besides its existence")
-    occlusion: float = setting(
+    lifetime: PositiveOrInf = setting(30.0, "mean time after which an object leaves unseen, s")
+    clutter_score: Fraction = setting(0.2, "probability score at which a matched detection neither helps nor hurts")
+    report: Fraction = setting(0.0, "tracks are reported from this existence probability on")
+    confirm: Fraction = setting(0.9, "from here on a track is confirmed: misses no longer end it, only time does")
+    newness: NonNegative = setting(0.0, "looks in vain a new track starts with in the share of looks that saw it")
+    steadiness_weight: NonNegative = setting(
+        0.0, "power of that share that a track's score is multiplied by, 0 for none"
+    )
+    coasting_score: Fraction = setting(1.0, "what a track's score is worth without a detection, besides its existence")
+    occlusion: Fraction = setting(
         0.0, "share of the chance of a detection that a track wholly hidden behind another loses; 0: hidden is as seen"
     )
-    give_up: float = setting(0.02, "unconfirmed tracks below this existence probability are removed")
+    give_up: Fraction = setting(0.02, "unconfirmed tracks below this existence probability are removed")
 
     def __post_init__(self) -> None:
-        require_positive(self, "lifetime", infinite=True)
-        require_between(self, 0, 1, "clutter_score", "report", "confirm", "give_up", "coasting_score", "occlusion")
-        require_between(self, 0, math.inf, "newness", "steadiness_weight")
+        super().__post_init__()
         if self.clutter_score in (0, 1):
             raise InputError(f"clutter_score: expected a probability inside 0 to 1, got {self.clutter_score!r}")
 
 
 @dataclass(frozen=True)
-class FlowSettings:
+class FlowSettings(Settings):
     """What a new track takes over from traffic that heads the same way, see `saga_fg.tracking.traffic_flow`."""
 
-    weight: float = setting(0.0, "what a neighbour counts for the speed of a new track against knowing nothing; 0: off")
-    ahead_scale: float = setting(15.0, "sigma of the kernel on the distance along the heading, m")
-    lateral_scale: float = setting(2.0, "sigma of the kernel on the distance across the heading, m")
-    heading_scale: float = setting(0.3, "sigma of the kernel on the difference of headings, rad")
-    spread: float = setting(2.0, "standard deviation of the difference between the speeds of neighbours, m/s")
-    known_speed: float = setting(1.5, "tracks whose speed is less certain than this teach nothing, m/s")
-    memory: float = setting(5.0, "where tracks passed is remembered for this long, s")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "weight", "spread", "memory")
-        require_positive(self, "ahead_scale", "lateral_scale", "heading_scale", "known_speed", infinite=True)
+    weight: NonNegative = setting(
+        0.0, "what a neighbour counts for the speed of a new track against knowing nothing; 0: off"
+    )
+    ahead_scale: PositiveOrInf = setting(15.0, "sigma of the kernel on the distance along the heading, m")
+    lateral_scale: PositiveOrInf = setting(2.0, "sigma of the kernel on the distance across the heading, m")
+    heading_scale: PositiveOrInf = setting(0.3, "sigma of the kernel on the difference of headings, rad")
+    spread: NonNegative = setting(2.0, "standard deviation of the difference between the speeds of neighbours, m/s")
+    known_speed: PositiveOrInf = setting(1.5, "tracks whose speed is less certain than this teach nothing, m/s")
+    memory: NonNegative = setting(5.0, "where tracks passed is remembered for this long, s")
 
 
 @dataclass(frozen=True)
-class StandingSettings:
+class StandingSettings(Settings):
     """The belief that an object stands still, see `saga_fg.tracking.standing`."""
 
-    prior: float = setting(0.0, "share of new objects that stand; 0: standing is no case of its own")
-    depart: float = setting(0.02, "rate at which what stands starts to move, 1/s")
-    halt: float = setting(0.05, "rate at which what moves comes to stand, 1/s")
-    drift: float = setting(0.02, "how far the place of what stands drifts, standard deviation after one second, m")
-    noise: float = setting(0.05, "share of the process noise that is left to what stands")
+    prior: Fraction = setting(0.0, "share of new objects that stand; 0: standing is no case of its own")
+    depart: NonNegative = setting(0.02, "rate at which what stands starts to move, 1/s")
+    halt: NonNegative = setting(0.05, "rate at which what moves comes to stand, 1/s")
+    drift: NonNegative = setting(
+        0.02, "how far the place of what stands drifts, standard deviation after one second, m"
+    )
+    noise: Fraction = setting(0.05, "share of the process noise that is left to what stands")
 
     def __post_init__(self) -> None:
-        require_between(self, 0, 1, "prior", "noise")
-        require_between(self, 0, math.inf, "depart", "halt", "drift")
+        super().__post_init__()
         if self.prior == 1 or self.noise == 0:
             raise InputError("prior and noise: expected a prior below 1 and some noise, since everything may move")
 
 
 @dataclass(frozen=True)
-class ClockSettings:
+class ClockSettings(Settings):
     """Which timestamps are believed, see `saga_fg.tracking.clock`."""
 
-    max_jump: float = setting(
+    max_jump: PositiveOrInf = setting(
         10.0, "a frame further than this from the newest time is left out until a second one confirms its time, s"
     )
-    late_run: int = setting(
+    late_run: PositiveInt = setting(
         3, "new frames in a row by which a sensor goes back in time, after which the clock is set back"
     )
 
-    def __post_init__(self) -> None:
-        require_positive(self, "max_jump", infinite=True)
-        require_positive(self, "late_run")
-
 
 @dataclass(frozen=True)
-class EgoNodeSettings:
+class EgoNodeSettings(Settings):
     """The vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
 
     estimated: bool = setting(
@@ -167,15 +171,12 @@ class EgoNodeSettings:
         "there; false: it is where frames say",
     )
     label: str = setting("car", "its class for edge rules")
-    length: float = setting(4.5, "m")
-    deviation: float = setting(0.02, "standard deviation of its place about its pose, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "length", "deviation")
+    length: Positive = setting(4.5, "m")
+    deviation: Positive = setting(0.02, "standard deviation of its place about its pose, m")
 
 
 @dataclass(frozen=True)
-class TrackerSettings:
+class TrackerSettings(Settings):
     """Everything the tracker can be told; `edges` empty is the classical filter of independent objects.
 
     Raises `InputError` for edge rules that make the dynamics, or a step of up to a second, unstable.
@@ -185,7 +186,7 @@ class TrackerSettings:
         default_factory=lambda: {DEFAULT: ClassSettings()},
         metadata={"comment": "by class; the entry named default serves all others"},
     )
-    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeEdge | Attached, ...] = (
+    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
         settings_group(lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects")
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
@@ -193,10 +194,10 @@ class TrackerSettings:
         "groups of classes that detectors mistake for each other: tracks believe in all of a group, and a detection of "
         "one may be of a track of another; []: a track has the class it was born with",
     )
-    explained_noise: float = setting(
+    explained_noise: NonNegative = setting(
         0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
     )
-    max_step: float = setting(
+    max_step: PositiveOrInf = setting(
         math.inf,
         "a longer interval is predicted in several steps, at most 100, each with edges of its own, s; .inf: in one",
     )
@@ -213,26 +214,30 @@ class TrackerSettings:
     ego: EgoNodeSettings | None = settings_group(
         lambda: None, "the vehicle as a node that leads and follows; null: it is none"
     )
-    lag: float = setting(
+    lag: NonNegative = setting(
         2.0, "window of the fixed-lag estimator, s; without providers, frames this late are put where they belong"
     )
     association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
     flow: FlowSettings = settings_group(FlowSettings, "the speed of new tracks from traffic around them")
     standing: StandingSettings = settings_group(StandingSettings, "whether an object stands or moves")
-    report_speed_known: float = setting(
+    report_speed_known: PositiveOrInf = setting(
         math.inf,
         "a track is first reported when the standard deviation of its velocity is below this, m/s; .inf: at once",
     )
-    score_memory: float = setting(0.15, "what a sensor said of a track counts for its score for this long, s")
-    confirmations: int = setting(3, "detections that confirm a track born of a weak sensor; another sensor's one does")
-    unconfirmed_share: float = setting(
+    score_memory: NonNegative = setting(0.15, "what a sensor said of a track counts for its score for this long, s")
+    confirmations: PositiveInt = setting(
+        3, "detections that confirm a track born of a weak sensor; another sensor's one does"
+    )
+    unconfirmed_share: Fraction = setting(
         0.0, "share of its score with which a track is reported that waits for confirmation; 0: not at all"
     )
     clock: ClockSettings = settings_group(ClockSettings, "which timestamps are believed")
-    max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
-    max_out_of_view: float = setting(0.5, "a track outside every sensor's field of view is given up after this time, s")
-    report_coasting: float = setting(0.6, "tracks are reported for this long after their last detection, s")
+    max_delay: NonNegative = setting(0.5, "a frame that comes later than this is left out, s")
+    max_out_of_view: PositiveOrInf = setting(
+        0.5, "a track outside every sensor's field of view is given up after this time, s"
+    )
+    report_coasting: NonNegative = setting(0.6, "tracks are reported for this long after their last detection, s")
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
         """Whether any class moves nonlinearly, or any of the edge rules acts so."""
@@ -240,11 +245,7 @@ class TrackerSettings:
         return moving or any(isinstance(rule.interaction, AccelerationLaw) for rule in rules)
 
     def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "explained_noise", "lag", "max_delay", "report_coasting", "score_memory")
-        require_positive(self, "max_out_of_view", "report_speed_known", "max_step", infinite=True)
-        require_positive(self, "confirmations")
-        require_between(self, 0, 1, "unconfirmed_share")
-        require_one_of(self, "estimator", get_args(EstimatorName))
+        super().__post_init__()
         if self.ego is not None and self.ego.estimated:
             if self.association.method == "graph":
                 raise InputError("ego.estimated: expected association without pairs, got association.method graph")
@@ -268,20 +269,15 @@ class TrackerSettings:
 
 
 @dataclass(frozen=True)
-class GreedySettings:
+class GreedySettings(Settings):
     """The greedy nearest-centre tracker (Yin et al., CenterPoint, CVPR 2021, section 4.2)."""
 
     max_distance: Mapping[str, float] = field(
         default_factory=lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
         metadata={"comment": "largest distance between prediction and detection by class, m"},
     )
-    max_coasting: float = setting(1.2, "a track without detection is kept this long, s")
-    baseline: float = setting(0.2, "velocities are differences of positions at least this far apart in time, s")
-    min_score: float = setting(0.0, "detections with a lower probability are not used")
+    max_coasting: PositiveOrInf = setting(1.2, "a track without detection is kept this long, s")
+    baseline: NonNegative = setting(0.2, "velocities are differences of positions at least this far apart in time, s")
+    min_score: Fraction = setting(0.0, "detections with a lower probability are not used")
     clock: ClockSettings = settings_group(ClockSettings, "which timestamps are believed")
-    max_delay: float = setting(0.5, "a frame that comes later than this is left out, s")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, 1, "min_score")
-        require_between(self, 0, math.inf, "baseline", "max_delay")
-        require_positive(self, "max_coasting", infinite=True)
+    max_delay: NonNegative = setting(0.5, "a frame that comes later than this is left out, s")

@@ -14,7 +14,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_positive, required_setting, setting
+from saga_fg.settings import Positive, Settings, required_setting, setting
 
 Point = tuple[float, float]
 LIGHT, STOP_LINE, LANE, WALL = "traffic_light", "stop_line", "lane", "wall"
@@ -61,16 +61,16 @@ class StopLine:
 
 
 @dataclass(frozen=True)
-class Lane:
+class Lane(Settings):
     """A lane: its centre line in the direction of travel."""
 
     name: str = required_setting("the lane's own")
     centre: tuple[Point, ...] = required_setting("points (x, y) of its centre line in the direction of travel, m")
-    width: float = setting(3.5, "width, m")
+    width: Positive = setting(3.5, "width, m")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _require_name(self.name)
-        require_positive(self, "width")
         _require_points(f"lane {self.name}: centre", self.centre)
         if len(self.centre) < 2 or not np.hypot(*np.diff(np.array(self.centre), axis=0).T).all():
             raise InputError(f"lane {self.name}: centre: expected at least two points, neighbours apart")
@@ -91,17 +91,17 @@ class Wall:
 
 
 @dataclass(frozen=True)
-class RoadMap:
+class RoadMap(Settings):
     """Elements of the road with names of their own, and how well their places are known."""
 
     lights: tuple[TrafficLight, ...] = setting((), "traffic lights")
     stop_lines: tuple[StopLine, ...] = setting((), "stop lines, each with the name of its light")
     lanes: tuple[Lane, ...] = setting((), "lanes")
-    deviation: float = setting(0.2, "standard deviation of the places, every direction, m")
+    deviation: Positive = setting(0.2, "standard deviation of the places, every direction, m")
     walls: tuple[Wall, ...] = setting((), "walls, which pedestrians keep away from (edge rule repulsion)")
 
     def __post_init__(self) -> None:
-        require_positive(self, "deviation")
+        super().__post_init__()
         names = [e.name for group in (self.lights, self.stop_lines, self.lanes, self.walls) for e in group]
         twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
         if twice is not None:

@@ -17,14 +17,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
-from saga_fg.settings import require_between, require_one_of, require_positive, setting, settings_group
+from saga_fg.settings import (
+    Finite,
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveOrInf,
+    Range,
+    Settings,
+    setting,
+    settings_group,
+)
 from saga_fg.types.by_class import DEFAULT, class_values
 from saga_fg.types.frame import LATEST, Detections, Frame
 
@@ -33,52 +43,43 @@ _LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
 
 
 @dataclass(frozen=True)
-class NoiseModel:
+class NoiseModel(Settings):
     """Standard deviations of what a sensor measures of a class of objects."""
 
-    position: float = setting(0.3, "standard deviation of a position, every direction, m")
-    range_noise: float = setting(0.0, "standard deviation along the line of sight, m per m of range")
-    bearing_noise: float = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
-    velocity: float = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
-    range_rate: float = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
-    low_score: float = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
-    told_scale: float = setting(1.0, "factor on the standard deviation that is told of a track's position")
-    told_low_score: float = setting(0.0, "it grows by the factor 1 + told_low_score * (1 - probability); > -1")
-    shared_error: float = setting(0.0, "standard deviation of what all detections of an object err alike, m")
-    shared_low_score: float = setting(0.0, "it grows by the factor 1 + shared_low_score * (1 - probability)")
-    yaw: float = setting(0.2, "standard deviation of the heading, rad")
-    height: float = setting(0.2, "standard deviation of the centre's height, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "position", "velocity", "range_rate", "yaw", "height", "told_scale")
-        require_between(self, 0, math.inf, "range_noise", "bearing_noise", "low_score")
-        require_between(self, 0, math.inf, "shared_error", "shared_low_score")
-        require_between(self, -0.99, math.inf, "told_low_score")
+    position: Positive = setting(0.3, "standard deviation of a position, every direction, m")
+    range_noise: NonNegative = setting(0.0, "standard deviation along the line of sight, m per m of range")
+    bearing_noise: NonNegative = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
+    velocity: Positive = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
+    range_rate: Positive = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
+    low_score: NonNegative = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
+    told_scale: Positive = setting(1.0, "factor on the standard deviation that is told of a track's position")
+    told_low_score: Annotated[float, Range(-0.99)] = setting(
+        0.0, "it grows by the factor 1 + told_low_score * (1 - probability); > -1"
+    )
+    shared_error: NonNegative = setting(0.0, "standard deviation of what all detections of an object err alike, m")
+    shared_low_score: NonNegative = setting(0.0, "it grows by the factor 1 + shared_low_score * (1 - probability)")
+    yaw: Positive = setting(0.2, "standard deviation of the heading, rad")
+    height: Positive = setting(0.2, "standard deviation of the centre's height, m")
 
 
 @dataclass(frozen=True)
-class ScoreCalibration:
+class ScoreCalibration(Settings):
     """How the scores of a class become probabilities: straight on the logit."""
 
-    slope: float = setting(1.0, "change of the logit of the probability with the logit of the score")
-    offset: float = setting(0.0, "logit of the probability at a score of one half")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "slope")
-        require_between(self, -math.inf, math.inf, "offset")
+    slope: NonNegative = setting(1.0, "change of the logit of the probability with the logit of the score")
+    offset: Finite = setting(0.0, "logit of the probability at a score of one half")
 
 
 @dataclass(frozen=True)
-class FieldOfView:
+class FieldOfView(Settings):
     """What a sensor can see, in its own frame."""
 
-    min_azimuth: float = setting(-np.pi, "rad, from straight ahead, left positive")
-    max_azimuth: float = setting(np.pi, "rad")
-    max_range: float = setting(80.0, "m")
+    min_azimuth: Finite = setting(-np.pi, "rad, from straight ahead, left positive")
+    max_azimuth: Finite = setting(np.pi, "rad")
+    max_range: PositiveOrInf = setting(80.0, "m")
 
     def __post_init__(self) -> None:
-        require_positive(self, "max_range", infinite=True)
-        require_between(self, -math.inf, math.inf, "min_azimuth", "max_azimuth")
+        super().__post_init__()
         if self.max_azimuth < self.min_azimuth:
             raise InputError(
                 f"max_azimuth: expected at least min_azimuth {self.min_azimuth:g}, got {self.max_azimuth:g}"
@@ -107,7 +108,7 @@ class Extrinsics:
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Settings):
     """A sensor's model."""
 
     noise: Mapping[str, NoiseModel] = field(
@@ -115,9 +116,11 @@ class Sensor:
         metadata={"comment": "by class; the entry named default serves all others"},
     )
     use_velocity: bool = setting(True, "take in the velocity, or the range rate, where one was measured")
-    max_speed: float = setting(150.0, "velocities and range rates beyond this are errors and are not taken in, m/s")
-    detection_probability: float = setting(0.9, "chance that a visible object in the field of view is detected")
-    class_detection: Mapping[str, float] = settings_group(dict, "that chance by class, where it differs")
+    max_speed: PositiveOrInf = setting(
+        150.0, "velocities and range rates beyond this are errors and are not taken in, m/s"
+    )
+    detection_probability: Fraction = setting(0.9, "chance that a visible object in the field of view is detected")
+    class_detection: Mapping[str, Fraction] = settings_group(dict, "that chance by class, where it differs")
     score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
@@ -130,8 +133,8 @@ class Sensor:
         "by true class, how often objects are taken for each class, their own among them, as counts or shares; in "
         "place of class_accuracy",
     )
-    colour_accuracy: float = setting(0.9, "chance that the colour reported of a traffic light is the true one")
-    clutter_area: float | None = setting(
+    colour_accuracy: Fraction = setting(0.9, "chance that the colour reported of a traffic light is the true one")
+    clutter_area: PositiveOrInf | None = setting(
         None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
     )
     births: Literal["alone", "confirmed"] = setting(
@@ -139,10 +142,12 @@ class Sensor:
     )
     field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
     extrinsics: Extrinsics = settings_group(Extrinsics, "where it sits, for detections in sensor coordinates")
-    time_offset: float = setting(0.0, "added to the sensor's timestamps to get the time of measurement, s")
+    time_offset: Annotated[float, Range(-LATEST, LATEST)] = setting(
+        0.0, "added to the sensor's timestamps to get the time of measurement, s"
+    )
 
     def __post_init__(self) -> None:
-        require_between(self, 0, 1, "detection_probability", "colour_accuracy")
+        super().__post_init__()
         if not 0 < self.class_accuracy < 1:
             raise InputError(f"class_accuracy: expected a chance inside 0 to 1, got {self.class_accuracy!r}")
         for label, taken_for in self.confusion.items():
@@ -150,15 +155,6 @@ class Sensor:
                 raise InputError(f"confusion.{label}: expected shares >= 0, some above, got {dict(taken_for)!r}")
             if label not in taken_for:
                 raise InputError(f"confusion.{label}: expected {label} among the classes it is taken for")
-        for label, chance in self.class_detection.items():
-            if not 0 <= chance <= 1:
-                raise InputError(f"class_detection.{label}: expected a number from 0 to 1, got {chance!r}")
-        require_between(self, -LATEST, LATEST, "time_offset")
-        require_positive(self, "max_speed", infinite=True)
-        if self.clutter_area is not None:
-            require_positive(self, "clutter_area", infinite=True)
-        require_one_of(self, "score", ("probability", "logit"))
-        require_one_of(self, "births", ("alone", "confirmed"))
 
     def logit(self, score: FloatArray) -> FloatArray:
         """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_one_of, require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 COLOURS = ("red", "amber", "green")
 SIGHTINGS = tuple(f"traffic_light_{colour}" for colour in COLOURS)  # labels of detections that report a colour
@@ -30,20 +30,16 @@ LEAST_BELIEF = 1e-6  # no colour is ever ruled out
 
 
 @dataclass(frozen=True)
-class SignalSettings:
+class SignalSettings(Settings):
     """How traffic lights change, and what follows from the belief."""
 
-    red_duration: float = setting(15.0, "mean duration of red, s")
-    amber_duration: float = setting(3.0, "mean duration of amber, s")
-    green_duration: float = setting(15.0, "mean duration of green, s")
-    max_distance: float = setting(4.0, "a reported light further from every known one than this is none of them, m")
+    red_duration: Positive = setting(15.0, "mean duration of red, s")
+    amber_duration: Positive = setting(3.0, "mean duration of amber, s")
+    green_duration: Positive = setting(15.0, "mean duration of green, s")
+    max_distance: Positive = setting(4.0, "a reported light further from every known one than this is none of them, m")
     belief: Literal["mixed", "likeliest"] = setting(
         "mixed", "stop lines act by the probability that they are closed, or wholly if that is above one half"
     )
-
-    def __post_init__(self) -> None:
-        require_positive(self, "red_duration", "amber_duration", "green_duration", "max_distance")
-        require_one_of(self, "belief", ("mixed", "likeliest"))
 
     @cached_property
     def generator(self) -> FloatArray:

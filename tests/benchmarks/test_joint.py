@@ -14,10 +14,8 @@ from benchmarks.app import app
 from benchmarks.joint import JointBench, bench_joint
 from benchmarks.joint_online import bench_online
 from data_tools.simulator import simulate_scene
-from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import load_config
-from pipelines.slam.joint import run_joint
-from pipelines.slam.simulated import street
+from pipelines.slam.joint import run_joint, street
 from saga_fg import InputError
 from saga_fg.slam.joint import JointSettings
 
@@ -34,8 +32,8 @@ def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None
     assert told[-1] == result
     assert [row.scene for row in result.rows] == ["street 1", "street 2"]
     for scene, row in zip(scenes, result.rows, strict=True):
-        odometry, joint = run_joint(scene, config, settings, "lidar", 0).errors()
-        assert (row.decoupled_ate, row.joint_ate) == (odometry.ate, joint.ate)
+        errors = run_joint(scene, config, settings, "lidar", 0).errors()
+        assert (row.decoupled_ate, row.joint_ate) == (errors["odometry"].ate, errors["joint"].ate)
     square = [(row.joint_ate**2, row.decoupled_ate**2) for row in result.rows]
     joint_square, decoupled_square = np.sum(square, axis=0)
     assert result.landmarks is not None
@@ -55,9 +53,7 @@ def test_online_objects_are_scored_where_both_report_them() -> None:
     result = bench_online(scenes, config, [0], lag=1.0)
     for scene, row in zip(scenes, result.rows, strict=True):
         run = run_joint(scene, config, JointSettings(), "lidar", 0, lag=1.0)
-        assert run.online is not None
-        online = Trajectory(run.online.timestamps, run.online.newest)
-        assert row.ate == (run.errors()[0].ate, trajectory_errors(online, run.truth).ate)
+        assert row.ate == (run.errors()["odometry"].ate, run.errors()["online"].ate)
         assert row.pairs > 20
         assert 0 < row.median_velocity[1] < row.velocity[1] < 5
         assert 0 < row.position[1] < 2

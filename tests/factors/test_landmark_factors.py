@@ -14,9 +14,9 @@ from factors import (
     Vector,
     attitude_factor,
     bearing_range_factor,
-    edge_factors,
     lane_boundary_factors,
     lane_keeping_factors,
+    line_factors,
     on_plane_factor,
     plane_factor,
     point_factors,
@@ -102,7 +102,7 @@ def keeping(rng, keys, covariance):
 
 
 def edge(rng, keys, covariance):
-    factor = edge_factors([keys], rng.normal(0, 5, (1, 2, 3)), covariance(rng, 2))
+    factor = line_factors([keys], rng.normal(0, 5, (1, 2, 3)), covariance(rng, 2))
     return factor, [some_pose(rng), np.array([rng.uniform(-3, 3), rng.normal(0, 5)])]
 
 

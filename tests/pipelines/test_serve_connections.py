@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import resource
 import socket
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 from running_service import frame, limits, serving, status, wait_for
 
-from pipelines.config import load_config
-from pipelines.serving import Address, SocketServer, StreamClient, StreamTracker
-from pipelines.serving.connection import Connection
+from pipelines.serving import Address, SocketServer, StreamClient, StreamSettings
 
 
 def connected(address: Address) -> socket.socket:
@@ -190,12 +190,36 @@ def test_a_flood_of_late_frames_is_no_flood_of_warnings():
 
 
 def test_long_lines_let_short_ones_pass_until_it_is_their_time():
-    server = SocketServer(StreamTracker(lambda: load_config("file").new_tracker("kf")), Address())
-    first, second, short = clients = [Connection(server) for _ in range(3)]
-    for client, size in zip(clients, (10**6, 10**6, 100), strict=True):
-        client.lines.append((b" " * size, 0.0))
-    server._turns, server._long_after = list(clients), 5.0
-    assert server._next_client(4.0) is short
-    assert server._next_client(4.0) is first  # nobody else waits
-    server._turns = [second, short]
-    assert server._next_client(6.0) is second
+    """Two long lines and twenty short ones, each of which takes 20 ms: the second long one is the last of all."""
+    order: list[str] = []
+
+    class Slow:
+        settings = StreamSettings()
+
+        def handle(self, line: bytes, client: str, received: float) -> list[Any]:
+            time.sleep(0.02)
+            order.append(client)
+            return []
+
+    class Silent:
+        async def drain(self) -> None: ...
+
+    async def clients() -> None:
+        server: Any = SocketServer(Slow(), Address())  # type: ignore[arg-type]
+
+        def line(size: int, name: str) -> Any:
+            client = type("client", (str,), {"writer": Silent()})(name)
+            return server._take_turn(b" " * size, client, 0.0)
+
+        async def short(name: str) -> None:
+            for _ in range(10):
+                await line(100, name)
+
+        first = asyncio.create_task(line(10**6, "long"))
+        await asyncio.sleep(0)
+        await asyncio.gather(line(10**6, "long"), short("a"), short("b"), first)
+
+    asyncio.run(clients())
+    assert order[0] == "long"
+    assert order.index("long", 1) >= 8  # a tenth of the time is theirs
+    assert order[1:5] in (list("abab"), list("baba"))  # clients take turns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from typing import Any
 
 import numpy as np
@@ -211,12 +212,15 @@ def test_percentiles_are_right_to_two_percent(seconds, percent):
 
 
 def test_a_pipe_is_served_to_its_end():
-    source = io.BytesIO(frame(0.0) + b"nonsense\n" + b"x" * 2000 + b"\n" + frame(0.1).rstrip(b"\n"))
+    read, write = os.pipe()
+    os.write(write, frame(0.0) + b"nonsense\n" + b"x" * 2000 + b"\n" + frame(0.1).rstrip(b"\n"))
+    os.close(write)
     sink = io.BytesIO()
     service: StreamTracker[None] = StreamTracker(
         lambda: load_config("file").new_tracker("kf"), StreamSettings(max_message=1000)
     )
-    serve_pipe(service, source, sink)
+    with os.fdopen(read, "rb") as source:
+        serve_pipe(service, source, sink)
     kinds = [json.loads(line)["type"] for line in sink.getvalue().splitlines()]
     assert kinds == ["tracks", "error", "error", "tracks"]
 

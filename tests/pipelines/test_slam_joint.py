@@ -15,9 +15,8 @@ from data_tools.simulator import simulate_scene
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.slam.joint import keyframes, run_joint
-from pipelines.slam.roadside import RoadsideSettings, observe_poles
-from pipelines.slam.simulated import street
+from pipelines.slam.joint import keyframes, run_joint, street
+from pipelines.slam.simulated_poles import SimulatedPoleSettings, observe_poles
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint import JointSettings
@@ -68,7 +67,7 @@ def test_a_sensor_without_frames_is_named() -> None:
 
 def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
     poses = np.stack([yaw_transform(0.5 * k) for k in range(60)])
-    settings = RoadsideSettings(reach=20.0, noise=0.1)
+    settings = SimulatedPoleSettings(reach=20.0, noise=0.1)
     seen = observe_poles(poses, 1, settings)
     assert len(seen) == len(poses)
     places = np.array([pose[:2, 3] + o.value[:2] for pose, now in zip(poses, seen, strict=True) for o in now])

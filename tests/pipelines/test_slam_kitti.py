@@ -11,14 +11,13 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from data_tools.lidar import read_scan
-from data_tools.simulator.scan_drive import SimulatedScans
-from data_tools.simulator.street import KERB, drive
+from data_tools.simulator.street import KERB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
-from pipelines.slam.kitti import covered_spans, write_lidar_slam
+from pipelines.slam.lidar_results import covered_spans, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
-from pipelines.slam.sightings import EDGE, POLE
+from pipelines.slam.scan_landmarks import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
@@ -74,10 +73,10 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
     assert trajectory_errors(found.trajectory, truth, "start").ate < 0.7 * before
 
 
-def test_lane_edges_are_found_where_the_road_ends() -> None:
+def test_road_lines_are_found_where_the_road_ends() -> None:
     scans = SimulatedScans(0, 16, kerbs=True)
     settings = LidarSlamSettings(loop_closures=False)
-    edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == EDGE]
+    edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == LINE]
     assert len(edges) == 2
     for mark in edges:  # the lines y = KERB and y = -KERB
         truth = np.array([np.pi / 2 * np.sign(mark.state[0]), KERB])
@@ -114,7 +113,7 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Lida
     assert len(read_scan(folder / "landmarks.ply")) > 0
     landmarks = json.loads((folder / "landmarks.json").read_text())
     assert {mark["kind"] for mark in landmarks} == {"pole", "wall"}
-    assert all(mark["sightings"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
+    assert all(mark["observations"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
     covariances = np.loadtxt(folder / "covariances.csv", delimiter=",", skiprows=1)
     assert covariances.shape == (len(result.keyframes), 22)
     assert json.loads((folder / "metrics.json").read_text()) == figures

@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan
-from data_tools.simulator.scan_drive import SimulatedScans
-from data_tools.simulator.street import drive, scans, street
+from data_tools.simulator.street import SimulatedScans, drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.bench.slam import bench_slam
 from pipelines.cli import app

@@ -12,7 +12,7 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following, build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
 from saga_fg.model.road.stopping import RedLight
 
@@ -69,7 +69,7 @@ def bent_lane(turn=0.0, shift=(0.0, 0.0)):
     return table(moved, np.zeros(2), {1: points @ R.T + shift}, {1: 3.5})
 
 
-RULES = (RedLight(), InLane(), ConeEdge(), Attached(), Following(cones=ConeGeometry()))
+RULES = (RedLight(), InLane(), ConeLine(), Attached(), Following(cones=ConeGeometry()))
 
 
 def crossing(closed):

@@ -3,13 +3,14 @@
 import dataclasses
 import inspect
 import math
+from typing import Annotated
 
 import pytest
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, GreedyTracker, InputError, RandomWalk, Sensor
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from saga_fg.settings import setting, settings_group
+from saga_fg.settings import Finite, Positive, PositiveOrInf, Range, Settings, setting, settings_group
 from saga_fg.tracking import ClassSettings, ExistenceSettings, GreedySettings, TrackerSettings
 from saga_fg.types.sensor import Extrinsics, FieldOfView, NoiseModel
 
@@ -92,6 +93,35 @@ def test_groups_are_made_anew():
 def test_numbers_out_of_range_are_refused(kind, values, message):
     with pytest.raises(InputError, match=message):
         kind(**values)
+
+
+@dataclasses.dataclass(frozen=True)
+class EveryRange(Settings):
+    angle: Annotated[float, Range(0, 3, above=True)] = setting(1.0, "rad")
+    count: Annotated[int, Range(2)] = setting(2, "a number")
+    offset: Finite = setting(0.0, "m")
+    span: Annotated[tuple[float, float], Range(0, ascending=True)] = setting((0.0, 1.0), "m")
+    speed: dict[str, Positive] = settings_group(dict, "by class, m/s")
+    lag: PositiveOrInf | None = setting(None, "s")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"angle": 0.0}, "angle: expected a number above 0 to 3, got 0.0"),
+        ({"count": 1}, "count: expected a finite number >= 2, got 1"),
+        ({"offset": -math.inf}, "offset: expected a finite number, got -inf"),
+        ({"span": (-1.0, 1.0)}, "span: expected a finite number >= 0, got -1.0"),
+        ({"span": (2.0, 1.0)}, "span: expected ascending numbers, got (2.0, 1.0)"),
+        ({"speed": {"car": 0.0}}, "speed.car: expected a finite number > 0, got 0.0"),
+        ({"lag": 0.0}, "lag: expected a number > 0, got 0.0"),
+    ],
+)
+def test_a_range_is_that_of_every_entry(values, message):
+    assert EveryRange(angle=3, lag=math.inf, speed={"car": 1.0}).lag == math.inf
+    with pytest.raises(InputError) as caught:
+        EveryRange(**values)
+    assert str(caught.value) == message
 
 
 def test_scales_may_be_infinite_to_switch_a_kernel_off():

@@ -19,11 +19,11 @@ import numpy as np
 
 from data_tools.central_differences import central_differences
 from data_tools.datasets.kitti.calibration import Calibration, read_calibration
-from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
 from data_tools.datasets.kitti.detections import detection_files, read_kitti_detections
-from data_tools.datasets.kitti.labels import KittiObjects, has_box, read_kitti_labels
+from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.oxts import read_poses
 from data_tools.files.located import located, unknown
+from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform

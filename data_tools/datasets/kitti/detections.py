@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.kitti.camera_boxes import CameraBoxes
 from data_tools.files.text_tables import TextTable, read_table
+from data_tools.kitti_objects import CameraBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 

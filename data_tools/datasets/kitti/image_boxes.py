@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_tools.datasets.kitti.camera_boxes import CameraBoxes
+from data_tools.kitti_objects import CameraBoxes
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import wrap_angle
 

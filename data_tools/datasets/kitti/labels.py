@@ -9,41 +9,18 @@ of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.kitti.camera_boxes import CameraBoxes
 from data_tools.files.located import unknown
 from data_tools.files.text_tables import TextTable, read_table
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.columns import Columns
+from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 
 _IMAGE_COLUMNS = ("truncated", "occluded", "alpha", "x1", "y1", "x2", "y2")
 _BOX_COLUMNS = ("h", "w", "l", "x", "y", "z", "rotation_y", "score")
-_NO_BOX = -999.0  # positions below: the object has no 3D box
-
-
-@dataclass(frozen=True, eq=False)
-class KittiObjects(Columns):
-    """Objects of a sequence, N lines as columns, in the order of the file.
-
-    frame (N,), track_id (N,), type (N,) as in the file, truncated (N,), occluded (N,), alpha (N,), bbox (N, 4) left,
-    top, right, bottom, boxes (N), score (N,) NaN where there is none.
-    """
-
-    frame: IntArray
-    track_id: IntArray
-    type: StrArray
-    truncated: FloatArray
-    occluded: FloatArray
-    alpha: FloatArray
-    bbox: FloatArray
-    boxes: CameraBoxes
-    score: FloatArray
 
 
 def read_kitti_labels(path: str | Path) -> KittiObjects:
@@ -82,8 +59,3 @@ def _check(table: TextTable, objects: KittiObjects) -> None:
         row = int(np.setdiff1d(np.arange(len(tracked)), first)[0])
         frame, id_ = pairs[row].tolist()
         raise table.fault(int(tracked[row]), f"id: expected each track once a frame, {id_} is in frame {frame} again")
-
-
-def has_box(objects: KittiObjects) -> BoolArray:
-    """Which objects (N,) have a 3D box; `DontCare` regions and results of image trackers have none."""
-    return np.asarray((objects.type != "DontCare") & (objects.boxes.location > _NO_BOX).all(axis=1))

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows, read_tracks
-from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD, KittiTracking
-from data_tools.datasets.kitti.labels import KittiObjects, has_box, read_kitti_labels
+from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
 from data_tools.files.located import located
+from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.metrics.track_table import TrackTable
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray

@@ -19,12 +19,12 @@ import numpy as np
 
 from data_tools.datasets.detection_files import write_tracks
 from data_tools.datasets.kitti.calibration import Calibration
-from data_tools.datasets.kitti.camera_boxes import world_boxes_to_camera
 from data_tools.datasets.kitti.dataset import KittiTracking
 from data_tools.datasets.kitti.image_boxes import image_boxes, observation_angles
 from data_tools.datasets.kitti.labels import TYPES
 from data_tools.files.atomic_files import atomic_directory
 from data_tools.files.located import located, unknown
+from data_tools.kitti_objects import world_boxes_to_camera
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
-from data_tools.datasets.kitti.labels import KittiObjects
+from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 

@@ -18,8 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from data_tools.datasets.kitti.camera_boxes import camera_boxes_to_world
-from data_tools.datasets.kitti.labels import KittiObjects, has_box
+from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.metrics.hota import Compared, HotaFigures, box_similarities, compared_figures
 from data_tools.metrics.kitti_tracking.class_rows import (
     NEIGHBOUR,

@@ -1,7 +1,6 @@
-"""Edges of lanes and of the road: curbs, border lines. A straight line on the ground, (theta, rho): n . x = rho.
+"""Lines on the road: curbs, borders of lanes. A straight line on the ground, (theta, rho): n . x = rho.
 
-A bend is a chain of such edges, each as long as it is straight; what is seen farther along the same line is the same
-edge.
+A bend is a chain of such lines, each as long as it is straight.
 """
 
 from __future__ import annotations
@@ -10,23 +9,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import HesseLine, ResidualFactors, SpatialPose, edge_factors
+from factors import HesseLine, ResidualFactors, SpatialPose, line_factors
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class LaneEdgeLandmark:
-    """An edge, observed as the two ends (6,) of the piece seen, in the frame of the pose; its noise is that of the two
-    ends across the edge, m.
+class LineLandmark(Settings):
+    """A line, observed as the two ends (6,) of the piece seen, in the frame of the pose; its noise is that of the two
+    ends across the line, m.
     """
 
-    name: str = setting("lane edge", "what it is called in files")
-    density: float = setting(0.2, "landmarks per rad m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "density")
+    name: str = setting("road line", "what it is called in files")
+    density: Positive = setting(0.2, "landmarks per rad m")
 
     @property
     def pose(self) -> SpatialPose:
@@ -37,7 +33,7 @@ class LaneEdgeLandmark:
         return HesseLine()
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
-        return [edge_factors(rows, observed.reshape(-1, 2, 3), covariances)]
+        return [line_factors(rows, observed.reshape(-1, 2, 3), covariances)]
 
     def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
         first, second = (observed.reshape(2, 3) @ world_T_pose[:3, :3].T + world_T_pose[:3, 3])[:, :2]

@@ -11,18 +11,15 @@ import gtsam
 
 from factors import OrientedPlane, SpatialPose, plane, plane_factor
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class PlaneLandmark:
+class PlaneLandmark(Settings):
     """A plane, observed as (n, d) (4,) in the frame of the pose; its noise is that of two turns (rad) and d (m)."""
 
     name: str = setting("plane", "what it is called in files")
-    density: float = setting(0.05, "landmarks per rad^2 m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "density")
+    density: Positive = setting(0.05, "landmarks per rad^2 m")
 
     @property
     def pose(self) -> SpatialPose:

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 from factors import PlanarPose, ResidualFactors, SpatialPose, Vector, point_factors
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class PointLandmark:
+class PointLandmark(Settings):
     """A point, observed as its place (dim,) in the frame of the pose."""
 
     dim: int = setting(2, "2 in the plane, 3 in space")
     name: str = setting("point", "what it is called in files")
-    density: float = setting(0.02, "landmarks per m^2, or m^3")
+    density: Positive = setting(0.02, "landmarks per m^2, or m^3")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.dim not in (2, 3):
             raise InputError(f"dim: expected 2 or 3, got {self.dim!r}")
-        require_positive(self, "density")
 
     @property
     def pose(self) -> PlanarPose | SpatialPose:

@@ -6,18 +6,15 @@ from dataclasses import dataclass
 
 from factors import ResidualFactors, SpatialPose, Vector, relative_detection_factors
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class PoleLandmark:
+class PoleLandmark(Settings):
     """A pole, observed as a point (3,) on it in the frame of the pose; its noise is that ahead and to the left."""
 
     name: str = setting("pole", "what it is called in files")
-    density: float = setting(0.02, "landmarks per m^2")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "density")
+    density: Positive = setting(0.02, "landmarks per m^2")
 
     @property
     def pose(self) -> SpatialPose:

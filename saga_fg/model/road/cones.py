@@ -1,34 +1,38 @@
-r"""Cones and barriers form a temporary edge of the lane, which pushes vehicles aside.
+r"""Cones and barriers form a temporary border of the lane, which pushes vehicles aside.
 
-A driver looks ahead by L = preview * speed along the edge (`saga_fg.model.cone_geometry`), and drives to where he will
-just clear it there. The two cones about a = L act, with the weights of linear interpolation w_k in their rates:
+A driver looks ahead by L = preview * speed along their line (`saga_fg.model.cone_geometry`), and drives to where he
+will just clear it there. The two cones about a = L act, with the weights of linear interpolation w_k in their rates:
 
     dv_i/dt += rate w_k n ( ( n.(p_k - p_i) + m c ) / preview - n.v_i )         n across the vehicle's heading
 
-    rate = rate exp( -min(demand(L), 0)^2 / (2 band^2) )          who is clear of the edge by far is left alone
+    rate = rate exp( -min(demand(L), 0)^2 / (2 band^2) )          0 for a vehicle well clear of the line
 
-A vehicle that the edge pushes out of its lane will drive behind, and ahead of, those of the lane beside: see the
-setting `cones` of the rule `following`.
+The setting `cones` of the rule `following` lets a vehicle that is pushed out of its lane follow, and lead, vehicles of
+the lane beside it.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.model.cone_geometry import MIN_SPEED, ConeGeometry, edge_before
+from saga_fg.model.cone_geometry import MIN_SPEED, ConeGeometry, cones_ahead
 from saga_fg.model.edge_rules import VEHICLES, Pairs
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import IntArray, of_classes
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import (
+    NonNegative,
+    PositiveOrInf,
+    setting,
+    settings_group,
+)
 
 
 @dataclass(frozen=True)
 class PassCones:
-    """Driving to where the edge of cones is just cleared; the source is a cone."""
+    """Driving to where the line of cones is just cleared; the source is a cone."""
 
     geometry: ConeGeometry
 
@@ -37,7 +41,7 @@ class PassCones:
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         vehicles, number = np.unique(target, return_inverse=True)
-        side = edge_before(nodes, vehicles, self.geometry).side[number]
+        side = cones_ahead(nodes, vehicles, self.geometry).side[number]
         u = unit(nodes.heading[target])
         n = np.stack([-u[:, 1], u[:, 0]], axis=-1)
         p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
@@ -53,17 +57,13 @@ class PassCones:
 
 
 @dataclass(frozen=True)
-class ConeEdge:
-    """Vehicles before an edge of cones pass it, and keep to it."""
+class ConeLine:
+    """Vehicles ahead of which cones form a line pass it on its free side."""
 
     cones: ConeGeometry = settings_group(ConeGeometry, "which cones concern a vehicle, and how it passes them")
-    rate: float = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
-    band: float = setting(0.5, "sigma of the kernel on the distance from where the edge is just cleared, m")
+    rate: NonNegative = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
+    band: PositiveOrInf = setting(0.5, "sigma of the kernel on the distance from where the line is just cleared, m")
     vehicles: tuple[str, ...] = setting(VEHICLES, "classes that are pushed")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate")
-        require_positive(self, "band", infinite=True)
 
     @property
     def interaction(self) -> PassCones:
@@ -75,20 +75,20 @@ class ConeEdge:
         none = Pairs(vehicles[:0], vehicles[:0], np.empty(0))
         if len(vehicles) == 0 or not of_classes(nodes.label, self.cones.classes).any():
             return none
-        edge = edge_before(nodes, vehicles, self.cones)
-        distance = self.cones.preview * edge.speed
-        before = (edge.known & (edge.ahead <= distance[:, None])).sum(axis=1)  # cones up to where the driver looks
-        count = edge.known.sum(axis=1)
-        # beyond the last cone the edge goes on as it ends; before the first there is none
-        rows = np.flatnonzero((before > 0) & (edge.speed > MIN_SPEED))
+        line = cones_ahead(nodes, vehicles, self.cones)
+        distance = self.cones.preview * line.speed
+        before = (line.known & (line.ahead <= distance[:, None])).sum(axis=1)  # cones up to where the driver looks
+        count = line.known.sum(axis=1)
+        # beyond the last cone the line goes on as it ends; before the first there is none
+        rows = np.flatnonzero((before > 0) & (line.speed > MIN_SPEED))
         near, far = before[rows] - 1, np.minimum(before[rows], count[rows] - 1)
-        gap = np.maximum(edge.ahead[rows, far] - edge.ahead[rows, near], 1e-9)
-        share = np.where(far > near, (distance[rows] - edge.ahead[rows, near]) / gap, 0.0)
-        demand = (1 - share) * edge.demand[rows, near] + share * edge.demand[rows, far]
+        gap = np.maximum(line.ahead[rows, far] - line.ahead[rows, near], 1e-9)
+        share = np.where(far > near, (distance[rows] - line.ahead[rows, near]) / gap, 0.0)
+        demand = (1 - share) * line.demand[rows, near] + share * line.demand[rows, far]
         rate = self.rate * np.exp(-((np.minimum(demand, 0.0) / self.band) ** 2) / 2)
         apart = far > near
         return Pairs(
             vehicles[np.concatenate([rows, rows[apart]])],
-            np.concatenate([edge.row[rows, near], edge.row[rows[apart], far[apart]]]),
+            np.concatenate([line.row[rows, near], line.row[rows[apart], far[apart]]]),
             np.concatenate([rate * (1 - share), (rate * share)[apart]]),
         )

@@ -10,7 +10,6 @@ state.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,22 +20,26 @@ from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, n
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.polyline import direction_at, feet, on_it
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import (
+    NonNegative,
+    PositiveOrInf,
+    Settings,
+    setting,
+    settings_group,
+)
 from saga_fg.types.road_map import LANE
 
 PUSHED = 0.5  # m aside, from which cones decide and no longer the lane
 
 
 @dataclass(frozen=True)
-class KeepLane:
+class KeepLane(Settings):
     """Attraction to the centre line of a lane and to its direction; the source is the lane."""
 
-    offset_time: float = setting(3.0, "tau: time over which an offset from the centre is made good, s; .inf for never")
-    lag: float = setting(0.5, "time that vehicles look ahead along the lane, s")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "offset_time", infinite=True)
-        require_between(self, 0, math.inf, "lag")
+    offset_time: PositiveOrInf = setting(
+        3.0, "tau: time over which an offset from the centre is made good, s; .inf for never"
+    )
+    lag: NonNegative = setting(0.5, "time that vehicles look ahead along the lane, s")
 
     def applies(self, target: NodeType, source: NodeType) -> bool:
         return target.has(POSITION + VELOCITY) and source.has(POSITION)
@@ -63,20 +66,18 @@ class KeepLane:
 
 
 @dataclass(frozen=True)
-class InLane:
+class InLane(Settings):
     """A vehicle that drives along a lane of the map, within its borders, keeps it."""
 
     interaction: KeepLane = settings_group(KeepLane, "interaction function of the edges")
-    rate: float = setting(2.0, "strength of an edge, 1/s")
-    drift_scale: float = setting(0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go")
+    rate: NonNegative = setting(2.0, "strength of an edge, 1/s")
+    drift_scale: PositiveOrInf = setting(
+        0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go"
+    )
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
     cones: ConeGeometry | None = settings_group(
         lambda: None, "who is pushed out of the lane by cones does not keep it; null: cones play no part"
     )
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate")
-        require_positive(self, "drift_scale", infinite=True)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = of_classes(nodes.label, self.classes)

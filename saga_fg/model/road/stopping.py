@@ -34,7 +34,7 @@ from saga_fg.model.nonlinear_interactions import Accelerations, smooth_accelerat
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.numerics.polyline import feet, on_it
-from saga_fg.settings import require_between, require_positive, setting, settings_group
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.types.road_map import LANE, STOP_LINE
 
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
@@ -78,15 +78,11 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
 
 
 @dataclass(frozen=True)
-class Stopping:
+class Stopping(Settings):
     """Even deceleration to a halt before a line; the source is the line."""
 
-    time_constant: float = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
-    margin: float = setting(3.0, "way left between the front of a vehicle and the line's middle at the halt, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "time_constant")
-        require_between(self, 0, math.inf, "margin")
+    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
+    margin: NonNegative = setting(3.0, "way left between the front of a vehicle and the line's middle at the halt, m")
 
     def applies(self, target: NodeType, source: NodeType) -> bool:
         return target.has(POSITION + VELOCITY) and source.has(POSITION)
@@ -160,22 +156,18 @@ class SmoothStopping:
 
 
 @dataclass(frozen=True)
-class RedLight:
+class RedLight(Settings):
     """The first vehicle that comes to a closed stop line, and can stop, does."""
 
     interaction: Stopping | DriverStopping | SmoothStopping = settings_group(
         Stopping, "interaction function of the edges"
     )
-    rate: float = setting(1.0, "strength of an edge of a vehicle that brakes for a line surely closed, 1/s")
-    max_distance: float = setting(100.0, "nobody brakes for a line further away, m")
-    noticed: float = setting(0.3, "needed deceleration from which drivers begin to react, m/s^2")
-    firm: float = setting(1.0, "needed deceleration from which they brake as much as is needed, m/s^2")
-    hardest: float = setting(4.5, "who would have to brake harder does not stop, m/s^2")
+    rate: NonNegative = setting(1.0, "strength of an edge of a vehicle that brakes for a line surely closed, 1/s")
+    max_distance: NonNegative = setting(100.0, "nobody brakes for a line further away, m")
+    noticed: NonNegative = setting(0.3, "needed deceleration from which drivers begin to react, m/s^2")
+    firm: Positive = setting(1.0, "needed deceleration from which they brake as much as is needed, m/s^2")
+    hardest: Positive = setting(4.5, "who would have to brake harder does not stop, m/s^2")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0, math.inf, "rate", "max_distance", "noticed")
-        require_positive(self, "firm", "hardest")
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         lines = np.flatnonzero(nodes.label == STOP_LINE)

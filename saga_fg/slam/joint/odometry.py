@@ -21,27 +21,25 @@ from factors import ERROR_DIM
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
-from saga_fg.settings import require_positive, setting
+from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class OdometryNoise:
+class OdometryNoise(Settings):
     """How good an odometry is: standard deviations."""
 
-    turn_noise: float = setting(0.01, "heading, rad after one second")
-    tilt_noise: float = setting(0.001, "roll and pitch, which gravity tells, rad after one second")
-    distance_noise: float = setting(0.03, "translation, m after one metre")
-    time_noise: float = setting(0.01, "translation, m after one second")
-    scale: float = setting(0.02, "scale of distances at the start")
-    scale_drift: float = setting(0.002, "change of the scale after one second")
-    bias: float = setting(0.005, "bias of the yaw rate at the start, rad/s")
-    bias_drift: float = setting(0.0005, "change of the bias after one second, rad/s")
-    course: float = setting(0.01, "direction of travel against the axes in which objects are seen, at the start, rad")
-    course_drift: float = setting(0.0003, "change of that after one second, rad")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "turn_noise", "tilt_noise", "distance_noise", "time_noise")
-        require_positive(self, "scale", "scale_drift", "bias", "bias_drift", "course", "course_drift")
+    turn_noise: Positive = setting(0.01, "heading, rad after one second")
+    tilt_noise: Positive = setting(0.001, "roll and pitch, which gravity tells, rad after one second")
+    distance_noise: Positive = setting(0.03, "translation, m after one metre")
+    time_noise: Positive = setting(0.01, "translation, m after one second")
+    scale: Positive = setting(0.02, "scale of distances at the start")
+    scale_drift: Positive = setting(0.002, "change of the scale after one second")
+    bias: Positive = setting(0.005, "bias of the yaw rate at the start, rad/s")
+    bias_drift: Positive = setting(0.0005, "change of the bias after one second, rad/s")
+    course: Positive = setting(
+        0.01, "direction of travel against the axes in which objects are seen, at the start, rad"
+    )
+    course_drift: Positive = setting(0.0003, "change of that after one second, rad")
 
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
         """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.

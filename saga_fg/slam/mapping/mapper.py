@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from saga_fg.estimators.graph_engine import RelinearisationSettings
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import require_between, setting
+from saga_fg.settings import Range, Settings, setting
 from saga_fg.slam.mapping.association import associate
 from saga_fg.slam.mapping.joint_estimate import JointEstimate
 from saga_fg.slam.mapping.merging import duplicates
@@ -39,17 +39,19 @@ _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 
 @dataclass(frozen=True)
-class MapperSettings:
+class MapperSettings(Settings):
     """How landmarks are told apart."""
 
-    gate: float = setting(0.999, "share of the true pairs that the gate of association lets through")
-    merge: float = setting(1 - 1e-6, "the same of merging; near to 1, as what begins a duplicate is an outlier")
-    smooth_every: int = setting(100, "observations between two smoothings of the whole graph")
-    confirm: int = setting(2, "observations that make a landmark certain")
-
-    def __post_init__(self) -> None:
-        require_between(self, 0.5, 1 - 1e-9, "gate", "merge")
-        require_between(self, 1, 10**9, "smooth_every", "confirm")
+    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
+        0.999, "share of the true pairs that the gate of association lets through"
+    )
+    merge: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
+        1 - 1e-6, "the same of merging; near to 1, as what begins a duplicate is an outlier"
+    )
+    smooth_every: Annotated[int, Range(1, 10**9)] = setting(
+        100, "observations between two smoothings of the whole graph"
+    )
+    confirm: Annotated[int, Range(1, 10**9)] = setting(2, "observations that make a landmark certain")
 
 
 @dataclass(frozen=True, eq=False)

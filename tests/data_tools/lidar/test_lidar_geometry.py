@@ -21,7 +21,7 @@ from data_tools.lidar import (
 )
 from data_tools.lidar.clusters import l_shape_heading
 from data_tools.lidar.components import connected_from_above
-from data_tools.simulator.scanner import ScannerSettings, StandingWorld, simulate_scan
+from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
 from data_tools.simulator.street import KERB, SENSOR_HEIGHT, street
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import transform_points, yaw_transform
@@ -31,7 +31,7 @@ FINE = ScannerSettings(rings=48, columns=1000)
 NO_POLES = np.empty((0, 4))
 
 
-def seen(world: StandingWorld, seed: int = 0, pose: np.ndarray | None = None) -> Scan:
+def seen(world: StaticWorld, seed: int = 0, pose: np.ndarray | None = None) -> Scan:
     pose = yaw_transform(0.0, 0.0, SENSOR_HEIGHT, 0.0) if pose is None else pose
     return simulate_scan(world, pose, np.random.default_rng(seed), FINE)
 
@@ -55,7 +55,7 @@ def test_ground_is_what_lies_at_height_zero(seed: int) -> None:
 
 def test_ground_follows_a_slope() -> None:
     """A road that rises by 8 % from 15 m on: no line of sight knows it in advance."""
-    scan = seen(StandingWorld(Boxes.empty(), NO_POLES))
+    scan = seen(StaticWorld(Boxes.empty(), NO_POLES))
     points = scan.points.copy()
     points[:, 2] += 0.08 * np.maximum(points[:, 0] - 15.0, 0.0)
     ground = segment_ground(points)
@@ -111,7 +111,7 @@ def test_walls_are_the_fronts_of_houses(seed: int) -> None:
 
 def test_poles_are_found_where_they_stand() -> None:
     poles = np.array([[10.0, 4.0, 0.1, 4.0], [-8.0, 6.0, 0.15, 3.0], [15.0, -7.0, 0.2, 5.0]])
-    world = StandingWorld(boxes((5.0, -5.0, 0.75, 4.4, 1.8, 1.5, 0.0), (0.0, 14.0, 3.0, 30.0, 2.0, 6.0, 0.0)), poles)
+    world = StaticWorld(boxes((5.0, -5.0, 0.75, 4.4, 1.8, 1.5, 0.0), (0.0, 14.0, 3.0, 30.0, 2.0, 6.0, 0.0)), poles)
     squares = []
     for seed in range(4):
         points = seen(world, seed).points
@@ -128,7 +128,7 @@ def test_poles_are_found_where_they_stand() -> None:
 
 
 def test_curbs_are_the_edges_of_the_road() -> None:
-    world = StandingWorld(
+    world = StaticWorld(
         boxes((0.0, 8.0, 0.07, 80.0, 8.0, 0.14, 0.0), (0.0, -9.0, 0.07, 80.0, 8.0, 0.14, 0.0)), NO_POLES
     )
     points = seen(world).points
@@ -137,7 +137,7 @@ def test_curbs_are_the_edges_of_the_road() -> None:
     assert len(ahead) > 20
     off = np.minimum(np.abs(ahead[:, 1] - 4.0), np.abs(ahead[:, 1] + 5.0))
     assert np.mean(off < 0.4) > 0.9
-    flat = seen(StandingWorld(Boxes.empty(), NO_POLES)).points
+    flat = seen(StaticWorld(Boxes.empty(), NO_POLES)).points
     assert len(extract_curbs(flat, segment_ground(flat).height)) == 0
 
 

@@ -22,7 +22,7 @@ from data_tools.lidar import (
     voxel_downsample,
     voxel_keys,
 )
-from data_tools.simulator.scanner import StandingWorld
+from data_tools.simulator.scanner import StaticWorld
 from data_tools.simulator.street import drive, scans, street
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
@@ -68,7 +68,7 @@ def test_deskew_needs_times_and_azimuths_give_them() -> None:
 
 
 def test_deskewed_scans_show_straight_walls() -> None:
-    wall = StandingWorld(
+    wall = StaticWorld(
         Boxes.of(["wall"], [(0.0, 10.0, 5.0)], [(60.0, 1.0, 10.0)], [0.0], [(0.0, 0.0)]), np.empty((0, 4))
     )
     poses = np.array([yaw_transform(0, 0, 2.0), yaw_transform(0.5, 0.3, 2.0, 0.03)])

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.datasets.kitti.camera_boxes import CameraBoxes
-from data_tools.datasets.kitti.labels import KittiObjects, read_kitti_labels
+from data_tools.datasets.kitti.labels import read_kitti_labels
+from data_tools.kitti_objects import CameraBoxes, KittiObjects
 from data_tools.metrics import KittiTrackingSequence, kitti_tracking_figures
 from data_tools.metrics.kitti_tracking.track_scores import track_scores
 from data_tools.metrics.kitti_tracking.trajectories import trajectory_figures

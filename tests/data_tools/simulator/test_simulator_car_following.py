@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.simulator.disturbances import SlowZone, StopLine, draw_intervals
-from data_tools.simulator.fleet import CAR, KINDS, Fleet
-from data_tools.simulator.idm import (
+from data_tools.simulator.disturbances import SlowZone, StopLine, sample_intervals
+from data_tools.simulator.driver_models import (
     HARDEST_BRAKING,
     Drivers,
     equilibrium_gap,
     following_acceleration,
     free_acceleration,
 )
+from data_tools.simulator.fleet import CAR, KINDS, Fleet
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import curved_road
 from data_tools.simulator.settings import DriverSettings
-from data_tools.simulator.traffic import Traffic, drive
+from data_tools.simulator.traffic import Traffic, record_traffic
 from saga_fg.numerics.arrays import FloatArray
 
 SMOOTH = DriverSettings(acceleration_noise=0.0, reaction_time=0.0)
@@ -92,7 +92,7 @@ def test_followers_settle_at_the_equilibrium_gap_of_a_steady_leader() -> None:
 
 def test_a_slow_down_runs_backwards_through_the_queue_as_a_wave() -> None:
     zone = SlowZone(np.array([0]), 1010.0, 1100.0, 2.0, np.array([[0.0, 8.0]]))
-    history = drive(queue(12, 10.0, slow_zones=(zone,)), 600)
+    history = record_traffic(queue(12, 10.0, slow_zones=(zone,)), 600)
     lowest = history.speed.argmin(axis=0)
     when, where = history.time[lowest], history.s[lowest, np.arange(12)]
     in_wave = slice(2, 10)  # the first two meet the slow zone itself
@@ -105,7 +105,7 @@ def test_a_slow_down_runs_backwards_through_the_queue_as_a_wave() -> None:
 
 def test_a_red_light_stops_the_queue_before_the_line_and_green_lets_it_go() -> None:
     line = StopLine(np.array([0]), 1100.0, np.array([[0.0, 40.0]]))
-    history = drive(queue(8, 10.0, stop_lines=(line,)), 1600)
+    history = record_traffic(queue(8, 10.0, stop_lines=(line,)), 1600)
     half = KINDS[CAR].size[0] / 2
     red = history.time < 40.0
     assert (history.s[red] + half < 1100.0).all()
@@ -116,7 +116,7 @@ def test_a_red_light_stops_the_queue_before_the_line_and_green_lets_it_go() -> N
 
 def test_who_cannot_stop_any_more_passes_the_light() -> None:
     line = StopLine(np.array([0]), 1012.0, np.array([[0.0, 40.0]]))
-    history = drive(queue(3, 12.0, stop_lines=(line,)), 600)
+    history = record_traffic(queue(3, 12.0, stop_lines=(line,)), 600)
     assert history.s[-1, 0] > 1100.0  # was 10 m before the line
     assert history.s[-1, 1] < 1012.0
     assert np.diff(history.speed, axis=0).min() / 0.05 > -6.0
@@ -125,10 +125,10 @@ def test_who_cannot_stop_any_more_passes_the_light() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_reaction_time_and_noise_cause_no_collision(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    active = draw_intervals((4.0, 8.0), (4.0, 8.0), 60.0, rng)
+    active = sample_intervals((4.0, 8.0), (4.0, 8.0), 60.0, rng)
     zone = SlowZone(np.array([0]), 900.0, 1500.0, 1.0, active)
     settings = DriverSettings(acceleration_noise=0.4, reaction_time=0.4)
-    history = drive(queue(15, 11.0, settings, slow_zones=(zone,)), 1200)
+    history = record_traffic(queue(15, 11.0, settings, slow_zones=(zone,)), 1200)
     gap = history.s[:, :-1] - history.s[:, 1:] - KINDS[CAR].size[0]
     assert gap.min() > 0.3
     assert history.speed.min() >= 0.0
@@ -136,7 +136,7 @@ def test_reaction_time_and_noise_cause_no_collision(seed: int) -> None:
 
 def test_intervals_alternate_and_cover_the_time() -> None:
     for seed in range(20):
-        intervals: FloatArray = draw_intervals((3.0, 5.0), (2.0, 4.0), 50.0, np.random.default_rng(seed))
+        intervals: FloatArray = sample_intervals((3.0, 5.0), (2.0, 4.0), 50.0, np.random.default_rng(seed))
         on, off = intervals[:, 1] - intervals[:, 0], intervals[1:, 0] - intervals[:-1, 1]
         assert ((on >= 3) & (on <= 5)).all()
         assert ((off >= 2) & (off <= 4)).all()

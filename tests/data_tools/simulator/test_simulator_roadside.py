@@ -10,7 +10,7 @@ import pytest
 
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.scenarios import SCENARIOS, ScenarioName, scenario_settings
-from data_tools.simulator.scene import scene_in
+from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.settings import (
     CyclistSettings,
     LightSettings,
@@ -44,7 +44,7 @@ def test_by_default_there_is_nothing_new() -> None:
 
 def test_colours_are_reported_as_often_rightly_as_the_camera_can() -> None:
     here = world("red-light")
-    scene = scene_in(here, settings("red-light"), 3)
+    scene = scene_from_world(here, settings("red-light"), 3)
     offset = scene.timestamps[0] - here.start
     right = total = 0
     for frame in scene.frames:
@@ -52,7 +52,7 @@ def test_colours_are_reported_as_often_rightly_as_the_camera_can() -> None:
         labels = frame.detections.boxes.label
         for row in np.flatnonzero(np.isin(labels, SIGHTINGS)).tolist():
             assert frame.sensor == "camera"
-            distance = [np.hypot(*(s.place - frame.detections.boxes.position[row, :2])) for s in here.signals]
+            distance = [np.hypot(*(s.position - frame.detections.boxes.position[row, :2])) for s in here.signals]
             nearest = here.signals[int(np.argmin(distance))]
             right += labels[row] == f"traffic_light_{nearest.colour(frame.timestamp - offset)}"
             total += 1
@@ -64,9 +64,9 @@ def test_a_map_tells_which_lanes_a_light_stops() -> None:
     """Every stop line lies across the lanes it closes, and its travellers go the way it looks."""
     here = world("red-light")
     assert here.road_map is not None
-    lanes = here.scenario.lanes
+    lanes = here.layout.lanes
     mapped = {line.name: line for line in here.road_map.stop_lines}
-    lines = [(n, line) for n, line in enumerate(here.scenario.stop_lines) if len(line.lanes)]
+    lines = [(n, line) for n, line in enumerate(here.layout.stop_lines) if len(line.lanes)]
     assert len(mapped) == len(lines)
     for number, line in lines:
         found = mapped[f"line-{number}"]
@@ -90,12 +90,12 @@ def test_amber_comes_before_red_and_green_after() -> None:
 @pytest.mark.parametrize("seed", [3, 4])
 def test_cones_push_the_traffic_of_their_lane_into_the_one_beside(seed: int) -> None:
     here = world("road-works", seed)
-    lanes, history = here.scenario.lanes, here.history
+    lanes, history = here.layout.lanes, here.history
     pushed = np.flatnonzero(history.lane[0] == lanes.ending)
     for row in pushed.tolist():
         past = history.s[:, row] >= lanes.end
         assert (history.lane[past, row] != lanes.ending).all()
-        assert np.allclose(history.offset[past, row][:1], lanes.offset[lanes.beside])
+        assert np.allclose(history.offset[past, row][:1], lanes.offset[lanes.adjacent])
         assert np.abs(np.diff(history.offset[:, row])).max(initial=0) < 0.25  # m in a twentieth of a second
     cones = here.objects.select(np.flatnonzero(here.objects.label == "traffic_cone"))
     assert len(cones) > 8
@@ -144,7 +144,7 @@ def test_riders_sit_on_their_bicycles() -> None:
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_scene_is_the_same_for_the_same_seed(name: ScenarioName) -> None:
     short = replace(scenario_settings(name), duration=0.5, warm_up=2.0)
-    one, other = (scene_in(build_world(short, 5), short, 5) for _ in range(2))
+    one, other = (scene_from_world(build_world(short, 5), short, 5) for _ in range(2))
     for a, b in zip(one.frames, other.frames, strict=True):
         assert np.array_equal(a.detections.boxes.position, b.detections.boxes.position)
         assert a.road_map == b.road_map

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from data_tools.lidar import deskewed
-from data_tools.simulator.scanner import ScannerSettings, StandingWorld, ranges, simulate_scan
+from data_tools.simulator.scanner import ScannerSettings, StaticWorld, ranges, simulate_scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
 
 NOTHING = Boxes.empty()
-WORLD = StandingWorld(
+WORLD = StaticWorld(
     Boxes.of(["car"], [(10.0, 0.0, 1.0)], [(4.0, 2.0, 2.0)], [np.pi / 2], [(0.0, 0.0)]),
     np.array([[0.0, 5.0, 0.5, 3.0]]),
 )
@@ -36,7 +36,7 @@ def test_ranges_are_those_of_geometry(direction: tuple[float, float, float], exp
 def test_scans_repeat_with_their_seed_and_have_the_noise_asked_for() -> None:
     settings = ScannerSettings(noise=0.05)
     pose = yaw_transform(z=2.0)
-    world = StandingWorld(NOTHING, np.empty((0, 4)))
+    world = StaticWorld(NOTHING, np.empty((0, 4)))
     a, b, c = (simulate_scan(world, pose, np.random.default_rng(seed), settings) for seed in (1, 1, 2))
     np.testing.assert_array_equal(a.points, b.points)
     assert not np.array_equal(a.points, c.points)
@@ -59,4 +59,4 @@ def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match="rings: expected"):
         ScannerSettings(rings=0)
     with pytest.raises(InputError, match=r"poles: expected shape \(any, 4\)"):
-        StandingWorld(NOTHING, np.zeros((1, 3)))
+        StaticWorld(NOTHING, np.zeros((1, 3)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, camera, lidar, simulate_scene
-from data_tools.simulator.annotation import lasting, remembered
+from data_tools.simulator.annotation import recently_visible, without_short_runs
 from data_tools.simulator.world import build_world
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
@@ -156,19 +156,19 @@ def test_objects_are_remembered_for_a_while() -> None:
     time = np.arange(7.0) / 2
     visible = np.array([[0, 1, 0, 0, 0, 0, 1], [1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
     expected = np.array([[0, 1, 1, 1, 0, 0, 1], [1, 1, 1, 1, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
-    assert np.array_equal(remembered(time, visible, 1.0), expected)
-    assert np.array_equal(remembered(time, visible, 0.0), visible)
-    assert remembered(time, visible, 9.0)[:, 0].tolist() == [False] + 6 * [True]
+    assert np.array_equal(recently_visible(time, visible, 1.0), expected)
+    assert np.array_equal(recently_visible(time, visible, 0.0), visible)
+    assert recently_visible(time, visible, 9.0)[:, 0].tolist() == [False] + 6 * [True]
 
 
 def test_glimpses_are_no_sightings() -> None:
     visible = np.array([[1, 0, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 1, 0]], dtype=np.bool_).T
     two = np.array([[0, 0, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 0, 0]], dtype=np.bool_).T
     three = np.array([[0, 0, 0, 0, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 0, 0]], dtype=np.bool_).T
-    assert np.array_equal(lasting(visible, 1), visible)
-    assert np.array_equal(lasting(visible, 2), two)
-    assert np.array_equal(lasting(visible, 3), three)
-    assert not lasting(visible, 9).any()
+    assert np.array_equal(without_short_runs(visible, 1), visible)
+    assert np.array_equal(without_short_runs(visible, 2), two)
+    assert np.array_equal(without_short_runs(visible, 3), three)
+    assert not without_short_runs(visible, 9).any()
 
 
 def test_the_dataset_makes_its_scenes_on_demand() -> None:

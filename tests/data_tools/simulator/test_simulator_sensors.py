@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_tools.simulator.sensors import detection_probability, in_view, observe
+from data_tools.simulator.sensors import detect, detection_probability, in_view
 from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -32,7 +32,7 @@ def cars(ego_positions: FloatArray) -> Boxes:
 
 def detections(sensor: SensorSettings, boxes: Boxes, share: float = 1.0, frames: int = 200) -> list[Detections]:
     rng = np.random.default_rng(7)
-    return [observe(sensor, POSE, boxes, np.full(len(boxes), share), rng) for _ in range(frames)]
+    return [detect(sensor, POSE, boxes, np.full(len(boxes), share), rng) for _ in range(frames)]
 
 
 def within(value: float, expected: float, standard_error: float) -> bool:
@@ -118,9 +118,9 @@ def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> N
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"rate": 0.0}, "rate: expected a positive number"),
-        ({"field_of_view": 7.0}, "field_of_view: expected an angle"),
-        ({"detection_probability": 1.2}, "detection_probability: expected a share"),
+        ({"rate": 0.0}, "rate: expected a finite number > 0"),
+        ({"field_of_view": 7.0}, "field_of_view: expected a number above 0 to 6.28"),
+        ({"detection_probability": 1.2}, "detection_probability: expected a number from 0 to 1"),
         ({"hidden_share": 0.6}, "clear_share: expected more than hidden_share"),
     ],
 )

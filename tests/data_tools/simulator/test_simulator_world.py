@@ -8,11 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from data_tools.simulator.pedestrians import walk
+from data_tools.simulator.pedestrians import simulate_pedestrians
 from data_tools.simulator.road import curved_road
-from data_tools.simulator.scenario import draw_scenario
+from data_tools.simulator.scene_layout import sample_layout
 from data_tools.simulator.settings import PedestrianSettings, RoadSettings, SimulatorSettings
-from data_tools.simulator.trajectories import Trajectories, standing
+from data_tools.simulator.trajectories import Trajectories, static_objects
 from data_tools.simulator.world import World, build_world, simulate_traffic
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -78,7 +78,7 @@ def test_traffic_merges_out_of_the_lane_that_ends() -> None:
     merged = 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        scenario = draw_scenario(MERGES, rng)
+        scenario = sample_layout(MERGES, rng)
         history = simulate_traffic(scenario, MERGES, rng)
         in_ending = history.lane == scenario.lanes.ending
         front = history.s + scenario.fleet.length / 2
@@ -92,7 +92,7 @@ def test_vehicles_between_lanes_change_their_offset_gradually() -> None:
     changes = 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        scenario = draw_scenario(MERGES, rng)
+        scenario = sample_layout(MERGES, rng)
         history = simulate_traffic(scenario, MERGES, rng)
         changes += int((np.diff(history.lane, axis=0) != 0).sum())
         sideways = np.abs(np.diff(history.offset, axis=0))
@@ -104,7 +104,7 @@ def test_every_scene_has_queues_that_stop_and_go() -> None:
     ranges = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        scenario = draw_scenario(SETTINGS, rng)
+        scenario = sample_layout(SETTINGS, rng)
         history = simulate_traffic(scenario, SETTINGS, rng)
         near = (np.abs(history.s[0] - scenario.focus) < 120) & history.on_road[-1]
         speed = history.speed[:, near]
@@ -128,7 +128,7 @@ def test_the_ego_vehicle_is_a_car_in_traffic_and_no_object() -> None:
 def people(settings: PedestrianSettings, seed: int = 0) -> Trajectories:
     road = curved_road(1000.0, [], np.zeros(2), 0.0)
     time = 0.05 * np.arange(800)
-    return walk(road, [(-9.0, -7.0)], (300.0, 500.0), time, settings, np.random.default_rng(seed))
+    return simulate_pedestrians(road, [(-9.0, -7.0)], (300.0, 500.0), time, settings, np.random.default_rng(seed))
 
 
 def test_people_stay_on_the_pavement_and_walk_at_their_speed() -> None:
@@ -186,7 +186,7 @@ def test_between_samples_motion_is_a_cubic() -> None:
 
 def test_standing_objects_stand() -> None:
     boxes = Boxes.of(["car"], [[5.0, 6.0, 0.8]], [[4.0, 2.0, 1.6]], [0.3], [[0.0, 0.0]])
-    found, present = standing(np.array(["x"]), boxes, np.array([0.0, 0.1, 0.2])).at(0.13)
+    found, present = static_objects(np.array(["x"]), boxes, np.array([0.0, 0.1, 0.2])).at(0.13)
     assert found.position == pytest.approx(boxes.position)
     assert found.velocity == pytest.approx(np.zeros((1, 2)))
     assert present.all()
@@ -195,12 +195,12 @@ def test_standing_objects_stand() -> None:
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: RoadSettings(length=100.0), "length: expected at least 800 m"),
-        (lambda: RoadSettings(lanes=(3, 2)), "lanes: expected two growing positive numbers"),
-        (lambda: PedestrianSettings(groups=(3, 1)), "groups: expected two growing numbers >= 0"),
-        (lambda: PedestrianSettings(walking_speed=(0.0, 1.0)), "walking_speed: expected two growing positive numbers"),
-        (lambda: SimulatorSettings(duration=0.0), "duration: expected a positive number"),
-        (lambda: SimulatorSettings(warm_up=-1.0), "warm_up: expected a time of at least 0 s"),
+        (lambda: RoadSettings(length=100.0), "length: expected a finite number >= 800"),
+        (lambda: RoadSettings(lanes=(3, 2)), "lanes: expected ascending numbers"),
+        (lambda: PedestrianSettings(groups=(3, 1)), "groups: expected ascending numbers"),
+        (lambda: PedestrianSettings(walking_speed=(0.0, 1.0)), "walking_speed: expected a finite number > 0, got 0.0"),
+        (lambda: SimulatorSettings(duration=0.0), "duration: expected a finite number > 0"),
+        (lambda: SimulatorSettings(warm_up=-1.0), "warm_up: expected a finite number >= 0"),
     ],
 )
 def test_settings_no_world_can_have_are_refused(make: object, text: str) -> None:

@@ -137,13 +137,13 @@ def test_a_crossing_crowd_does_not_let_clusters_grow():
     prior, record = flock(seed=2, n=120, frames=60, dt=0.2, speed=8.0)
     estimator = BoundedKalmanFilter(hops=1, core=10)
     estimator.add(nodes, prior, np.tile(np.diag(prior_deviation() ** 2), (120, 1, 1)))
-    guests = []
+    members = []
     for frame in record:
         estimator.predict(frame.transition)
         estimator.update(frame.measurements)
-        guests.append(sum(len(cluster) for cluster in estimator.clusters) / 120)
+        members.append(sum(len(cluster) for cluster in estimator.clusters) / 120)
     assert max(len(cluster) for cluster in estimator.clusters) <= 50
-    assert np.mean(guests[-10:]) <= 1.3 * np.mean(guests[:10])
+    assert np.mean(members[-10:]) <= 1.3 * np.mean(members[:10])
 
 
 # positive definite, whatever happens

@@ -611,7 +611,7 @@ def test_bad_input_does_not_end_the_interpreter(recipe):
         import sys, warnings
         sys.path[:0] = {sys.path!r}
         warnings.simplefilter("error")
-        import test_conformance as suite
+        from tests.saga_fg.estimators import test_conformance as suite
         from saga_fg import SagaError
         make = suite.maker({recipe!r})
         estimator = suite.filled(make)

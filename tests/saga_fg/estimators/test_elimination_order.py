@@ -88,7 +88,7 @@ def test_nodes_without_neighbours_do_not_end_the_interpreter():
         import sys
         sys.path[:0] = {sys.path!r}
         import numpy as np
-        from test_estimator_batch_order import recorded, queue
+        from tests.saga_fg.estimators.test_elimination_order import recorded, queue
         from saga_fg.estimators.elimination_order import sparse_ordering
         factors = [(k, k + 1) for k in range(50)] + [(k,) for k in range(100, 160)]
         assert sparse_ordering(factors, "metis").size() == 111
@@ -107,7 +107,7 @@ def test_nodes_without_neighbours_do_not_end_the_interpreter():
 def test_the_cheapest_order_is_chosen(graph_of, n, order):
     smoother = recorded(graph_of, n, 40)
     recording = smoother._recording
-    assert cheapest_order(recording.moments, recording.layouts) in order.split()
+    assert cheapest_order(recording.epochs, recording.layouts) in order.split()
     assert smoother.order in order.split()
 
 

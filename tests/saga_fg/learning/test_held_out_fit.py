@@ -9,9 +9,9 @@ from following_pairs import RATE, following_pairs
 
 from saga_fg.learning import (
     FORMS_OF_TRACKERS,
+    FilterNoise,
     FittedInteractions,
     GapSettings,
-    OwnMotion,
     fit_by_held_out,
     gap_moments,
 )
@@ -20,7 +20,7 @@ from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing
 
 SHORT = GapSettings(longest=1.5)
-OWN = OwnMotion({"car": 0.3, "default": 0.3}, 0.005)
+OWN = FilterNoise({"car": 0.3, "default": 0.3}, 0.005)
 FOLLOW = Following(CarFollowing(time_constant=math.inf), rate=RATE, gap_scale=100.0)
 
 

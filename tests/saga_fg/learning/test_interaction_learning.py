@@ -9,15 +9,14 @@ from following_pairs import GAP, RATE, following_pairs
 
 from saga_fg import InputError
 from saga_fg.learning import (
+    FilterNoise,
+    FilterNoiseLikelihood,
     GapSample,
     GapSettings,
     JointGaps,
-    OwnMotion,
-    OwnMotionLikelihood,
     Trajectories,
     filter_independently,
     fit_interactions,
-    fit_interactions_in_view,
     gap_errors,
     negative_log_likelihood,
     predict_gaps,
@@ -26,7 +25,7 @@ from saga_fg.learning import (
 )
 from saga_fg.learning.interaction_fit import FittedInteractions, couple_rules
 from saga_fg.model.edge_features import EdgeFeatures
-from saga_fg.model.edge_information import News
+from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedCourse, SharedVelocity
 
@@ -137,7 +136,11 @@ def test_edges_that_tell_the_hidden_alone_leave_those_in_view_to_their_measureme
         rule = dataclasses.replace(FOLLOW, rate=RATE, news=news)
         return JointGaps(trajectories, filtered, {"default": 1.5}, 0.005, (rule,)).errors(sample, GapSettings())
 
-    kf, hidden, nobody = errors(News(1e6)), errors(News(1.0, 1e6)), errors(News(1e4, 1e-3))
+    kf, hidden, nobody = (
+        errors(EdgeInformation(1e6)),
+        errors(EdgeInformation(1.0, 1e6)),
+        errors(EdgeInformation(1e4, 1e-3)),
+    )
     np.testing.assert_allclose(kf, nobody, atol=1e-3)
     at_once = gap_errors(sample, predict_gaps(sample, alone, 1.5, 0.0))
     np.testing.assert_allclose(kf, at_once, atol=1e-3)
@@ -158,7 +161,7 @@ def test_the_noise_of_the_classical_filter_is_found_again():
     places += rng.normal(0, r, places.shape)
     ids, label = np.array([f"{k:02d}" for k in range(n)]), np.full(n, "car")
     trajectories = Trajectories(dt * np.arange(K), ids, label, np.zeros(n), places, np.full((K, n), np.nan))
-    own = OwnMotion.most_likely([OwnMotionLikelihood(trajectories, ("car",), GapSettings())])
+    own = FilterNoise.most_likely([FilterNoiseLikelihood(trajectories, ("car",), GapSettings())])
     assert 0.1 <= own.acceleration_noise["car"] <= 0.9
     assert 0.02 <= own.position_noise <= 0.1
 
@@ -185,54 +188,3 @@ def test_objects_in_view_are_likeliest_by_the_rate_at_which_they_follow():
     assert count == 6 * 79
     assert right > low + 5
     assert right > high + 5
-
-
-def test_the_rate_of_objects_in_view_is_found_again():
-    trajectories = following_pairs(pairs=4, moments=30, seed=4)
-    labels = np.where(np.arange(8) >= 4, "car", "bus")
-    trajectories = dataclasses.replace(trajectories, label=labels)
-    template = dataclasses.replace(FOLLOW, gap_scale=math.inf, lateral_scale=math.inf, heading_scale=math.inf)
-    noise = {"car": 0.3, "default": 0.3}
-    fitted = fit_interactions_in_view([trajectories], 0.005, noise, (template,), iterations=5)
-    assert fitted.rules[0].rate == pytest.approx(RATE, rel=0.35)
-    assert fitted.acceleration_noise["car"] < 0.3 * fitted.acceleration_noise["default"]
-    with pytest.raises(InputError, match="seen twice"):
-        fit_interactions_in_view([trajectories.until(0.0)], 0.005, noise, (template,))
-
-
-def drifting(rng, groups, members, noise, moments=25, rate=0.0):
-    """Groups far from each other; members take over the velocity of every other one of their group at this rate."""
-    group = np.repeat(np.arange(groups), members)
-    x = 100.0 * group[:, None] + 4.0 * rng.normal(size=(len(group), 2))
-    v = np.tile([5.0, 0.0], (len(group), 1))
-    places, h = [], 0.02
-    for step in range(10 * moments):
-        if step % 10 == 0:
-            places.append(x)
-        total = np.stack([v[group == g].sum(axis=0) for g in group])
-        x = x + h * v
-        v = v + h * rate * (total - members * v) + np.sqrt(h * noise) * rng.normal(size=v.shape)
-    ids, label = np.array([f"{k:02d}" for k in range(len(group))]), np.full(len(group), "car")
-    time, heading = 0.2 * np.arange(moments), np.zeros((moments, len(group)))
-    return Trajectories(time, ids, label, np.full(len(group), 4.5), np.array(places), heading)
-
-
-SHARING = Neighbours(
-    SharedVelocity(), rate=0.5, distance_scale=math.inf, heading_scale=math.inf, speed_scale=math.inf, max_distance=50.0
-)
-
-
-def test_what_objects_in_view_do_not_share_is_not_learned():
-    trajectories = drifting(np.random.default_rng(6), groups=2, members=3, noise=0.5)
-    fitted = fit_interactions_in_view([trajectories], 0.005, {"default": 1.0}, (SHARING,), iterations=5)
-    assert fitted.rules == ()
-    assert fitted.acceleration_noise["default"] == pytest.approx(0.5, rel=0.3)
-
-
-def test_no_more_edges_are_learned_than_there_are_members_to_share_with():
-    trajectories = drifting(np.random.default_rng(7), groups=2, members=3, noise=0.5, rate=1.0)
-    template = dataclasses.replace(SHARING, max_degree=8)
-    fitted = fit_interactions_in_view([trajectories], 0.005, {"default": 1.0}, (template,), (1, 2, 5), iterations=5)
-    (rule,) = fitted.rules
-    assert rule.max_degree == 2
-    assert rule.rate == pytest.approx(1.0, rel=0.4)

@@ -5,7 +5,7 @@ import pytest
 
 from saga_fg import ConstantVelocity, InputError, NodeType, SceneGraph
 from saga_fg.estimators import Gaussian, kalman_predict, kalman_update
-from saga_fg.learning import Sightings, fit_acceleration_noise
+from saga_fg.learning import MeasuredTrajectory, fit_acceleration_noise
 from saga_fg.learning.process_noise import log_likelihood
 from saga_fg.model.discretisation import discretise
 
@@ -23,7 +23,7 @@ def drawn(rng, acceleration_noise, count=40, length=30, noise=0.2):
             time += dt
             times.append(time)
             seen.append(x[:2] + noise * rng.normal(size=2))
-        objects.append(Sightings(times, seen, np.tile(noise**2 * np.eye(2), (len(seen), 1, 1))))
+        objects.append(MeasuredTrajectory(times, seen, np.tile(noise**2 * np.eye(2), (len(seen), 1, 1))))
     return objects
 
 
@@ -54,7 +54,7 @@ def test_the_noise_of_the_model_is_found_again(truth):
 
 
 def test_objects_seen_too_seldom_tell_nothing():
-    seldom = Sightings([0.0, 1.0], np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1)))
+    seldom = MeasuredTrajectory([0.0, 1.0], np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1)))
     for objects in ([], [seldom]):
         with pytest.raises(InputError, match="objects: expected at least one object seen three times or more"):
             fit_acceleration_noise(objects)
@@ -71,4 +71,4 @@ def test_objects_seen_too_seldom_tell_nothing():
 )
 def test_wrong_sightings_are_named(columns, message):
     with pytest.raises(InputError, match=message):
-        Sightings(*columns)
+        MeasuredTrajectory(*columns)

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from saga_fg import Annotations, Boxes, Detections, Frame, InputError, Scene, Sensor
 from saga_fg.learning import (
     DetectionSample,
+    SampledDetections,
+    SampledObjects,
     fit_position_noise,
     fit_score_calibration,
     fit_sensor,
@@ -73,15 +75,17 @@ def test_scores_that_separate_all_there_is_give_a_finite_calibration():
     assert fit_score_calibration(np.empty(0), np.empty(0, dtype=bool), prior) == prior
 
 
+def detections_at(azimuth, distance=None):
+    """Detections of one class whose errors are not known."""
+    n = len(azimuth)
+    distance = np.zeros(n) if distance is None else distance
+    return SampledDetections.without_errors(np.full(n, "car"), np.zeros(n), distance, azimuth, np.zeros(n, dtype=bool))
+
+
 def test_detection_probability_is_the_share_of_chances_taken():
-    sample = replace(
-        DetectionSample.empty(),
-        object_label=np.repeat(["car", "bus"], [400, 5]),
-        object_range=np.full(405, 20.0),
-        object_azimuth=np.zeros(405),
-        detected=np.concatenate([np.arange(400) % 4 > 0, np.zeros(5, dtype=bool)]),
-    )
-    model = fit_sensor(sample, Sensor(), gate=4.0)
+    detected = np.concatenate([np.arange(400) % 4 > 0, np.zeros(5, dtype=bool)])
+    objects = SampledObjects(np.repeat(["car", "bus"], [400, 5]), np.full(405, 20.0), np.zeros(405), detected)
+    model = fit_sensor(DetectionSample(detections_at(np.empty(0)), objects), Sensor(), gate=4.0)
     assert model.class_detection["car"] == pytest.approx(0.75, abs=0.01)
     assert "bus" not in model.class_detection  # seldom in view: the share of all classes serves
     assert model.noise == Sensor().noise
@@ -89,7 +93,7 @@ def test_detection_probability_is_the_share_of_chances_taken():
 
 def test_where_a_sensor_never_detects_anything_it_does_not_look():
     rng = np.random.default_rng(5)
-    sample = replace(DetectionSample.empty(), azimuth=rng.uniform(2.5, 4.5, 1000), range=rng.uniform(2.0, 40.0, 1000))
+    sample = detections_at(rng.uniform(2.5, 4.5, 1000), rng.uniform(2.0, 40.0, 1000))
     view = fit_field_of_view(sample, FieldOfView())
     assert (view.min_azimuth, view.max_azimuth) == pytest.approx((2.5, 4.5), abs=0.02)
     assert view.max_range == pytest.approx(40.8, abs=0.5)
@@ -120,14 +124,14 @@ def test_detections_are_compared_with_the_truth_of_their_own_time():
     (matched,) = match_to_truth(recording(), {"camera": sensor})
     assert matched.annotations.boxes.position[:, 0].tolist() == [25.0, 5.0]  # half way
     assert (matched.detection.tolist(), matched.truth.tolist()) == ([0], [0])
-    sample = sample_with_truth(recording(), {"camera": sensor})["camera"]
+    sample, objects = sample_with_truth(recording(), {"camera": sensor})["camera"]
     assert sample.true.tolist() == [True, False]
     sight = np.array([22.5, 1.4]) / np.hypot(22.5, 1.4)
     assert sample.along[0] == pytest.approx(np.array([0.5, 0.4]) @ sight)
     assert sample.across[0] == pytest.approx(np.array([0.5, 0.4]) @ [-sight[1], sight[0]])
     assert sample.height[0] == pytest.approx(0.2)
     assert sample.yaw[0] == pytest.approx(0.0, abs=1e-12)  # half a turn counts as none
-    assert sample.detected.tolist() == [True, False]
+    assert objects.detected.tolist() == [True, False]
 
 
 def test_without_annotations_there_is_no_truth():

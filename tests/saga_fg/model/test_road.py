@@ -14,7 +14,7 @@ from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_rules import Following, build_graph
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.rigid_coupling import Attached, RigidCoupling
-from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane, KeepLane
 from saga_fg.model.road.stopping import RedLight, Stopping
 from saga_fg.numerics.polyline import direction_at, feet
@@ -238,7 +238,7 @@ def test_who_is_pushed_out_of_a_lane_by_cones_does_not_keep_it():
 
 def test_cones_push_aside_whose_lane_they_close():
     nodes = taper()
-    acceleration = pull(nodes, ConeEdge(cones=ConeGeometry(clearance=1.5)))
+    acceleration = pull(nodes, ConeLine(cones=ConeGeometry(clearance=1.5)))
     assert acceleration[0, 1] > 0.5
     assert acceleration[0, 0] == pytest.approx(0)
     assert np.allclose(acceleration[1:], 0)
@@ -247,13 +247,13 @@ def test_cones_push_aside_whose_lane_they_close():
 def test_the_push_is_to_where_the_edge_is_just_cleared():
     """Looking 15 m ahead, at the second cone, which is at y = -1: the way aside there is clearance - 1."""
     cones = ConeGeometry(clearance=1.5, preview=1.5)
-    assert pull(taper(), ConeEdge(cones=cones, rate=2.0))[0, 1] == pytest.approx(2.0 * 0.5 / 1.5)
+    assert pull(taper(), ConeLine(cones=cones, rate=2.0))[0, 1] == pytest.approx(2.0 * 0.5 / 1.5)
 
 
 def test_cones_on_the_left_push_to_the_right():
     nodes = taper()
     mirrored = table([(str(nodes.label[k]), *(nodes.position[k] * (1, -1)), 10.0 * (k < 2), 0, 4) for k in range(7)])
-    assert np.allclose(pull(mirrored, ConeEdge()) * (1, -1), pull(nodes, ConeEdge()))
+    assert np.allclose(pull(mirrored, ConeLine()) * (1, -1), pull(nodes, ConeLine()))
 
 
 def test_the_car_beside_knows_that_cones_push_another_into_its_lane():

@@ -1,4 +1,4 @@
-"""Planes, poles and lane edges are recovered within their stated covariance: the chi-square test over many drives.
+"""Planes, poles and road lines are recovered within their stated covariance: the chi-square test over many drives.
 
 With the model true, the squared error e^T P^-1 e of all landmarks of a kind together, at the end of a drive, has as
 many degrees of freedom as they have dimensions; its sum over independent drives is tested on both sides.
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from saga_fg.model.landmarks.line import LaneEdgeLandmark
+from saga_fg.model.landmarks.line import LineLandmark
 from saga_fg.model.landmarks.plane import PlaneLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
@@ -23,7 +23,7 @@ Q = np.diag([0.003, 0.003, 0.004, 0.03, 0.02, 0.02]) ** 2  # of a motion: rad, m
 R_PLANE, R_POLE = np.diag([0.01, 0.01, 0.05]) ** 2, np.diag([0.08, 0.05]) ** 2
 R_EDGE = np.array([[0.0064, 0.002], [0.002, 0.01]])
 # edges are rare: what is tested is the covariance, not who is taken for whom
-POLE, EDGE, PLANE = PoleLandmark(), LaneEdgeLandmark(density=1e-3), PlaneLandmark()
+POLE, LINE, PLANE = PoleLandmark(), LineLandmark(density=1e-3), PlaneLandmark()
 
 
 def drawn(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
@@ -55,13 +55,13 @@ def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
             off = rho + drawn(rng, R_EDGE)
             at = middle + np.array([rng.uniform(-9, -4), rng.uniform(4, 9)])
             ends = np.column_stack([off[:, None] * n + at[:, None] * along, np.zeros(2)])
-            seen.append(Observation(EDGE, np.concatenate([pose.transformTo(end) for end in ends]), R_EDGE))
+            seen.append(Observation(LINE, np.concatenate([pose.transformTo(end) for end in ends]), R_EDGE))
         mapper.observe(seen)
         step = gtsam.Pose3(gtsam.Rot3.Yaw(0.01), np.array([1.5, 0.0, 0.0]))
         pose = pose.compose(step)
         mapper.move(step.retract(drawn(rng, Q)).matrix(), Q)
     mapper.smooth()
-    truth = {"pole": list(poles), "plane": planes, "lane edge": list(lines)}
+    truth = {"pole": list(poles), "plane": planes, "road line": list(lines)}
     found = {}
     for name, things in truth.items():
         numbers = sorted(n for n, kind in mapper.estimate.kinds.items() if kind.name == name)
@@ -81,7 +81,7 @@ def drives() -> list[tuple[dict[str, tuple[float, int]], float]]:
     return [drive(seed) for seed in range(DRIVES)]
 
 
-@pytest.mark.parametrize("kind", ["pole", "plane", "lane edge"])
+@pytest.mark.parametrize("kind", ["pole", "plane", "road line"])
 def test_squared_errors_lie_in_the_band(kind: str, drives: list[tuple[dict[str, tuple[float, int]], float]]) -> None:
     squared = sum(found[kind][0] for found, _ in drives)
     dim = sum(found[kind][1] for found, _ in drives)

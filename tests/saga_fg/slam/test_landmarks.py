@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError
-from saga_fg.model.landmarks.line import LaneEdgeLandmark
+from saga_fg.model.landmarks.line import LineLandmark
 from saga_fg.model.landmarks.plane import PlaneLandmark
 from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
@@ -16,7 +16,7 @@ from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping import JointEstimate, LandmarkMap, LandmarkMapper, MapperSettings, associate, duplicates
 from saga_fg.types.landmark import LandmarkType, Observation
 
-KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LaneEdgeLandmark()]
+KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
 Q = np.diag([0.01, 0.01, 0.01, 0.05, 0.02, 0.02]) ** 2
 NOISE = {"pole": np.diag([0.1, 0.1]) ** 2, "plane": np.diag([0.01, 0.01, 0.05]) ** 2}
 
@@ -31,7 +31,7 @@ def some_observation(kind: LandmarkType, rng: np.random.Generator) -> FloatArray
     if isinstance(kind, PlaneLandmark):
         normal = rng.normal(size=3)
         return np.append(normal / np.linalg.norm(normal), rng.uniform(2, 9))
-    if isinstance(kind, LaneEdgeLandmark):
+    if isinstance(kind, LineLandmark):
         return rng.normal(0, 8, 6)
     return rng.normal(0, 8, 2 if isinstance(kind, PointLandmark) and kind.dim == 2 else 3)
 
@@ -138,7 +138,7 @@ def test_what_was_seen_side_by_side_is_never_one() -> None:
 @pytest.mark.parametrize("side", [4.0, 0.0])
 def test_an_edge_is_one_whichever_way_its_normal_points(way: float, side: float) -> None:
     """A kerb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
-    kind, R = LaneEdgeLandmark(), 0.01 * np.eye(2)
+    kind, R = LineLandmark(), 0.01 * np.eye(2)
     estimate = JointEstimate(np.eye(4), 1e-6 * np.eye(6))
     for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
         along = np.array([np.cos(way + turn), np.sin(way + turn), 0.0])
@@ -210,7 +210,7 @@ def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
         (lambda: Observation(PoleLandmark(), [1, 2, np.nan], np.eye(2)), "observed pole"),
         (lambda: Observation(PoleLandmark(), [1, 2, 3], np.eye(3)), "covariance of a pole"),
         (lambda: Observation(PlaneLandmark(), [0, 0, 1, 2], -np.eye(3)), "positive definite"),
-        (lambda: LaneEdgeLandmark().initialise(np.eye(4), np.tile([3.0, 2.0, 0.0], 2)), "two ends that are apart"),
+        (lambda: LineLandmark().initialise(np.eye(4), np.tile([3.0, 2.0, 0.0], 2)), "two ends that are apart"),
         (lambda: PointLandmark(dim=4), "dim: expected 2 or 3"),
         (lambda: PoleLandmark(density=0.0), "density"),
         (lambda: MapperSettings(gate=0.2), "gate"),

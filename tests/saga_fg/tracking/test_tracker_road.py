@@ -12,7 +12,7 @@ from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.node import ConstantVelocity, RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeEdge
+from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
 from saga_fg.model.road.stopping import RedLight, SmoothStopping
 from saga_fg.tracking import ClassSettings
@@ -24,7 +24,7 @@ MAP = RoadMap(
     (Lane("lane", ((-200.0, 0.0), (50.0, 0.0))),),
 )
 FOLLOW = Following(interaction=SharedVelocity(), rate=1.0, max_gap=40)
-EDGES = (RedLight(), InLane(), ConeEdge(), Attached(), replace(FOLLOW, cones=ConeGeometry()))
+EDGES = (RedLight(), InLane(), ConeLine(), Attached(), replace(FOLLOW, cones=ConeGeometry()))
 SETTINGS = TrackerSettings(
     classes={
         "default": ClassSettings(motion=ConstantVelocity(acceleration_noise=0.5), max_coasting=5.0),

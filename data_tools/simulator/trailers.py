@@ -1,7 +1,7 @@
-"""Trucks that tow a trailer. They drive as one long vehicle, and are seen as two.
+"""Trucks that tow a trailer: one long vehicle in traffic, two objects in the scene.
 
-Both parts are on the path of the whole: the truck's middle (total - truck) / 2 before the middle of the whole, the
-trailer's (total - trailer) / 2 behind it, along the lane.
+Both parts follow the path of the combination: along the lane, the truck's centre is (total - truck) / 2 ahead of the
+centre of the combination, the trailer's is (total - trailer) / 2 behind it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ HITCH = 0.9  # m between truck and trailer
 TRAILER_LENGTH = (6.0, 11.0)  # m
 
 
-def hitched(fleet: Fleet, share: float, rng: np.random.Generator) -> tuple[Fleet, FloatArray]:
-    """A share of the trucks get a trailer: the fleet with their whole lengths, and the trailers' lengths (N,), m."""
+def attach_trailers(fleet: Fleet, share: float, rng: np.random.Generator) -> tuple[Fleet, FloatArray]:
+    """Attach trailers to a share of the trucks: the fleet with total lengths, and lengths (N,) of trailers, m, or 0."""
     trailer = np.zeros(len(fleet))
     if share > 0:
         tows = (fleet.kind == TRUCK) & (rng.random(len(fleet)) < share)
@@ -31,38 +31,38 @@ def hitched(fleet: Fleet, share: float, rng: np.random.Generator) -> tuple[Fleet
     return replace(fleet, size=size), trailer
 
 
-def parted(
+def split_trailers(
     vehicles: Trajectories, lanes: Lanes, history: TrafficHistory, trailer: FloatArray
 ) -> tuple[Trajectories, Trajectories]:
-    """The vehicles, with the trucks' part alone of those that tow, and their trailers of lengths (N,) > 0."""
+    """The vehicles without their trailers, and the trailers; `trailer` (N,) are their lengths, m, 0 for none."""
     rows = np.flatnonzero(trailer > 0)
     if len(rows) == 0:
         return vehicles, vehicles.select(rows)
     whole, behind = vehicles.size[rows, 0], trailer[rows]
     truck = whole - behind - HITCH
     position, yaw, velocity = (x.copy() for x in (vehicles.position, vehicles.yaw, vehicles.velocity))
-    position[:, rows], yaw[:, rows], velocity[:, rows] = _moved(lanes, history, rows, (whole - truck) / 2)
+    position[:, rows], yaw[:, rows], velocity[:, rows] = _shifted(lanes, history, rows, (whole - truck) / 2)
     size = vehicles.size.copy()
     size[rows, 0] = truck
-    place = _moved(lanes, history, rows, -(whole - behind) / 2)
+    pose = _shifted(lanes, history, rows, -(whole - behind) / 2)
     trailer_size = np.column_stack([behind, vehicles.size[rows, 1], vehicles.size[rows, 2]])
     trailers = Trajectories(
         np.char.replace(vehicles.id[rows], "vehicle", "trailer"),
         np.full(len(rows), "trailer"),
         trailer_size,
         vehicles.time,
-        place[0],
-        place[2],
-        place[1],
+        pose[0],
+        pose[2],
+        pose[1],
         vehicles.present[:, rows],
     )
     return replace(vehicles, position=position, yaw=yaw, velocity=velocity, size=size), trailers
 
 
-def _moved(
+def _shifted(
     lanes: Lanes, history: TrafficHistory, rows: IntArray, by: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position (T, k, 2), heading (T, k) and velocity (T, k, 2) of vehicles moved along their lanes by (k,) m."""
+    """Position (T, k, 2), heading (T, k) and velocity (T, k, 2) of points `by` (k,) m ahead of vehicles' centres."""
     lane, slope = history.lane[:, rows], history.slope[:, rows]
     position, heading = lanes.pose(lane, history.s[:, rows] + by, history.offset[:, rows] + slope * by, slope)
     heading = np.unwrap(heading, axis=0)

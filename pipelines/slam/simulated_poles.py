@@ -14,30 +14,26 @@ import numpy as np
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import require_between, require_positive, setting
+from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.joint import Observations
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True)
-class RoadsideSettings:
+class SimulatedPoleSettings(Settings):
     """Poles and how they are seen."""
 
-    gap: float = setting(25.0, "mean distance between poles of one side, m")
-    offset: float = setting(9.0, "mean distance of a pole from the path, m")
-    reach: float = setting(30.0, "farther poles are not seen, m")
-    seen: float = setting(0.8, "chance to see a pole within reach")
-    noise: float = setting(0.1, "standard deviation of an observation, m")
-
-    def __post_init__(self) -> None:
-        require_positive(self, "gap", "offset", "reach", "noise")
-        require_between(self, 0, 1, "seen")
+    gap: Positive = setting(25.0, "mean distance between poles of one side, m")
+    offset: Positive = setting(9.0, "mean distance of a pole from the path, m")
+    reach: Positive = setting(30.0, "farther poles are not seen, m")
+    seen: Fraction = setting(0.8, "chance to see a pole within reach")
+    noise: Positive = setting(0.1, "standard deviation of an observation, m")
 
 
-def observe_poles(world_T_ego: FloatArray, seed: int, settings: RoadsideSettings | None = None) -> Observations:
+def observe_poles(world_T_ego: FloatArray, seed: int, settings: SimulatedPoleSettings | None = None) -> Observations:
     """What is seen of poles from true poses (n, 4, 4); the same for the same seed."""
-    settings = settings or RoadsideSettings()
+    settings = settings or SimulatedPoleSettings()
     rng = np.random.default_rng(seed)
     poles = _poles(world_T_ego, settings, rng)
     kind, R = PoleLandmark(), settings.noise**2 * np.eye(2)
@@ -55,7 +51,7 @@ def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
     return observe_poles(np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None]), seed)
 
 
-def _poles(world_T_ego: FloatArray, settings: RoadsideSettings, rng: np.random.Generator) -> FloatArray:
+def _poles(world_T_ego: FloatArray, settings: SimulatedPoleSettings, rng: np.random.Generator) -> FloatArray:
     """(m, 3) places at a man's height, along the path and straight on beyond its end."""
     steps = np.linalg.norm(np.diff(world_T_ego[:, :3, 3], axis=0), axis=1)
     driven = np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,4 +1,4 @@
-"""Log lines that a flood of messages must not turn into a flood of their own."""
+"""Limits how often a log line is repeated, so that a flood of messages is no flood of log lines."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import logging
 import time
 from collections.abc import Hashable
 
-MOST = 1000  # keys that are remembered
+MOST = 1000  # kinds that are remembered
 
 
-class Seldom:
-    """Says of each kind of event whether it is time to log one again: once in `seconds`."""
+class LogLimit:
+    """Allows one log line of each kind of event in `seconds`."""
 
     def __init__(self, seconds: float = 60.0) -> None:
         self._seconds = seconds
         self._latest: dict[Hashable, float] = {}
 
     def due(self, kind: Hashable) -> bool:
-        """Whether to log an event of this kind."""
+        """Whether to log an event of this kind now."""
         now = time.monotonic()
         if now - self._latest.get(kind, -self._seconds) < self._seconds:
             return False
@@ -27,13 +27,13 @@ class Seldom:
         return True
 
 
-class SeldomFilter(logging.Filter):
-    """Lets every line of code log once in a while only."""
+class LogLimitFilter(logging.Filter):
+    """Limits the log lines of every line of code."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._seldom = Seldom()
+        self._limit = LogLimit()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether this record is due."""
-        return self._seldom.due((record.name, record.lineno))
+        """Whether to log this record."""
+        return self._limit.due((record.name, record.lineno))

@@ -26,9 +26,8 @@ from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
 from saga_fg.learning.independent_filter import filter_independently
-from saga_fg.learning.interaction_fit import EXPLAINED_BOUNDS, NOISE_BOUNDS, FittedInteractions
+from saga_fg.learning.interaction_fit import EXPLAINED_BOUNDS, NOISE_BOUNDS, FittedInteractions, Rule, RuleParameters
 from saga_fg.learning.joint_gaps import JointGaps
-from saga_fg.learning.rule_parameters import Rule, RuleParameters
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray

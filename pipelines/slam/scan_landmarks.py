@@ -1,4 +1,4 @@
-"""What a scan shows of landmarks: walls and the ground as planes, masts and trunks as poles, curbs as lane edges."""
+"""Landmarks observed in a scan: walls and the ground as planes, masts and trunks as poles, curbs as road lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from data_tools.lidar import (
     straight_edges,
 )
 from saga_fg.model.landmarks.detector import LandmarkDetector
-from saga_fg.model.landmarks.line import LaneEdgeLandmark
+from saga_fg.model.landmarks.line import LineLandmark
 from saga_fg.model.landmarks.plane import PlaneLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
@@ -31,11 +31,11 @@ from saga_fg.types.landmark import Observation
 GROUND = PlaneLandmark(name="ground")
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
-EDGE = LaneEdgeLandmark()
+LINE = LineLandmark()
 
 
 @dataclass(frozen=True)
-class SightingSettings:
+class ScanLandmarkSettings:
     """Which landmarks are looked for, and how."""
 
     ground: bool = setting(False, "the ground as one plane: for level places only")
@@ -50,33 +50,37 @@ class SightingSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """An observation, and the ends (2, 3) of the piece of a wall or edge that was seen, m, in the sensor's frame."""
+class ObservedLandmark:
+    """An observation, and the ends (2, 3) of the observed piece of a wall or line, m, in the sensor's frame."""
 
     observation: Observation
     extent: FloatArray
 
 
-def landmarks_seen(
-    points: FloatArray, settings: SightingSettings | None = None, detectors: Sequence[LandmarkDetector] = ()
-) -> list[Seen]:
-    """Landmarks seen in points (N, 3) of a scan without skew, m, in the sensor's frame; by other detectors as well."""
-    s = settings or SightingSettings()
+def observe_landmarks(
+    points: FloatArray, settings: ScanLandmarkSettings | None = None, detectors: Sequence[LandmarkDetector] = ()
+) -> list[ObservedLandmark]:
+    """Observe landmarks in points (N, 3) of a scan without skew, m, in the sensor's frame.
+
+    detectors: of further kinds of landmarks
+    """
+    s = settings or ScanLandmarkSettings()
     ground = segment_ground(points, s.segmentation)
     found = []
     if s.ground:
         plane = fit_ground(points[ground.is_ground], s.plane)
         if plane is not None:
-            found.append(Seen(Observation(GROUND, plane.coefficients, plane.covariance), plane.extent))
+            found.append(ObservedLandmark(Observation(GROUND, plane.coefficients, plane.covariance), plane.extent))
     walls = extract_walls(points[~ground.is_ground], s.plane)
     for wall in walls[: s.walls]:
-        found.append(Seen(Observation(WALL, wall.coefficients, wall.covariance), wall.extent))
+        found.append(ObservedLandmark(Observation(WALL, wall.coefficients, wall.covariance), wall.extent))
     poles = extract_poles(points, ground.height, walls, s.pole)
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
-        found.append(Seen(Observation(POLE, pole.foot, pole.covariance), extent))
+        found.append(ObservedLandmark(Observation(POLE, pole.foot, pole.covariance), extent))
     curbs = extract_curbs(points, ground.height, s.curb) if s.edges else np.empty((0, 3))
     for edge in straight_edges(curbs, s.edges, s.edge):
-        found.append(Seen(Observation(EDGE, edge.ends.ravel(), edge.covariance), edge.ends))
-    found += [Seen(other, np.zeros((2, 3))) for detector in detectors for other in detector.observations(points)]
+        found.append(ObservedLandmark(Observation(LINE, edge.ends.ravel(), edge.covariance), edge.ends))
+    others = [other for detector in detectors for other in detector.observations(points)]
+    found += [ObservedLandmark(other, np.zeros((2, 3))) for other in others]
     return found

@@ -22,7 +22,7 @@ ACCELERATION_NOISE = tuple(np.geomspace(0.003, 3.0, 7).tolist())  # m^2/s^3
 POSITION_NOISE = (0.01, 0.02, 0.05, 0.1, 0.2)  # m
 
 
-class OwnMotionLikelihood:
+class FilterNoiseLikelihood:
     """Of one recording: for each class, `loss` (Q, R), the sum over its gaps, and their `count`."""
 
     def __init__(self, trajectories: Trajectories, classes: tuple[str, ...], settings: GapSettings) -> None:
@@ -43,14 +43,14 @@ class OwnMotionLikelihood:
 
 
 @dataclass(frozen=True)
-class OwnMotion:
+class FilterNoise:
     """acceleration_noise by class, m^2/s^3, `default` for all others; position_noise, m."""
 
     acceleration_noise: dict[str, float]
     position_noise: float
 
     @classmethod
-    def most_likely(cls, likelihoods: Sequence[OwnMotionLikelihood]) -> OwnMotion:
+    def most_likely(cls, likelihoods: Sequence[FilterNoiseLikelihood]) -> FilterNoise:
         """The maximum over some recordings: one position noise, and for it a process noise of every class."""
         classes = list(likelihoods[0].loss)
         losses = {c: np.sum([of.loss[c] for of in likelihoods], axis=0) for c in classes}

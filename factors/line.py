@@ -1,4 +1,4 @@
-"""Straight edges on the ground, seen from the vehicle: curbs, the borders of lanes.
+"""Straight lines on the ground, seen from the vehicle: curbs, borders of lanes.
 
 The state is a line in the plane, (theta, rho), in the Hesse normal form
 
@@ -59,10 +59,10 @@ class HesseLine:
         return state
 
 
-def edge_factors(
+def line_factors(
     rows: ArrayLike, ends: ArrayLike, covariances: ArrayLike, robust: RobustLoss | None = None
 ) -> ResidualFactors:
-    """Return n factors of straight edges seen from the vehicle.
+    """Return n factors of straight lines seen from the vehicle.
 
     rows: (n, 2) keys of the pose (`gtsam.Pose3`) and of the line (a vector of 2: rad, m); ends: (n, 2, 3), m, in the
     frame of the pose; covariances: (n, 2, 2), or one for all, m^2, of the two ends across the line. Raises
@@ -77,7 +77,7 @@ def edge_factors(
         covariances=checked_covariances("covariances", covariances, len(measured), 2),
         jacobians=function.jacobians,
         robust=robust,
-        name="straight edges",
+        name="straight lines",
     )
 
 

@@ -1,4 +1,4 @@
-"""What a scene is made of, drawn from its settings: road, lanes, disturbances, and vehicles with their first places."""
+"""The layout of a scene, sampled from its settings: road, lanes, disturbances, vehicles and their initial states."""
 
 from __future__ import annotations
 
@@ -6,24 +6,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.simulator.disturbances import SlowZone, StopLine, draw_intervals
-from data_tools.simulator.fleet import Fleet, draw_fleet
-from data_tools.simulator.idm import equilibrium_gap
+from data_tools.simulator.disturbances import SlowZone, StopLine, sample_intervals
+from data_tools.simulator.driver_models import equilibrium_gap
+from data_tools.simulator.fleet import Fleet, sample_fleet
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import curved_road
 from data_tools.simulator.settings import RoadSettings, RoadworkSettings, SimulatorSettings, TrafficSettings
-from data_tools.simulator.towing import hitched
+from data_tools.simulator.trailers import attach_trailers
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 JUNCTION = 10.0  # m between the stop lines of the two directions
-FOCUS = 0.55  # share of the road's length at which things happen
+FOCUS = 0.55  # share of the road's length
 
 
 @dataclass(frozen=True, eq=False)
-class Scenario:
-    """A scene before anybody moves; `focus` is where, m along the road, traffic is disturbed.
+class SceneLayout:
+    """Initial state of a scene with N vehicles.
 
-    trailer  (N,) lengths of the vehicles' trailers, part of their length, m; 0 for none
+    focus    distance along the road at which traffic is disturbed, m
+    hedge    offset of the hedge between the directions, m, or None
+    lane, s, speed  (N,) lane, distance along it in m, and speed in m/s of each vehicle
+    trailer  (N,) lengths of the vehicles' trailers, included in their length, m; 0 for none
     """
 
     lanes: Lanes
@@ -45,26 +48,26 @@ class Scenario:
         return float(outermost - half), float(self.lanes.offset.max() + half)
 
 
-def draw_scenario(settings: SimulatorSettings, rng: np.random.Generator) -> Scenario:
-    """A scenario with its own road, traffic and disturbances."""
-    lanes, hedge = _draw_lanes(settings.road, settings.roadworks, rng)
+def sample_layout(settings: SimulatorSettings, rng: np.random.Generator) -> SceneLayout:
+    """A random layout."""
+    lanes, hedge = _sample_lanes(settings.road, settings.roadworks, rng)
     focus = FOCUS * settings.road.length
     until = settings.warm_up + settings.duration
-    stop_lines, slow_zones = _draw_disturbances(lanes, focus, until, settings.traffic, rng)
+    stop_lines, slow_zones = _sample_disturbances(lanes, focus, until, settings.traffic, rng)
     desired_speed = float(rng.uniform(*settings.drivers.desired_speed))
-    fleet, trailer, lane, s = _fill(lanes, desired_speed, settings, rng)
+    fleet, trailer, lane, s = _sample_vehicles(lanes, desired_speed, settings, rng)
     speed = np.full(len(fleet), _start_speed(desired_speed))
-    return Scenario(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones, trailer)
+    return SceneLayout(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones, trailer)
 
 
 def _start_speed(desired_speed: float) -> float:
     return 0.6 * desired_speed
 
 
-def _draw_lanes(
+def _sample_lanes(
     settings: RoadSettings, roadworks: RoadworkSettings, rng: np.random.Generator
 ) -> tuple[Lanes, float | None]:
-    """Lanes, and the offset of the hedge between the directions, if there is one."""
+    """Lanes, and the offset of the hedge between the directions, m, or None."""
     focus = FOCUS * settings.length
     bends = []
     if rng.random() < settings.curve_probability:
@@ -96,38 +99,38 @@ def _draw_lanes(
     return lanes, 0.0 if hedge else None
 
 
-def _draw_disturbances(
+def _sample_disturbances(
     lanes: Lanes, focus: float, until: float, settings: TrafficSettings, rng: np.random.Generator
 ) -> tuple[tuple[StopLine, ...], tuple[SlowZone, ...]]:
     opposite = lanes.road.length - (focus + JUNCTION)
     light = lanes.ending < 0 and rng.random() < settings.signal_probability
     lane_wise = rng.random() < settings.lane_wise_probability
     stop_lines, zones = [], []
-    shared = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
+    shared = sample_intervals(settings.red_duration, settings.green_duration, until, rng)
     for mine, place in ((lanes.forward, focus), (lanes.oncoming, opposite)):
         if light:
             turning = mine[:1] if lane_wise and len(mine) > 1 else mine[:0]  # the innermost lane turns off
-            own = draw_intervals(settings.red_duration, settings.green_duration, until, rng)
+            own = sample_intervals(settings.red_duration, settings.green_duration, until, rng)
             stop_lines += [StopLine(np.setdiff1d(mine, turning), place, shared), StopLine(turning, place, own)]
         elif lanes.taper == 0:  # cones are disturbance enough
             for group in mine[:, None] if lane_wise else [mine]:
                 speed = float(rng.uniform(*settings.slow_speed))
-                active = draw_intervals(settings.slow_duration, settings.slow_duration, until, rng)
+                active = sample_intervals(settings.slow_duration, settings.slow_duration, until, rng)
                 zones.append(SlowZone(group, place + 20.0, place + 80.0, speed, active))
     return tuple(stop_lines), tuple(zones)
 
 
-def _fill(
+def _sample_vehicles(
     lanes: Lanes, desired_speed: float, settings: SimulatorSettings, rng: np.random.Generator
 ) -> tuple[Fleet, FloatArray, IntArray, FloatArray]:
-    """Vehicles in platoons at equilibrium distances on all lanes.
+    """Vehicles in platoons at equilibrium gaps on all lanes.
 
-    Returns the fleet, the lengths of its trailers (N,), m, its lanes (N,) and places s (N,), m.
+    Returns the fleet, the lengths of its trailers (N,), m, its lanes (N,) and distances s (N,), m.
     """
     length = lanes.road.length
     most = int(length / 6.0) * len(lanes.offset)
-    fleet = draw_fleet(most, desired_speed, settings.drivers, settings.traffic, rng)
-    fleet, trailer = hitched(fleet, settings.traffic.trailer_share, rng)
+    fleet = sample_fleet(most, desired_speed, settings.drivers, settings.traffic, rng)
+    fleet, trailer = attach_trailers(fleet, settings.traffic.trailer_share, rng)
     gaps = equilibrium_gap(_start_speed(desired_speed), fleet.drivers)
     rows, lane, s, row = [], [], [], 0
     for number in range(len(lanes.offset)):

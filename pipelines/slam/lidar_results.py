@@ -1,14 +1,13 @@
-"""The results of SLAM on a recording, as files.
+"""Results of LiDAR SLAM on a recording as files; `pipelines.slam.results` says what the common ones hold.
 
 trajectory.txt, times.txt   poses of the vehicle, KITTI's format: world_T_ego of every scan, and its time
 trajectory.tum              the same in the TUM format
 odometry.tum                by odometry alone; online.tum: as estimated when each keyframe came
-covariances.csv             of the sensor's pose at the keyframes: time, then the upper triangle of (rotation vector,
-                            translation) in the sensor's frame, rad and m
+covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
-landmarks.json              kind, number of sightings, coordinates and covariance of each landmark
-landmarks.ply               the same to look at: points along the poles and on the seen pieces of the walls
-tracks.csv                  with objects: those in the world at every moment of the graph, see `object_tracks`
+landmarks.json              each landmark
+landmarks.ply               points along the poles and on the observed pieces of the walls
+tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
 metrics.json                errors of the trajectories against the recording's own poses, and the map's sharpness
 
@@ -24,24 +23,23 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.files.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.figures import write_figures
 from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam
-from pipelines.slam.object_tracks import tracks, tracks_csv
-from pipelines.slam.sightings import EDGE, GROUND, WALL
+from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
+from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.types.landmark import Landmark
 
-POLE_HEIGHT = 3.0  # m above the first pose, to which poles are drawn
-_GAP = 2.0  # m between sightings of a wall, beyond which two pieces of it are drawn
-_EDGE_COLOUR = (148, 103, 189)
-_COLOURS = {True: (255, 127, 14), False: (214, 39, 40)}  # of poles, of planes
+HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
+_GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
+POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
 
 
 def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
@@ -68,7 +66,7 @@ def write_lidar_slam(
     points = accumulated_map(result, spacing)
     figures = metrics(result, scans)
     if isinstance(found, SlamWithObjects):
-        figures["objects"] = len(tracks(found.estimate))
+        figures["objects"] = len(object_paths(found.estimate))
         figures["without_objects"] = metrics(found.alone, scans)["trajectory"]
     with atomic_directory(output) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
@@ -76,13 +74,14 @@ def write_lidar_slam(
             ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)
         ):  # fmt: skip
             write_tum_poses(folder / f"{name}.tum", trajectory)
-        _write_covariances(folder / "covariances.csv", result)
+        times = result.trajectory.timestamps[result.keyframes].tolist()
+        write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
         write_ply(folder / "map.ply", points)
         _write_landmarks(folder, result)
         paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
         if objects is not None:
-            write_text(folder / "tracks.csv", tracks_csv(objects))
-        driven = () if objects is None else tuple(tracks(objects).values())
+            write_objects(folder / "tracks.csv", objects)
+        driven = () if objects is None else tuple(object_paths(objects).values())
         figure = scan_map_from_above(points, paths, _poles(result.landmarks), _lines(result), driven)
         write_bytes(folder / "above.png", png(figure))
         write_figures(folder / "metrics.json", figures)
@@ -96,61 +95,37 @@ def accumulated_map(result: LidarSlam, spacing: float) -> FloatArray:
     return points[voxel_downsample(points, spacing)]
 
 
-def _write_covariances(path: Path, result: LidarSlam) -> None:
-    upper = np.triu_indices(6)
-    names = ["time", *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))]
-    times = result.trajectory.timestamps[result.keyframes].tolist()
-    rows = [
-        ",".join([repr(time), *(f"{x:.9g}" for x in covariance[upper])])
-        for time, covariance in zip(times, result.covariances, strict=True)
-    ]
-    write_text(path, "\n".join([",".join(names), *rows]) + "\n")
-
-
 def _write_landmarks(folder: Path, result: LidarSlam) -> None:
-    records = [
-        {
-            "id": landmark.number,
-            "kind": landmark.kind.name,
-            "sightings": landmark.sightings,
-            **landmark.kind.coordinates(landmark.state),
-            "covariance": landmark.covariance.tolist(),
-        }
-        for landmark in result.landmarks
-    ]
-    write_figures(folder / "landmarks.json", records)
-    start = float(result.world_T_lidar[0, 2, 3])
-    drawn, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
-    for pole in _poles(result.landmarks):
-        z = np.arange(start - 1.5, start + POLE_HEIGHT, 0.1)
-        drawn.append(np.column_stack([np.broadcast_to(pole, (len(z), 2)), z]))
-        colours.append(np.full((len(z), 3), _COLOURS[True], dtype=np.uint8))
-    for a, b in _pieces(result, EDGE.name):
-        share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(b - a) / 0.2)))
-        drawn.append(np.column_stack([a + share[:, None] * (b - a), np.full(len(share), start - 1.7)]))
-        colours.append(np.full((len(share), 3), _EDGE_COLOUR, dtype=np.uint8))
-    for a, b in _pieces(result, WALL.name):
-        share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(b - a) / 0.2)))
-        z = np.arange(start - 1.0, start + POLE_HEIGHT, 0.4)
-        foot = np.repeat(a + share[:, None] * (b - a), len(z), axis=0)
-        drawn.append(np.column_stack([foot, np.tile(z, len(share))]))
-        colours.append(np.full((len(foot), 3), _COLOURS[False], dtype=np.uint8))
-    write_ply(folder / "landmarks.ply", np.concatenate(drawn), np.concatenate(colours))
+    write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
+    ground, lines, poles = float(result.world_T_lidar[0, 2, 3]), _lines(result), _poles(result.landmarks)
+    shapes = [(pole[None], np.arange(ground - 1.5, ground + HEIGHT, 0.1), POLE_COLOUR) for pole in poles]
+    shapes += [(_sampled(*ends), np.array([ground - 1.7]), LINE_COLOUR) for ends in lines["road lines"]]
+    shapes += [(_sampled(*ends), np.arange(ground - 1.0, ground + HEIGHT, 0.4), WALL_COLOUR) for ends in lines["walls"]]
+    points, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
+    for foot, z, colour in shapes:
+        points.append(np.column_stack([np.repeat(foot, len(z), axis=0), np.tile(z, len(foot))]))
+        colours.append(np.full((len(points[-1]), 3), colour, dtype=np.uint8))
+    write_ply(folder / "landmarks.ply", np.concatenate(points), np.concatenate(colours))
+
+
+def _sampled(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Places (n, 2) from a to b, 0.2 m apart at most."""
+    return np.linspace(a, b, max(2, int(np.linalg.norm(b - a) / 0.2)))
 
 
 def _lines(result: LidarSlam) -> dict[str, FloatArray]:
-    """Pieces of walls and lane edges, under their names."""
-    return {"walls": _pieces(result, WALL.name), "lane edges": _pieces(result, EDGE.name)}
+    """Pieces of walls and road lines, under their names."""
+    return {"walls": _pieces(result, WALL.name), "road lines": _pieces(result, LINE.name)}
 
 
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
-    """Places (P, 2) of all but planes and edges."""
-    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (EDGE, GROUND, WALL)]
+    """Places (P, 2) of all but planes and lines."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, GROUND, WALL)]
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 
 def _pieces(result: LidarSlam, kind: str) -> FloatArray:
-    """Ends (W, 2, 2), from above, of the pieces of walls or lane edges that were seen, one or several of each."""
+    """Ends (W, 2, 2), from above, of the pieces of walls or road lines that were observed, one or several of each."""
     ends = []
     for mark in result.landmarks:
         if mark.kind.name != kind:
@@ -160,7 +135,7 @@ def _pieces(result: LidarSlam, kind: str) -> FloatArray:
         along = np.array([-normal[1], normal[0]])
         foot = (np.array([place["x"], place["y"]]) @ normal) * normal
         spans = []
-        for seen, extent in zip(result.sightings, result.extents, strict=True):
+        for seen, extent in zip(result.observations, result.extents, strict=True):
             if seen.landmark == mark.number:
                 u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
                 spans.append((float(u.min()), float(u.max())))
@@ -169,7 +144,7 @@ def _pieces(result: LidarSlam, kind: str) -> FloatArray:
 
 
 def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """What spans cover together, gaps up to `_GAP` filled: houses on both sides of a street may lie in one plane."""
+    """Return the union of spans, gaps up to `_GAP` filled: houses on both sides of a street may lie in one plane."""
     covered: list[tuple[float, float]] = []
     for low, high in sorted(spans):
         if covered and low <= covered[-1][1] + _GAP:

@@ -48,7 +48,7 @@ class Observations:
         return len(self.nodes)
 
 
-class LinearRows(NamedTuple):
+class LinearisedMeasurements(NamedTuple):
     """rows (m,) of the nodes; z (m, k); H (m, k, d); R (m, k, k)."""
 
     rows: IntArray
@@ -57,7 +57,7 @@ class LinearRows(NamedTuple):
     R: FloatArray
 
 
-class WhitenedRows(NamedTuple):
+class WhitenedMeasurements(NamedTuple):
     """The same in units of its noise, R = 1; log_det: the sum of the logarithms of the determinants of R."""
 
     rows: IntArray
@@ -66,16 +66,16 @@ class WhitenedRows(NamedTuple):
     log_det: float
 
 
-def whitened(seen: LinearRows) -> WhitenedRows:
+def whitened(seen: LinearisedMeasurements) -> WhitenedMeasurements:
     """W z and W H, W R W^T = 1."""
     L = np.linalg.cholesky(seen.R)
     white = np.linalg.solve(L, np.concatenate([seen.H, seen.z[:, :, None]], axis=2))
     log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-    return WhitenedRows(seen.rows, white[:, :, -1], white[:, :, :-1], log_det)
+    return WhitenedMeasurements(seen.rows, white[:, :, -1], white[:, :, :-1], log_det)
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class RecordedMeasurements:
     """Measurements as an estimator records them.
 
     robust: a loss whose weights follow the residuals, or one whose `weights` (m,) a batch smoother sets.
@@ -114,31 +114,31 @@ class Sighting:
                 f"H: expected {span.shape[1]} columns, the size of the nodes' states, got {self.state_dim}"
             )
 
-    def linearised(self, layout: Layout, mean: FloatArray) -> LinearRows:
+    def linearised(self, layout: Layout, mean: FloatArray) -> LinearisedMeasurements:
         """Around the joint state `mean` (D,) of `layout`."""
         measured = self.measured
         rows = layout.rows(measured.nodes)
         if self.linear and self.weights is None:
             assert isinstance(measured, Measurements)
-            return LinearRows(rows, measured.z, measured.H, measured.R)
+            return LinearisedMeasurements(rows, measured.z, measured.H, measured.R)
         x = mean[layout.spans(rows)]
         residual, H = self._residual(x)
         z = measured.z if isinstance(measured, Measurements) else residual + (H @ x[:, :, None])[:, :, 0]
-        root = np.sqrt(self.counted(layout, mean))
-        return LinearRows(rows, root[:, None] * z, root[:, None, None] * H, measured.R)
+        root = np.sqrt(self.weights_at(layout, mean))
+        return LinearisedMeasurements(rows, root[:, None] * z, root[:, None, None] * H, measured.R)
 
     def distances(self, layout: Layout, mean: FloatArray) -> FloatArray:
         """(m,) distances || z - h(x) ||_R of the residuals at the joint state `mean`, in standard deviations."""
         residual, _ = self._residual(mean[layout.spans(layout.rows(self.measured.nodes))])
         return _distances(residual, self.measured.R)
 
-    def counted(self, layout: Layout, mean: FloatArray) -> FloatArray:
+    def weights_at(self, layout: Layout, mean: FloatArray) -> FloatArray:
         """(m,) the weight of each measurement at the joint state `mean`."""
         if self.weights is not None:
             return self.weights
         return np.ones(len(self.measured)) if self.loss is None else self.loss.weight(self.distances(layout, mean))
 
-    def weighted(self, weights: FloatArray) -> Sighting:
+    def with_weights(self, weights: FloatArray) -> RecordedMeasurements:
         """The same with fixed weights."""
         return replace(self, weights=weights)
 
@@ -159,13 +159,6 @@ class Sighting:
         if not (np.isfinite(residual).all() and np.isfinite(H).all()):
             raise InputError(f"{model.name}: the prediction or its Jacobian is not finite")
         return residual, H
-
-
-def along_the_way(measured: Measurements | Observations, robust: Robust | None) -> Sighting:
-    """What a smoother records that never has the whole recording, which graduated non-convexity would need."""
-    if robust is not None:
-        require_kind("robust", robust, Robust)
-    return Sighting(measured, robust)
 
 
 def _distances(residual: FloatArray, R: FloatArray) -> FloatArray:

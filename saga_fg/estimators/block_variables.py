@@ -1,15 +1,15 @@
 r"""The variables of the iSAM2 filter, and the linear factors on them.
 
-A variable is a *cell*: the stacked state of a few nodes that are correlated anyway. One cell a component, or cells of a
-few nodes where a component is large: elimination then works on blocks that are worth a call to the linear algebra. Its
-unit is the standard deviation and its zero is the estimate at which it began,
+A variable is the stacked state of some correlated nodes, a whole component or a part of a large one: elimination works
+on blocks that are worth a call to the linear algebra. Its unit is the standard deviation, its zero its first
+estimate,
 
     x = origin + scale y,
 
 so that information matrices have entries of order one and estimates are small numbers. In it, with W W^T = noise^-1,
 
-    interaction  || W ( x' - F x - b ) ||^2     one factor a cell, over all cells it listens to
-    detection    || W ( z - H x ) ||^2          one factor a cell
+    interaction  || W ( x' - F x - b ) ||^2     one factor a variable, with all variables that act on it
+    detection    || W ( z - H x ) ||^2          one factor a variable
     prior        || W ( x - origin ) ||^2       one factor a component
 """
 
@@ -29,17 +29,17 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.sighting import WhitenedRows
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
-_WHOLE = 64  # size of a component up to which it is one cell
-_PART = 24  # size of the cells of a larger one
+_WHOLE = 64  # size of a component up to which it is one variable
+_PART = 24  # size of the variables of a larger one
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
-    """partition: the cells of the nodes; keys (c,) of their variables; origin, scale (D,): see the module."""
+class BlockVariables:
+    """partition of the nodes into variables; keys (c,) of these; origin, scale (D,): see the module."""
 
     partition: Partition
     keys: IntArray
@@ -49,29 +49,31 @@ class Cells:
     @staticmethod
     def over(
         components: Partition, first_key: int, origin: FloatArray, scale: FloatArray, dynamics: Dynamics | None = None
-    ) -> Cells:
+    ) -> BlockVariables:
         """New variables for the nodes of `components`, with keys from `first_key` on.
 
-        Large components are cut so that nodes next to each other in the graph of `dynamics` share a cell.
+        Large components are cut so that nodes next to each other in the graph of `dynamics` share a variable.
         """
         partition = _divided(components, dynamics)
-        return Cells(partition, first_key + np.arange(partition.count), origin, scale)
+        return BlockVariables(partition, first_key + np.arange(partition.count), origin, scale)
 
-    def extended(self, layout: Layout, means: FloatArray, scale: FloatArray, first_key: int) -> Cells:
-        """With the further nodes of `layout`, each a cell of its own."""
+    def extended(self, layout: Layout, means: FloatArray, scale: FloatArray, first_key: int) -> BlockVariables:
+        """Add the further nodes of `layout`, each a variable of its own."""
         partition = self.partition.extended(layout)
         keys = np.concatenate([self.keys, first_key + np.arange(partition.count - len(self.keys))])
-        return Cells(partition, keys, np.concatenate([self.origin, means]), np.concatenate([self.scale, scale]))
+        return BlockVariables(
+            partition, keys, np.concatenate([self.origin, means]), np.concatenate([self.scale, scale])
+        )
 
     @cached_property
     def sizes(self) -> IntArray:
-        """(c,) size of each cell's state."""
+        """(c,) size of each variable's state."""
         sizes = np.bincount(self.partition.label, weights=self.partition.layout.dims, minlength=len(self.keys))
         return sizes.astype(np.int64)
 
     @cached_property
     def places(self) -> list[IntArray]:
-        """For each cell, where its state is in the joint state."""
+        """Places of each variable in the joint state."""
         partition = self.partition
         places: list[IntArray] = [np.empty(0, dtype=np.int64)] * len(self.keys)
         for node in np.unique(partition.label, return_index=True)[1].tolist():
@@ -90,20 +92,20 @@ class Cells:
         return self.origin + self.scale * y
 
     def priors(self, x: BlockGaussian, rows: IntArray) -> list[gtsam.JacobianFactor]:
-        """One factor a component of `x`, which cells do not straddle; its nodes stand at `rows` here."""
+        """One factor a component of `x`, whose nodes are at `rows` here; no variable belongs to two components."""
         here = self.partition.layout.places(rows)
         factors = []
         for places, P in zip(x.partition.groups, x.blocks, strict=True):
             W = np.linalg.inv(np.linalg.cholesky(P))
             for component, whitener in zip(here[places], W, strict=True):
-                order, cells = self._cells_of(component)
+                order, variables = self._variables_of(component)
                 augmented = np.zeros((len(component), len(component) + 1), order="F")
                 augmented[:, :-1] = whitener[:, order] * self.scale[component[order]]
-                factors.append(native_factor(self.keys[cells].tolist(), self.sizes[cells].tolist(), augmented))
+                factors.append(native_factor(self.keys[variables].tolist(), self.sizes[variables].tolist(), augmented))
         return factors
 
     def births(self, rows: IntArray, covariances: FloatArray) -> list[gtsam.JacobianFactor]:
-        """One factor for each of the nodes at `rows`, cells of their own that begin at their mean: (k, d, d)."""
+        """Priors (k, d, d) of the nodes at `rows`, variables of their own that begin at their mean: one factor each."""
         k, d, _ = covariances.shape
         span = self.partition.layout.offsets[rows][:, None] + np.arange(d)
         augmented = np.zeros((k, d + 1, d))  # transposed
@@ -112,22 +114,22 @@ class Cells:
         keys = self.keys[self.partition.label[rows]].tolist()
         return [native_factor([key], [d], matrix.T) for key, matrix in zip(keys, augmented, strict=True)]
 
-    def detections(self, seen: WhitenedRows) -> list[gtsam.JacobianFactor]:
-        """One factor a cell for the measurements of its nodes."""
+    def detections(self, seen: WhitenedMeasurements) -> list[gtsam.JacobianFactor]:
+        """One factor a variable for the measurements of its nodes."""
         rows, z, H = seen.rows, seen.z, seen.H
         partition, (_, k, d) = self.partition, H.shape
         span = partition.layout.offsets[rows][:, None] + np.arange(d)
         A = H * self.scale[span][:, None, :]
         rhs = z - (H @ self.origin[span][:, :, None])[:, :, 0]
-        number, cell, counts = np.unique(partition.label[rows], return_inverse=True, return_counts=True)
+        number, variable, counts = np.unique(partition.label[rows], return_inverse=True, return_counts=True)
         size = self.sizes[number]
         base = np.concatenate([[0], np.cumsum((size + 1) * counts * k)])
         flat = np.zeros(base[-1])  # every factor's matrix, transposed, one after the other
-        row = rank(cell)[:, None] * k + np.arange(k)
-        at = base[cell][:, None, None] + row[:, None, :]
-        width = (counts * k)[cell][:, None, None]
+        row = rank(variable)[:, None] * k + np.arange(k)
+        at = base[variable][:, None, None] + row[:, None, :]
+        width = (counts * k)[variable][:, None, None]
         flat[at + (partition.offset[rows][:, None] + np.arange(d))[:, :, None] * width] = np.swapaxes(A, 1, 2)
-        flat[at + size[cell][:, None, None] * width] = rhs[:, None, :]
+        flat[at + size[variable][:, None, None] * width] = rhs[:, None, :]
         return [
             native_factor([key], [s], flat[begin:end].reshape(s + 1, -1).T)
             for key, s, begin, end in zip(
@@ -135,28 +137,33 @@ class Cells:
             )
         ]
 
-    def interactions(self, before: Cells, rows: IntArray, dynamics: Dynamics) -> list[gtsam.JacobianFactor]:
-        """One factor a cell whose nodes have dynamics, over the cells `before`, in which all nodes stand at `rows`."""
+    def interactions(self, before: BlockVariables, rows: IntArray, dynamics: Dynamics) -> list[gtsam.JacobianFactor]:
+        """One factor a variable with dynamics, with the variables `before`, in which the nodes are at `rows`."""
         layout, new, old = self.partition.layout, self.partition, before.partition
         if not dynamics.F:
             return []
         target = np.concatenate([blocks.target for blocks in dynamics.F])
         source = rows[np.concatenate([blocks.source for blocks in dynamics.F])]
         pairs, pair = np.unique(new.label[target] * len(before.keys) + old.label[source], return_inverse=True)
-        listener, heard = np.divmod(pairs, len(before.keys))  # cells, sorted by listener
-        width = before.sizes[heard]
-        first = np.searchsorted(listener, np.arange(len(self.keys) + 1))
+        target_variable, source_variable = np.divmod(pairs, len(before.keys))  # variables, sorted by target_variable
+        width = before.sizes[source_variable]
+        first = np.searchsorted(target_variable, np.arange(len(self.keys) + 1))
         ends = np.concatenate([[0], np.cumsum(width)])
-        column = self.sizes[listener] + ends[:-1] - ends[first[listener]]  # where each pair's block begins
+        column = (
+            self.sizes[target_variable] + ends[:-1] - ends[first[target_variable]]
+        )  # where each pair's block begins
         columns = self.sizes + ends[first[1:]] - ends[first[:-1]]
         base = np.concatenate([[0], np.cumsum((columns + 1) * self.sizes)])
         flat = np.zeros(base[-1])  # every factor's matrix, transposed, one after the other
 
         def put(values: FloatArray, node: IntArray, column: IntArray) -> None:
             """Write values (m, d_i, d_j) to the rows of node rows `node` and from `column` on."""
-            cell = new.label[node]
+            variable = new.label[node]
             _, d_i, d_j = values.shape
-            at = base[cell][:, None, None] + (column[:, None, None] + np.arange(d_j)) * self.sizes[cell][:, None, None]
+            at = (
+                base[variable][:, None, None]
+                + (column[:, None, None] + np.arange(d_j)) * self.sizes[variable][:, None, None]
+            )
             flat[at + (new.offset[node][:, None, None] + np.arange(d_i)[:, None])] = values
 
         W = {d: np.zeros((len(layout), d, d)) for d in np.unique(layout.dims).tolist()}
@@ -176,18 +183,18 @@ class Cells:
             values = -(W[d_i][i] @ blocks.values) * before.scale[span][:, None, :]
             put(values, i, column[pair[mine]] + old.offset[j])
         factors = []
-        for cell in np.unique(listener).tolist():
-            heard_here = heard[first[cell] : first[cell + 1]]
-            matrix = flat[base[cell] : base[cell + 1]].reshape(-1, self.sizes[cell]).T
-            keys = [int(self.keys[cell]), *before.keys[heard_here].tolist()]
-            factors.append(native_factor(keys, [int(self.sizes[cell]), *before.sizes[heard_here].tolist()], matrix))
+        for variable in np.unique(target_variable).tolist():
+            here = source_variable[first[variable] : first[variable + 1]]
+            matrix = flat[base[variable] : base[variable + 1]].reshape(-1, self.sizes[variable]).T
+            keys = [int(self.keys[variable]), *before.keys[here].tolist()]
+            factors.append(native_factor(keys, [int(self.sizes[variable]), *before.sizes[here].tolist()], matrix))
         return factors
 
     def marginals(self, isam: gtsam.ISAM2, components: Partition) -> tuple[FloatArray, ...]:
-        """Covariances of the components, which cells do not straddle.
+        """Covariances of the components; no variable belongs to two of them.
 
-        A component of one cell is a root of the Bayes tree. That of several is too, but GTSAM would eliminate it again
-        to hand it over; the sum of its factors, which are those of one moment, is the same information.
+        A component of one variable is a root of the Bayes tree. One of several is too, but GTSAM would eliminate it
+        again to hand it over; the sum of its factors is the same information.
         """
         blocks = []
         factors = isam.getFactorsUnsafe()
@@ -198,14 +205,14 @@ class Cells:
             here = first[components.group[first] == number]
             nodes[components.row[here]] = here
             order = np.broadcast_to(np.arange(places.shape[1]), places.shape).copy()
-            roots = np.empty((*places.shape, places.shape[1]))  # upper triangular in the order of the cells
+            roots = np.empty((*places.shape, places.shape[1]))  # upper triangular in the order of the variables
             single = count[components.label[nodes]] == 1
             for component in np.flatnonzero(single).tolist():
                 conditional = isam.marginalFactor(int(self.keys[self.partition.label[nodes[component]]]))
                 roots[component] = conditional.R()  # a view into what must stay alive
             for component in np.flatnonzero(~single).tolist():
-                order[component], cells = self._cells_of(places[component])
-                information = _information(factors, self.keys[cells].tolist())
+                order[component], variables = self._variables_of(places[component])
+                information = _information(factors, self.keys[variables].tolist())
                 roots[component] = np.linalg.cholesky(information).T
             half = _inverted(roots) * np.take_along_axis(self.scale[places], order, axis=1)[:, :, None]
             P = half @ np.swapaxes(half, 1, 2)
@@ -218,12 +225,12 @@ class Cells:
             blocks.append(P)
         return tuple(blocks)
 
-    def _cells_of(self, places: IntArray) -> tuple[IntArray, IntArray]:
-        """The cells of a component at `places` of the joint state, and the order of its entries cell by cell."""
+    def _variables_of(self, places: IntArray) -> tuple[IntArray, IntArray]:
+        """Order of the entries of a component, at `places` of the joint state, by variable; and its variables."""
         layout = self.partition.layout
         node = np.searchsorted(layout.offsets, places, side="right") - 1
-        cell = self.partition.label[node]
-        return np.argsort(cell, kind="stable"), np.unique(cell)
+        variable = self.partition.label[node]
+        return np.argsort(variable, kind="stable"), np.unique(variable)
 
 
 def _information(factors: gtsam.NonlinearFactorGraph, keys: list[int]) -> FloatArray:
@@ -246,7 +253,7 @@ def _inverted(roots: FloatArray) -> FloatArray:
 
 
 def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:
-    """Cells: the components, large ones cut into parts of nodes that are close in the graph."""
+    """BlockVariables: the components, large ones cut into parts of nodes that are close in the graph."""
     layout, label = components.layout, components.label
     size = np.bincount(label, weights=layout.dims, minlength=components.count).astype(np.int64)
     if (size <= _WHOLE).all():
@@ -261,7 +268,7 @@ def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:
 
 
 def _neighbours_first(layout: Layout, dynamics: Dynamics | None) -> IntArray:
-    """Rows of the nodes in an order in which those that interact are close (reverse Cuthill-McKee)."""
+    """Order the nodes so that those that interact are close (reverse Cuthill-McKee)."""
     if dynamics is None:
         return np.arange(len(layout))
     target = np.concatenate([blocks.target for blocks in dynamics.F])

@@ -1,4 +1,4 @@
-"""Boxes between KITTI's camera frame and the world.
+"""Objects as KITTI writes them, and their boxes between the camera frame and the world.
 
 KITTI gives a box by the centre of its *bottom* face in the rectified camera frame (x right, y down, z ahead), its
 height, width and length, and `rotation_y`, the heading about the camera's y axis: 0 along x, growing from z to -x, so
@@ -17,10 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle
 from saga_fg.types.boxes import Boxes
+
+_NO_BOX = -999.0  # positions below: the object has no 3D box
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,30 @@ class CameraBoxes(Columns):
         return np.asarray(
             self.location[:, None, :] + np.stack([c * along + s * across, down, -s * along + c * across], axis=-1)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class KittiObjects(Columns):
+    """Objects of a sequence, N lines as columns, in the order of the file.
+
+    frame (N,), track_id (N,), type (N,) as in the file, truncated (N,), occluded (N,), alpha (N,), bbox (N, 4) left,
+    top, right, bottom, boxes (N), score (N,) NaN where there is none.
+    """
+
+    frame: IntArray
+    track_id: IntArray
+    type: StrArray
+    truncated: FloatArray
+    occluded: FloatArray
+    alpha: FloatArray
+    bbox: FloatArray
+    boxes: CameraBoxes
+    score: FloatArray
+
+
+def has_box(objects: KittiObjects) -> BoolArray:
+    """Which objects (N,) have a 3D box; `DontCare` regions and results of image trackers have none."""
+    return np.asarray((objects.type != "DontCare") & (objects.boxes.location > _NO_BOX).all(axis=1))
 
 
 def camera_boxes_to_world(boxes: CameraBoxes, label: StrArray | Sequence[str], world_T_camera: FloatArray) -> Boxes:
