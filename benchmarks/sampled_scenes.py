@@ -83,10 +83,10 @@ def sampled_config(
     """
     of_class = ClassSettings(
         motion=ConstantVelocity(settings.acceleration_noise),
-        birth_speed=SPEED,
-        birth_drift=SPEED,
-        birth_score=0.0,
-        duplicate_distance=0.0,
+        initial_speed_deviation=SPEED,
+        initial_lateral_speed_deviation=SPEED,
+        initiation_score=0.0,
+        nms_distance=0.0,
         max_distance=30.0,
         max_coasting=4 * settings.hidden_for,
     )

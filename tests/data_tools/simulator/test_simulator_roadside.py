@@ -20,7 +20,7 @@ from data_tools.simulator.settings import (
 )
 from data_tools.simulator.world import World, build_world
 from saga_fg.errors import InputError
-from saga_fg.types.signal import SIGHTINGS
+from saga_fg.types.signal import COLOUR_LABELS
 
 SHORT = 6.0  # s
 
@@ -50,7 +50,7 @@ def test_colours_are_reported_as_often_rightly_as_the_camera_can() -> None:
     for frame in scene.frames:
         assert frame.road_map is here.road_map
         labels = frame.detections.boxes.label
-        for row in np.flatnonzero(np.isin(labels, SIGHTINGS)).tolist():
+        for row in np.flatnonzero(np.isin(labels, COLOUR_LABELS)).tolist():
             assert frame.sensor == "camera"
             distance = [np.hypot(*(s.position - frame.detections.boxes.position[row, :2])) for s in here.signals]
             nearest = here.signals[int(np.argmin(distance))]
