@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from nuscenes_random_drive import VERSION, write_random_drive
 
-from benchmarks.devkit import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
+from benchmarks.metrics import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
 from data_tools.datasets.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.scored_scenes import read_scored_scenes
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics

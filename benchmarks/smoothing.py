@@ -1,7 +1,7 @@
-"""What the edges are worth to a smoother where objects hide: simulated traffic, with and without them.
+"""`python -m benchmarks smoothing`: the smoother with and without edges, on hidden objects in simulated traffic.
 
 Detections are given to their true objects, so that nothing but the smoother differs. Its states of objects that no
-sensor sees, between one sighting and the next, are compared with the truth, at the same moments of the same objects.
+sensor sees, between one detection and the next, are compared with the truth, at the same moments of the same objects.
 The simulator does not drive by the smoother's dynamics, and both have the same process noise.
 """
 
@@ -9,13 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile, report
+from pipelines.figures import FigureTable, cell, percent
 from pipelines.process import one_thread
-from pipelines.smoothing import SmoothConfig, smooth_known_objects
+from pipelines.smoothing import SmoothConfig, load_smooth_config, smooth_known_objects
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import Evidence, StateTable, attribute, gather_evidence
@@ -97,3 +103,23 @@ def _hidden_errors(scene: Scene, evidence: Evidence, states: StateTable, names: 
         offset = states.mean[at, :2] + evidence.origin - truth.boxes.position[hidden, :2]
         errors.append(np.hypot(*offset[at >= 0].T))
     return np.concatenate(errors)
+
+
+def smoothing(
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first of them.")] = 0,
+    json_file: JsonFile = None,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """The smoother with and without edges on hidden objects; which detection is of which object is known.
+
+    \b
+    Example:
+      python -m benchmarks smoothing --scenes 4 --seed 100 --json figures.json
+    """
+    with progress_bar(unit="scenes") as progress:
+        figures = hidden_objects(load_smooth_config("simulated", config), range(seed, seed + scenes), progress)
+    row = (str(figures.boxes), cell(figures.with_edges), cell(figures.without_edges), percent(figures.change))
+    columns = ("boxes", "with edges", "without", "change, 95 % interval")
+    report([FigureTable(f"{scenes} simulated scenes; RMSE of hidden objects, m", columns, (row,))], figures, json_file)

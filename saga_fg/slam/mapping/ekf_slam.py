@@ -1,11 +1,11 @@
-"""The pose and all landmarks as one Gaussian, kept by an error-state Kalman filter between two smoothings.
+"""EKF-SLAM: the pose and all landmarks as one Gaussian, kept by an error-state Kalman filter between two smoothings.
 
 State x = (pose, l_1, ..., l_n) with covariance P of its tangents. With factors linearised and whitened at the state,
 r + A_p dp + A_l dl + w, w ~ N(0, 1):
 
-    move      P_pp <- Ad P_pp Ad^T + Q,  P_pl <- Ad P_pl              Ad of the inverse increment
+    predict   P_pp <- Ad P_pp Ad^T + Q,  P_pl <- Ad P_pl              Ad of the inverse increment
     update    S = A P A^T + 1,  K = P A^T S^-1,  x <- x + (-K r),  P <- P - K A P
-    append    dl = -A_l^-1 (A_p dp + w)                                 a landmark where its first observation puts it
+    augment   dl = -A_l^-1 (A_p dp + w)                                 a landmark starts at its first observation
 
 Source: R. Smith, M. Self, P. Cheeseman, "Estimating uncertain spatial relationships in robotics", 1990.
 """
@@ -24,7 +24,7 @@ from factors.differences import central_differences
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.landmark import LandmarkType, Observation
 
-_SAME = 1e-6  # variance of what is one and the same, for the numerics
+_SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics
 POSE = 0  # key of the pose; landmarks have positive ones
 
 
@@ -38,8 +38,8 @@ class Innovation:
     by_landmark: FloatArray
 
 
-class JointEstimate:
-    """Pose and landmarks; a landmark's key is the number it was appended with."""
+class EkfSlam:
+    """Pose and landmarks; a landmark's key is its number."""
 
     def __init__(
         self,
@@ -67,12 +67,12 @@ class JointEstimate:
         return self.kinds[landmark].variable.read(self.values, landmark)
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
-        """The joint covariance of these."""
+        """The joint covariance of some variables."""
         columns = self._columns_of(keys)
         return np.asarray(self.P[np.ix_(columns, columns)])
 
-    def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
-        """Move the pose by a measured increment; covariance (k, k) of its tangent."""
+    def predict(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
+        """Predict the pose after a measured increment; covariance (k, k) of its tangent."""
         increment = pose("a_T_b", a_T_b)
         k = increment.dim()
         self.values.update(POSE, self.pose.compose(increment))
@@ -112,7 +112,7 @@ class JointEstimate:
         return np.asarray(A @ self.P[np.ix_(columns, columns)] @ A.T + np.eye(len(A)))
 
     def squared_distances(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, FloatArray]:
-        """d^2 (n,) and log det S (n,) of innovations of the same kind, each for itself."""
+        """d^2 (n,) and log det S (n,) of each of several innovations of one kind."""
         k = self._columns[POSE].stop
         A_p = np.stack([i.by_pose for i in innovations])
         A_l = np.stack([i.by_landmark for i in innovations])
@@ -127,7 +127,7 @@ class JointEstimate:
         return squared, np.linalg.slogdet(S)[1]
 
     def update(self, innovations: Sequence[Innovation]) -> None:
-        """Take in observations of different landmarks made from the present pose."""
+        """Update with observations of different landmarks made from the present pose."""
         A, columns = self._stacked(innovations)
         r = np.concatenate([i.r for i in innovations])
         PA = self.P[:, columns] @ A.T
@@ -138,7 +138,7 @@ class JointEstimate:
         self._retract(-K @ r)
 
     def differences(self, pairs: Sequence[tuple[int, int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How far K pairs of a kind are apart: l_j seen from l_i in its tangent, (K, d), to first order delta + J dl.
+        """Differences of K pairs of one kind: l_j in the tangent of l_i, (K, d), to first order delta + J dl.
 
         Returns the differences, and their derivatives J_i and J_j (K, d, d).
         """
@@ -152,7 +152,7 @@ class JointEstimate:
         return delta, np.stack([first for first, _ in J]), np.stack([second for _, second in J])
 
     def difference_covariances(self, pairs: Sequence[tuple[int, int]], J_i: FloatArray, J_j: FloatArray) -> FloatArray:
-        """The covariance (K, d, d) of each difference for itself."""
+        """The covariance (K, d, d) of each difference."""
         i = np.stack([self._columns_of([pair[0]]) for pair in pairs])
         j = np.stack([self._columns_of([pair[1]]) for pair in pairs])
         both = np.concatenate([i, j], axis=1)
@@ -174,8 +174,8 @@ class JointEstimate:
         C = C.reshape(K * d, K * d) + _SAME * np.eye(K * d)
         return np.asarray(C.reshape(K, d, K, d))
 
-    def append(self, landmark: int, observation: Observation) -> None:
-        """Add a landmark where an observation from the present pose puts it."""
+    def augment(self, landmark: int, observation: Observation) -> None:
+        """Add a landmark at its first observation, from the present pose."""
         kind = observation.kind
         self._insert(landmark, kind, kind.initialise(self.pose.matrix(), observation.value))
         n, d, k = len(self.P), kind.variable.dim, self._columns[POSE].stop
@@ -197,7 +197,7 @@ class JointEstimate:
         self._columns[landmark] = slice(end, end + kind.variable.dim)
 
     def _columns_of(self, keys: Sequence[int]) -> IntArray:
-        """The columns of P that belong to these, one after the other."""
+        """The columns of P of some variables, one after the other."""
         return np.concatenate([np.arange(len(self.P))[self._columns[key]] for key in keys])
 
     def _stacked(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, FloatArray]:

@@ -1,31 +1,39 @@
-"""Coasting on real trajectories: an object is hidden for some seconds while its neighbours stay visible.
+"""`python -m benchmarks gaps`: where is an object that is hidden for some seconds while its neighbours stay visible?
 
-Each method is the joint filter of `saga_fg`, told which measurement is whose; the error is the distance between where
-an object is predicted at the end of a gap and where it reappears. All methods start a gap from the same measurements:
+Recorded trajectories. Each method is the joint filter of `saga_fg`, told which measurement is of which object; the
+error is the distance between the prediction at the end of a gap and the place where the object reappears. All methods
+start a gap from the same measurements:
 
-    kf            independent objects (their joint filter falls apart into one of each)
+    kf            independent objects
     hand-crafted  the edge rules that the configuration of the kind of data ships
     learned       `fit_by_held_out` on the other recordings
-    noise alone   the process noise that goes with these interactions, without edges: what is not the neighbours' doing
-    network       networks (`fit_networks`) fitted alike, where they are asked for (extra [learn])
+    noise alone   the process noise learned with these interactions, without edges
+    network       networks (`fit_networks`) fitted alike, if asked for (extra [learn])
 
-The process noise of kf, by class, and the noise of the positions are the most likely ones, by the same likelihood of
-reappearances and on the same recordings as the learned interactions; hand-crafted has those of kf. Recordings are dealt
-into folds: what is measured on one was fitted on the others. Intervals are bootstraps over stretches of ten seconds.
+The process noise of kf, by class, and the noise of the positions are the most likely ones on the recordings that the
+interactions are learned from; hand-crafted has those of kf. Recordings are dealt into folds: each is tested with what
+the others taught. Intervals are bootstraps over blocks of ten seconds.
 
-Pedestrians in company, who walk beside another that stays visible when they are hidden, are told apart as well.
+Pedestrians with companions, who walk beside another that stays visible, are a group of their own as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from benchmarks.block_bootstrap import Average, relative_change_of_errors
 from data_tools.metrics import Interval
-from pipelines.figures import FigureTable, cell
+from pipelines.cli.options import Config, Verbose, names
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile, report
+from pipelines.config import load_config
+from pipelines.figures import FigureTable, cell, percent
+from pipelines.learning import TrajectorySource
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import (
@@ -59,12 +67,12 @@ Method = str
 KF, HAND_CRAFTED, LEARNED, NETWORK = "kf", "hand-crafted", "learned", "network"
 NOISE_ALONE = "noise alone"
 AVERAGES: tuple[Average, Average] = ("median", "mean")
-STRETCH = 10.0  # s
-BESIDE, ALIKE = 2.0, 0.5  # in company: another within so many m, whose velocity differs by less than so many m/s
+BLOCK = 10.0  # s
+BESIDE, ALIKE = 2.0, 0.5  # a companion: another within so many m whose velocity differs by less than so many m/s
 
 
 @dataclass(frozen=True)
-class CoastingSettings:
+class GapBenchSettings:
     """How much is done: folds, how many of them are tested, gaps judged in a recording, whether by networks too."""
 
     folds: int = 3
@@ -74,32 +82,32 @@ class CoastingSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class CoastingErrors:
+class GapErrors:
     """n gaps of up to S steps.
 
-    recording, stretch (n,) numbers; label, in_company (n,); gap (S,) lengths, s; errors (n, S) by method, m
+    recording, block (n,) numbers; label, with_companions (n,); gap (S,) lengths, s; errors (n, S) by method, m
     """
 
     recording: IntArray
-    stretch: IntArray
+    block: IntArray
     label: StrArray
-    in_company: BoolArray
+    with_companions: BoolArray
     gap: FloatArray
     errors: dict[Method, FloatArray]
 
-    def select(self, rows: IntArray | BoolArray) -> CoastingErrors:
+    def select(self, rows: IntArray | BoolArray) -> GapErrors:
         """Some of the gaps."""
         errors = {method: e[rows] for method, e in self.errors.items()}
-        of_gaps = (self.recording[rows], self.stretch[rows], self.label[rows], self.in_company[rows])
-        return CoastingErrors(*of_gaps, self.gap, errors)
+        of_gaps = (self.recording[rows], self.block[rows], self.label[rows], self.with_companions[rows])
+        return GapErrors(*of_gaps, self.gap, errors)
 
-    def groups(self) -> dict[str, CoastingErrors]:
-        """By class, and the pedestrians in company."""
+    def groups(self) -> dict[str, GapErrors]:
+        """By class, and the pedestrians with companions."""
         found = {label: self.select(self.label == label) for label in np.unique(self.label).tolist()}
-        together = (self.label == "pedestrian") & self.in_company
-        return found | ({"pedestrian in company": self.select(together)} if together.any() else {})
+        together = (self.label == "pedestrian") & self.with_companions
+        return found | ({"pedestrian with companions": self.select(together)} if together.any() else {})
 
-    def at(self, gap: float) -> tuple[float, CoastingErrors]:
+    def at(self, gap: float) -> tuple[float, GapErrors]:
         """The length nearest to `gap`, s, and those gaps, with the errors (n,) at its end, of which that is known."""
         column = int(np.argmin(np.abs(self.gap - gap)))
         known = np.all([np.isfinite(e[:, column]) for e in self.errors.values()], axis=0)
@@ -108,21 +116,21 @@ class CoastingErrors:
 
     def change(self, method: Method, base: Method, average: Average) -> Interval:
         """Relative change of the average of all errors."""
-        return relative_change_of_errors(self.errors[method], self.errors[base], self.stretch, average)
+        return relative_change_of_errors(self.errors[method], self.errors[base], self.block, average)
 
 
-def coasting_errors(
+def gap_errors(
     recordings: Mapping[str, Trajectories],
     classes: tuple[str, ...],
     hand_crafted: Sequence[EdgeRule],
-    settings: CoastingSettings | None = None,
+    settings: GapBenchSettings | None = None,
     progress: Progress | None = None,
-) -> tuple[CoastingErrors, dict[Method, list[FittedInteractions]]]:
+) -> tuple[GapErrors, dict[Method, list[FittedInteractions]]]:
     """Fit and measure on some recordings of one kind, fold by fold; returns what each fold learned, too.
 
     Raises `InputError` where the recordings of a fold have nothing to learn from, or not all have one rate.
     """
-    settings, lengths = settings or CoastingSettings(), GapSettings()
+    settings, lengths = settings or GapBenchSettings(), GapSettings()
     names, ends = list(recordings), _ends(recordings, lengths)
     folds = min(settings.folds, len(names))
     likelihoods = []
@@ -153,16 +161,16 @@ def coasting_errors(
             alone = FilterNoise(fitted[LEARNED].acceleration_noise, own.position_noise)
             same = _sample(trajectories, alone, classes, lengths, k).drawn(settings.most_gaps, seed=1)
             errors[NOISE_ALONE] = errors_alone(same)
-            parts.append((gaps, trajectories.time[gaps.moment] // STRETCH, errors))
+            parts.append((gaps, trajectories.time[gaps.moment] // BLOCK, errors))
             if progress is not None:
                 progress(f"coasting {names[k]}", len(parts), len(names))
     recording = np.concatenate([gaps.recording for gaps, _, _ in parts])
-    stretch = np.unique(np.stack([recording, np.concatenate([s for _, s, _ in parts])]), axis=1, return_inverse=True)[1]
-    return CoastingErrors(
+    block = np.unique(np.stack([recording, np.concatenate([s for _, s, _ in parts])]), axis=1, return_inverse=True)[1]
+    return GapErrors(
         recording,
-        stretch,
+        block,
         np.concatenate([gaps.label for gaps, _, _ in parts]),
-        np.concatenate([_in_company(gaps) for gaps, _, _ in parts]),
+        np.concatenate([_with_companions(gaps) for gaps, _, _ in parts]),
         ends,
         {method: np.concatenate([errors[method] for _, _, errors in parts]) for method in parts[0][2]},
     ), learned
@@ -204,7 +212,7 @@ def _sample(
     return sample_gaps(trajectories, own.filtered(trajectories), classes, lengths, number)
 
 
-def _in_company(gaps: GapSample) -> BoolArray:
+def _with_companions(gaps: GapSample) -> BoolArray:
     """(n,) whether another of the class moves alike beside the object when it is hidden."""
     offset = gaps.other_mean[:, 0] - gaps.mean[:, None]
     near, alike = (np.hypot(offset[..., k], offset[..., k + 1]) for k in (0, 2))
@@ -213,7 +221,7 @@ def _in_company(gaps: GapSample) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class CoastingFigure:
+class GapFigure:
     """Errors of one method at the end of gaps of one class, m, and their changes against kf (None for kf itself)."""
 
     label: str
@@ -226,7 +234,7 @@ class CoastingFigure:
     mean_change: Interval | None
 
 
-def coasting_figures(errors: CoastingErrors) -> list[CoastingFigure]:
+def gap_figures(errors: GapErrors) -> list[GapFigure]:
     """All classes, gaps and methods."""
     rows = []
     for group, mine in errors.groups().items():
@@ -235,31 +243,73 @@ def coasting_figures(errors: CoastingErrors) -> list[CoastingFigure]:
             for method, e in there.errors.items():
                 if len(e):
                     changes = [None if method == KF else there.change(method, KF, average) for average in AVERAGES]
-                    rows.append(
-                        CoastingFigure(group, gap, method, len(e), float(np.median(e)), float(e.mean()), *changes)
-                    )
+                    rows.append(GapFigure(group, gap, method, len(e), float(np.median(e)), float(e.mean()), *changes))
     return rows
 
 
-def coasting_table(figures: Sequence[CoastingFigure], title: str) -> FigureTable:
-    """The figures as people read them."""
+def gap_table(figures: Sequence[GapFigure], title: str) -> FigureTable:
+    """A row for each class, gap and method."""
+    rows = []
+    for row in figures:
+        changes = ("-" if c is None else percent(c) for c in (row.median_change, row.mean_change))
+        median, mean = changes
+        name = f"{row.label}, {row.gap:.1f} s"
+        rows.append((name, row.method, str(row.gaps), cell(row.median), median, cell(row.mean), mean))
+    title = f"{title}: position error when a hidden object reappears, m; 95 % intervals"
+    columns = ("class, gap", "method", "gaps", "median", "against kf", "mean", "against kf")
+    return FigureTable(title, columns, tuple(rows))
 
-    def change(of: Interval | None) -> str:
-        return "-" if of is None else f"{100 * of.estimate:+.1f} % ({100 * of.low:+.1f} to {100 * of.high:+.1f})"
 
-    return FigureTable(
-        f"{title}: position error when a hidden object reappears, m; 95 % intervals",
-        ("class, gap", "method", "gaps", "median", "against kf", "mean", "against kf"),
-        tuple(
-            (
-                f"{row.label}, {row.gap:.1f} s",
-                row.method,
-                str(row.gaps),
-                cell(row.median),
-                change(row.median_change),
-                cell(row.mean),
-                change(row.mean_change),
-            )
-            for row in figures
+def gaps(
+    data: Annotated[
+        list[str],
+        typer.Option(
+            "--data",
+            help="Recordings with ground truth: kitti=, nuscenes=, eth_ucy=, argoverse= with their folder, simulated= "
+            "with a number of scenes; repeatable.",
+            metavar="KIND=PLACE",
         ),
-    )
+    ],
+    recordings: Annotated[
+        str | None, typer.Option("--recordings", help="Recordings of a single --data, with commas between them.")
+    ] = None,
+    folds: Annotated[int, typer.Option("--folds", min=2, help="Each is tested with what the others taught.")] = 3,
+    tested_folds: Annotated[
+        int | None, typer.Option("--tested-folds", min=1, help="Test the first folds only; all if left out.")
+    ] = None,
+    most: Annotated[int, typer.Option("--gaps", min=1, help="Gaps judged in a recording, sampled from all.")] = 500,
+    network: Annotated[
+        bool, typer.Option("--network", help="Train networks too (extra [learn]); minutes a fold.")
+    ] = False,
+    json_file: JsonFile = None,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """Hide one object for 1, 2 and 3 s while its neighbours stay visible: the error when it reappears.
+
+    Independent objects (kf) against the hand-crafted and the learned interactions. Process noise and interactions are
+    fitted on other recordings than those that are tested. Intervals are bootstraps over blocks of 10 s.
+
+    \b
+    Examples:
+      python -m benchmarks gaps --data kitti=data/kitti --json gaps.json
+      python -m benchmarks gaps --data eth_ucy=data/eth_ucy --data simulated=6
+      python -m benchmarks gaps --data kitti=data/kitti --network --tested-folds 1
+    """
+    if recordings is not None and len(data) != 1:
+        raise InputError(f"--recordings {recordings}: goes with a single --data")
+    chosen = names("--recordings", recordings) if recordings is not None else None
+    shown, figures, settings = [], {}, GapBenchSettings(folds, tested_folds, most, network)
+    for source in [TrajectorySource.parsed(value, chosen) for value in data]:
+        if source.kind not in CLASSES:
+            raise InputError(f"--data {source.kind}=...: expected recordings with ground truth: {', '.join(CLASSES)}")
+        found = source.trajectories()
+        if len(found) < 2:
+            raise InputError(f"--data {source.kind}={source.place}: expected at least two recordings")
+        rules = load_config(source.family, config).tracker.edges
+        with progress_bar(unit="recordings") as progress:
+            errors, learned = gap_errors(found, CLASSES[source.kind], rules, settings, progress)
+        rows = gap_figures(errors)
+        shown.append(gap_table(rows, f"{source.kind}, {len(found)} recordings"))
+        figures[source.kind] = {"recordings": list(found), "figures": rows, "learned": learned}
+    report(shown, figures, json_file)

@@ -1,10 +1,9 @@
 """The vehicle and the objects around it online, in one running graph, against one after the other.
 
-Decoupled: the odometry's path, and the tracker along it. Joint: `saga_fg.slam.joint.OnlineEstimator`, which knows the
-same frames and odometry. Both are asked at every frame for what they know then. Errors of objects are those of position
-and velocity in the world, of the pairs (object, moment) that the tracker reports and that both have detected, within 2
-m of the truth along the true path, in at least `SETTLED` frames before: earlier, velocities are the priors of new
-tracks.
+Decoupled: the odometry's path, and the tracker along it. Joint: `saga_fg.slam.joint.OnlineEstimator`, with the same
+frames and odometry. Both are read out at every frame. Errors of objects are those of position and velocity in the
+world, of the pairs (object, moment) that the tracker reports and that both have detected, within 2 m of the truth along
+the true path, in at least `SETTLED` frames before: earlier, velocities are the priors of new tracks.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import numpy as np
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import TrackConfig
+from pipelines.figures import FigureTable, percent
 from pipelines.slam.joint import degraded_drive
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -70,7 +70,7 @@ def bench_online(
     progress: Progress | None = None,
     so_far: Callable[[OnlineBench], None] | None = None,
 ) -> OnlineBench:
-    """Run all scenes with the first seed, then with the next; so_far: told after every run what the runs say.
+    """Run all scenes with the first seed, then with the next; so_far: called after every run with the results up to it.
 
     Raises `InputError` for a scene without ground truth.
     """
@@ -188,3 +188,16 @@ def _judged(rows: Sequence[OnlineRow]) -> OnlineBench:
         change(lambda row: row.position, lambda row: row.pairs),
         change(lambda row: row.velocity, lambda row: row.pairs),
     )
+
+
+def online_table(result: OnlineBench) -> FigureTable:
+    """A row for each recording and seed, and the changes of the pooled errors."""
+    names = ("ate", "position", "velocity", "median_velocity")
+    rows = []
+    for row in result.rows:
+        ate, *objects = ("{:.3f} -> {:.3f}".format(*getattr(row, name)) for name in names)
+        rows.append((row.scene, str(row.seed), ate, f"{row.settled_ate:.3f}", str(row.pairs), *objects))
+    changes = (percent(result.ate), "", "", percent(result.position), percent(result.velocity), "")
+    rows.append(("pooled, 95 % interval", "", *changes))
+    columns = ("recording", "seed", "ATE, m", "settled", "pairs", "position, m", "velocity, m/s", "median")
+    return FigureTable("decoupled -> joint, RMSE of objects in the world", columns, tuple(rows))

@@ -77,7 +77,7 @@ class Traffic:
         return _REPULSION
 
 
-def draw_traffic(
+def sample_traffic(
     rng: np.random.Generator,
     frames: int = 12,
     cars: int = 4,

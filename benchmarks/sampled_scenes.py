@@ -1,9 +1,8 @@
-"""Scenes drawn from the interaction model itself: groups that share their velocity, seen by a sensor with gaps.
+"""Scenes sampled from the interaction model itself: groups that share their velocity, seen by a sensor with gaps.
 
 The truth moves by the scene graph's own dynamics: edges between all members of a group, frozen for the interval, and
-white noise accelerations of every object. Members are detected with a noise, among false detections; now and then a
-whole group, or an object alone, is hidden, as behind a lorry. The tracker is told neither who is of which group nor
-when anybody is hidden.
+white noise accelerations of every object. Members are detected with noise, among false detections; now and then a whole
+group, or an object alone, is hidden, as behind a lorry. The tracker knows neither the groups nor who is hidden.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.bench.flocks import sample_step
 from pipelines.config import TrackConfig
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_network import EdgeNetwork
@@ -37,8 +37,8 @@ CLUTTER_AREA = 1e4  # over which what is false is spread, m^2
 
 
 @dataclass(frozen=True)
-class DrawnSettings:
-    """What scenes are like.
+class SceneSettings:
+    """Parameters of the scenes.
 
     coupling  total rate at which an object takes over the velocity of its group, 1/s
     noise     standard deviation of a detected position, m
@@ -74,10 +74,10 @@ class DrawnSettings:
         )
 
 
-def drawn_config(
-    settings: DrawnSettings, edges: tuple[Following | Neighbours | EdgeNetwork, ...] | None = None
+def sampled_config(
+    settings: SceneSettings, edges: tuple[Following | Neighbours | EdgeNetwork, ...] | None = None
 ) -> TrackConfig:
-    """Trackers that know what is drawn but for the edges, which are the true ones if left out.
+    """Settings of trackers that know the true parameters; the edges are the true ones if left out.
 
     Objects come from anywhere, are hidden for any time, and a miss says little: they may be hidden.
     """
@@ -102,7 +102,7 @@ def drawn_config(
     return TrackConfig(tracker, sensors={DEFAULT: Sensor(noise=noise, detection_probability=settings.detected)})
 
 
-def drawn_scene(settings: DrawnSettings, seed: int) -> Scene:
+def sample_scene(settings: SceneSettings, seed: int) -> Scene:
     """One scene with its ground truth."""
     rng = np.random.default_rng(seed)
     n = settings.groups * settings.members
@@ -115,16 +115,16 @@ def drawn_scene(settings: DrawnSettings, seed: int) -> Scene:
     frames, truth = [], []
     for step in range(steps):
         if step:
-            x = _moved(x, _transition(x, car, settings), rng)
+            x = sample_step(_transition(x, car, settings), x, rng)
         boxes = _boxes(x[:, :2], x[:, 2:])
         truth.append(Annotations(names, boxes, visible[step]))
         frames.append(_frame(step * INTERVAL, x, visible[step], settings, rng))
     times = np.arange(steps, dtype=np.float64) * INTERVAL
     pose = np.tile(np.eye(4), (steps, 1, 1))
-    return Scene(f"drawn-{seed:04d}", times, pose, ("",) * steps, tuple(frames), tuple(truth))
+    return Scene(f"sampled-{seed:04d}", times, pose, ("",) * steps, tuple(frames), tuple(truth))
 
 
-def _start(settings: DrawnSettings, group: IntArray, rng: np.random.Generator) -> FloatArray:
+def _start(settings: SceneSettings, group: IntArray, rng: np.random.Generator) -> FloatArray:
     """(n, 4): groups in a row of clusters, each with a velocity of its own."""
     side = int(np.ceil(np.sqrt(settings.members)))
     member = np.arange(len(group)) % settings.members
@@ -136,7 +136,7 @@ def _start(settings: DrawnSettings, group: IntArray, rng: np.random.Generator) -
     return np.concatenate([position, SPEED * np.stack([np.cos(heading), np.sin(heading)], axis=-1)[group]], axis=1)
 
 
-def _transition(x: FloatArray, car: NodeType, settings: DrawnSettings) -> Transition:
+def _transition(x: FloatArray, car: NodeType, settings: SceneSettings) -> Transition:
     """The dynamics of the next interval, by the rule at the true states."""
     n = len(x)
     heading = np.arctan2(x[:, 3], x[:, 2])
@@ -146,16 +146,7 @@ def _transition(x: FloatArray, car: NodeType, settings: DrawnSettings) -> Transi
     return discretise(build_graph(nodes, (settings.rule,)), INTERVAL)
 
 
-def _moved(x: FloatArray, move: Transition, rng: np.random.Generator) -> FloatArray:
-    """States (n, 4) one interval later, process noise drawn."""
-    moved: FloatArray = (move.F_matrix @ x.ravel() + move.b).reshape(x.shape)
-    for blocks in move.Q:
-        drawn = rng.normal(size=(len(blocks.target), 4, 1))
-        moved[blocks.target] += (np.linalg.cholesky(blocks.values) @ drawn)[:, :, 0]
-    return moved
-
-
-def _hidden(settings: DrawnSettings, group: IntArray, steps: int, rng: np.random.Generator) -> BoolArray:
+def _hidden(settings: SceneSettings, group: IntArray, steps: int, rng: np.random.Generator) -> BoolArray:
     """(steps, n) who is hidden."""
     length = round(settings.hidden_for / INTERVAL)
     begins = settings.hidden / 2 / length
@@ -168,7 +159,7 @@ def _hidden(settings: DrawnSettings, group: IntArray, steps: int, rng: np.random
     return hidden
 
 
-def _frame(time: float, x: FloatArray, visible: BoolArray, settings: DrawnSettings, rng: np.random.Generator) -> Frame:
+def _frame(time: float, x: FloatArray, visible: BoolArray, settings: SceneSettings, rng: np.random.Generator) -> Frame:
     seen = visible & (rng.random(len(x)) < settings.detected)
     z = x[seen, :2] + settings.noise * rng.normal(size=(int(seen.sum()), 2))
     low, high = x[:, :2].min(axis=0) - 10.0, x[:, :2].max(axis=0) + 10.0
