@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics.error_figures import BANDS, calibration, errors_by_class
+from data_tools.metrics.error_summary import BANDS, calibration, errors_by_class
 from data_tools.metrics.label_errors import LabelErrors
 from data_tools.metrics.nuscenes_tracking import RecallCurves
 from saga_fg.numerics.arrays import FloatArray
@@ -51,7 +51,7 @@ def calibration_plot(errors: LabelErrors) -> Any:
 
     A line for each class; classes with too few boxes to judge are dotted. On the diagonal the covariances are right,
     above it too large, below it too small; the grey bands are those that classes are judged by
-    (`data_tools.metrics.error_figures`).
+    (`data_tools.metrics.error_summary`).
     """
     from matplotlib.figure import Figure
 
