@@ -21,8 +21,8 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from saga_fg.estimators.epoch import Epoch
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.motion import Motion
 from saga_fg.numerics.arrays import IntArray
 
 log = logging.getLogger(__name__)
@@ -56,8 +56,8 @@ def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> floa
     nodes = np.unique(np.concatenate([layout.nodes for layout in layouts]))
     a, b = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     for epoch in epochs:
-        if isinstance(epoch.motion, Motion):
-            for target, source in _heard(epoch.motion):
+        if isinstance(epoch.interval, IntervalDynamics):
+            for target, source in _heard(epoch.interval):
                 a.append(np.searchsorted(nodes, target))
                 b.append(np.searchsorted(nodes, source))
     i, j = np.concatenate(a), np.concatenate(b)
@@ -70,12 +70,12 @@ def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> floa
     return _SWEEP_CALLS * len(epochs) + work / _SWEEP_SPEED
 
 
-def _heard(motion: Motion) -> list[tuple[IntArray, IntArray]]:
+def _heard(interval: IntervalDynamics) -> list[tuple[IntArray, IntArray]]:
     """Ids of nodes and of those they listen to."""
-    nodes = motion.transition.nodes
-    pairs = [(nodes[blocks.target], nodes[blocks.source]) for blocks in motion.transition.F]
-    for flow in motion.flows:
-        pairs += [(nodes[flow.rows[:, 0]], nodes[others]) for others in flow.rows.T[1:]]
+    nodes = interval.transition.nodes
+    pairs = [(nodes[blocks.target], nodes[blocks.source]) for blocks in interval.transition.F]
+    for group in interval.nonlinear:
+        pairs += [(nodes[group.rows[:, 0]], nodes[others]) for others in group.rows.T[1:]]
     return pairs
 
 
@@ -110,8 +110,8 @@ def _structure(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> tuple[list
         here, there = layouts[k], layouts[k + 1]
         gone = set(epoch.gone)
         listens = {node: [first[k] + row] for row, node in enumerate(here.nodes.tolist()) if node not in gone}
-        if isinstance(epoch.motion, Motion):
-            for targets, sources in _heard(epoch.motion):
+        if isinstance(epoch.interval, IntervalDynamics):
+            for targets, sources in _heard(epoch.interval):
                 for target, source in zip(targets.tolist(), (first[k] + here.rows(sources)).tolist(), strict=True):
                     listens[target].append(source)
         rows = first[k + 1] + there.rows(list(listens))

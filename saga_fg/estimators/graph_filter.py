@@ -18,9 +18,9 @@ from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.graph_moments import by_covariance, condense, lossy
 from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_graph import IncrementalSmoother
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, beginnings
@@ -123,10 +123,10 @@ class GraphFilter(LatestMarginals):
 
     def predict(self, transition: Transition) -> None:
         require_kind("transition", transition, Transition)
-        motion = Motion(transition)
-        motion.check(self._layout)
+        interval = IntervalDynamics(transition)
+        interval.check(self._layout)
         x, nodes = self.posterior(), self._layout.nodes
-        dynamics = motion.dynamics(self._layout, x.mean)
+        dynamics = interval.linearised(self._layout, x.mean)
         still = dynamics.still
         if transition.dt == 0 and still.all():
             return

@@ -14,10 +14,10 @@ from typing import ClassVar
 import numpy as np
 
 from factors import detection_factors, gaussian_factors, prior_factors
-from saga_fg.estimators.factor_graph import motion_factors
+from saga_fg.estimators.factor_graph import interval_factors
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import Observations
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.parts import NewVariable
@@ -71,8 +71,8 @@ class Interactions:
         now = {node: node_key(node, view.epoch) for node in nodes}
         layout = Layout(nodes, transition.graph.dims)
         mean = np.concatenate([view.state(earlier[node]) for node in nodes])
-        motion = Motion(transition)
-        dynamics = motion.dynamics(layout, mean)
+        interval = IntervalDynamics(transition)
+        dynamics = interval.linearised(layout, mean)
         moved = dynamics.moved(mean) + dynamics.b
         states = np.split(moved, transition.offsets[1:-1])
         new = [
@@ -80,7 +80,7 @@ class Interactions:
             for n, x in zip(nodes, states, strict=True)
             if n not in self.standing
         ]
-        native, nonlinear = motion_factors(motion, layout, mean, dict(earlier), now)
+        native, nonlinear = interval_factors(interval, layout, mean, dict(earlier), now)
         still = {now[node] for node in self.standing}
         return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
 

@@ -28,8 +28,8 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import WhitenedFactor, correct_whitened
 from saga_fg.estimators.dynamics import Dynamics, identity, predict
 from saga_fg.estimators.graph_moments import condense
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.partition import Partition
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import node_kind
@@ -67,11 +67,11 @@ class Beside:
 
     def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
         """Those of a transition over the nodes; the variables beside them stay as they are."""
-        motion, others = Motion(transition), self.rows(x.layout)
+        interval, others = IntervalDynamics(transition), self.rows(x.layout)
         if len(others) == 0:
-            return motion.dynamics(x.layout, x.mean)
+            return interval.linearised(x.layout, x.mean)
         nodes = x.without(others)
-        return motion.dynamics(nodes.layout, nodes.mean).beside(x.layout, others)
+        return interval.linearised(nodes.layout, nodes.mean).beside(x.layout, others)
 
     def priors(self, x: BlockGaussian, time: float) -> SceneFactorGraph:
         """All that is known at `time`, as one prior for each component."""
