@@ -35,8 +35,8 @@ from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.transition import Blocks
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 

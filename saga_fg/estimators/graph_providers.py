@@ -20,8 +20,8 @@ from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import Observations
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -53,12 +53,12 @@ class Interactions:
     """Objects move by a transition over those that stay.
 
     earlier    by id, the keys of their variables, by default those of the epoch before
-    standing   ids of those whose variables stay as they are
+    carried_over   ids of those whose variables stay as they are
     """
 
     transition: Transition
     earlier: Mapping[int, int] | None = None
-    standing: Collection[int] = ()
+    carried_over: Collection[int] = ()
     name: str = "interactions"
     internal: ClassVar[bool] = True
 
@@ -78,10 +78,10 @@ class Interactions:
         new = [
             NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
             for n, x in zip(nodes, states, strict=True)
-            if n not in self.standing
+            if n not in self.carried_over
         ]
         native, nonlinear = interval_factors(interval, layout, mean, dict(earlier), now)
-        still = {now[node] for node in self.standing}
+        still = {now[node] for node in self.carried_over}
         return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
 
 

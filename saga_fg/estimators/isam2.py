@@ -24,14 +24,13 @@ from saga_fg.estimators.backward import smoothed_means
 from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
 from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
@@ -206,7 +205,7 @@ def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
     stay = x.without(x.layout.rows(state.newest.gone))
     dynamics = interval.linearised(stay.layout, stay.mean)
     apart = dynamics.separated(stay)
-    prediction = Prediction.of(apart, dynamics)
+    prediction = PredictionSummary.of(apart, dynamics)
     components, small = prediction.components, _largest(prediction.components) <= _SMALL
     lossy = np.zeros(components.count, dtype=bool)
     lossy[components.label[prediction.ratio > (_QR_LIMIT if small else _CHOLESKY_LIMIT)]] = True
@@ -228,7 +227,11 @@ def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
 
 
 def _tree_predicted(
-    tree: BayesTree | None, rows: IntArray, dynamics: Dynamics, prediction: Prediction, by_covariance: BlockGaussian
+    tree: BayesTree | None,
+    rows: IntArray,
+    dynamics: Dynamics,
+    prediction: PredictionSummary,
+    by_covariance: BlockGaussian,
 ) -> BayesTree | None:
     """Move the tree over an interval; None where a covariance has no digits left to be inverted."""
     try:

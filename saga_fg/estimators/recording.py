@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
+from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import (
     MarginalCovariances,
     SmoothedCovariance,
@@ -25,7 +26,6 @@ from saga_fg.estimators.backward import (
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
 from saga_fg.estimators.factor_graph import recording_graph
-from saga_fg.estimators.fixed_point import FixedPoint
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
@@ -265,7 +265,7 @@ class Recording:
         self._steps = _completed(self._steps, self._prior, self._epochs)
         if self._converged:
             return
-        means, step, iteration = smoothed_means(self._steps), math.inf, FixedPoint()
+        means, step, iteration = smoothed_means(self._steps), math.inf, AndersonAcceleration()
         ends = np.cumsum([len(mean) for mean in means])[:-1]
         for count in range(self._settings.max_iterations):
             steps = filter_epochs(self._prior, self._epochs, means)
