@@ -1,7 +1,7 @@
 """How honest covariances are: the share of errors within the tracks' ellipses over the probability they should hold.
 
 A class on the diagonal is right; above it the covariances are too large, below it too small. The grey bands are
-those a class is judged by (`data_tools.metrics.error_figures`).
+those a class is judged by (`data_tools.metrics.error_summary`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics.error_figures import BANDS, calibration, errors_by_class
+from data_tools.metrics.error_summary import BANDS, calibration, errors_by_class
 from data_tools.metrics.label_errors import LabelErrors
 from saga_fg.numerics.chi_square import chi_square_quantile
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics.error_figures import errors_by_class
+from data_tools.metrics.error_summary import errors_by_class
 from data_tools.metrics.label_errors import LabelErrors
 from saga_fg.numerics.arrays import FloatArray
 

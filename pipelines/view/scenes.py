@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from pipelines.report.edges import Edges, edges_of_moments
 from pipelines.report.scenes import UNMEASURED, ReportScene, latest_detections
 from pipelines.scan_sequence import ScanSequence
@@ -161,7 +161,7 @@ def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Marks, dict[st
 class _Method:
     """The tracks of one method."""
 
-    def __init__(self, table: TrackTable, origin: FloatArray, report: ReportScene) -> None:
+    def __init__(self, table: SceneBoxes, origin: FloatArray, report: ReportScene) -> None:
         self._table, self._place = table, table.boxes.position - origin
         self._origin, self._time = origin, report.scene.timestamps
         names, self._number = np.unique(table.id, return_inverse=True)

@@ -87,7 +87,7 @@ def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:
     rows = parsed_json(read_bytes(path), str(path))
     try:
         marks = [row for row in rows if "nx" not in row]
-        names = tuple(f"{row.get('kind', row.get('type'))} {row.get('id', row.get('number'))}" for row in marks)
+        names = tuple(f"{row['kind']} {row['number']}" for row in marks)
         places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in marks], dtype=np.float64)
         return names, checked("places", places.reshape(-1, 3), (len(names), 3))
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:

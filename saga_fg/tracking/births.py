@@ -49,7 +49,9 @@ def _unmeasured_velocity(
     boxes: Boxes, classes: Mapping[str, ClassSettings], flow: TrafficFlow, standing: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Velocity (k, 2), its covariance (k, 2, 2) and the belief (k,) to stand, by class, heading and traffic."""
-    speed, drift = class_values(classes, ClassSettings, boxes.label, "birth_speed", "birth_drift")
+    speed, drift = class_values(
+        classes, ClassSettings, boxes.label, "initial_speed_deviation", "initial_lateral_speed_deviation"
+    )
     stands, mean, variance = flow.expected(boxes.label, boxes.position[:, :2], boxes.yaw, speed**2, standing)
     known = np.isfinite(boxes.yaw)
     ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))

@@ -76,7 +76,7 @@ class EgoNode:
         if self.present:
             state.update(_ID, label, z, R, np.zeros(1, dtype=bool), 0.0, seen)
         else:
-            speed = self.motion.birth_speed**2 * np.eye(2)[None]
+            speed = self.motion.initial_speed_deviation**2 * np.eye(2)[None]
             state.add(_ID, label, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), seen=seen)
         velocity = state.node(_ID, label).velocity[0]
         self.present, self.time, self.yaw = True, time, float(yaw_of(pose[:3, :3]))

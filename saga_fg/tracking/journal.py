@@ -143,7 +143,7 @@ class Journal:
                 "detection": int(now.observed.row[detection]),
                 "position": _numbers(measured),
                 "probability": float(now.observed.probability[detection]),
-                "least_probability": of_class.birth_score,
+                "least_probability": of_class.initiation_score,
                 "gate": gate(of_class.gate),
                 "nearest_tracks": [
                     {"track": int(old.columns.id[k]), "distance2": float(d2[same == k, 0][0])} for k in nearest.tolist()

@@ -100,8 +100,8 @@ def candidates(
     same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
     if said is not None:
         same = said.groups.akin(np.array(classes), np.array(seen))
-    names = ("max_distance", "overlap_weight")
-    reach, overlap_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
+    names = ("max_distance", "giou_weight")
+    reach, giou_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
     gates = np.array([gate(class_settings(settings.classes, ClassSettings, c).gate) for c in classes])[of_track]
     x, y = (observed.boxes.position[:, k] - predicted.position[:, k, None] for k in (0, 1))
     near = same[of_track[:, None], of_detection] & (x * x + y * y < (reach**2)[:, None])
@@ -111,7 +111,7 @@ def candidates(
     of_class = 0.0 if said is None else said.costs(t, d)
     inside = (d2 + of_class < gates[t]).nonzero()[0]
     found = Candidates(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
-    found = found._replace(gain=found.gain - _overlap(found, predicted, observed.boxes, overlap_weight))
+    found = found._replace(gain=found.gain - _overlap(found, predicted, observed.boxes, giou_weight))
     unmatched = _unmatched(found, expected, observed.probability, of_detection, settings.association, clutter_area)
     return found._replace(gain=found.gain - unmatched)
 

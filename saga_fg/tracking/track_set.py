@@ -136,7 +136,7 @@ class TrackSet:
         self._believe(observed, matching, sensor, frame, self._time - before, delay)
         self._tell("believe", frame, observed, matching)
         self._watch_traffic(matching)
-        born = self._bear(observed, matching, frame.sensor, sensor.births == "alone", delay, said, seen)
+        born = self._bear(observed, matching, frame.sensor, sensor.initiation == "alone", delay, said, seen)
         self._state.ask_providers()
         self._state.hear(None, self._origin)
         self._tell("births", frame, observed, matching, born)
@@ -309,7 +309,9 @@ class TrackSet:
         """
         free = np.ones(len(observed), dtype=bool)
         free[matching.detection] = False
-        born = np.flatnonzero(free & (observed.probability >= self._of_class(observed.boxes.label, "birth_score")[0]))
+        born = np.flatnonzero(
+            free & (observed.probability >= self._of_class(observed.boxes.label, "initiation_score")[0])
+        )
         if len(born) == 0:
             return born
         boxes, p = observed.boxes.select(born), observed.probability[born]

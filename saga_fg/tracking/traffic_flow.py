@@ -2,7 +2,7 @@ r"""How fast traffic goes here: the speed of a new track from tracks of its clas
 
     k_j = weight * max over where j passed of
               exp( -ahead^2 / (2 ahead_scale^2) - lateral^2 / (2 lateral_scale^2) - turn^2 / (2 heading_scale^2) )
-    p(speed) ~ N(0, birth_speed^2) + sum_j k_j N(s_j, sigma_j^2 + spread^2)
+    p(speed) ~ N(0, initial_speed_deviation^2) + sum_j k_j N(s_j, sigma_j^2 + spread^2)
 
 Every neighbour j counts once, by the nearest place it passed within `memory`, with its speed s_j along its heading
 there (parked ones with a speed near 0). The new track takes the mean and the variance of the mixture, which is as wide

@@ -127,7 +127,7 @@ def test_kitti_with_scans_and_a_map(tmp_path: Path) -> None:
     poses[1, 0, 3] = 1.0
     write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
     write_ply(slam / "landmarks.ply", np.array([[3.0, 4.0, 0.5]]))
-    marks = [{"id": 2, "kind": "pole", "x": 3.0, "y": 4.0}, {"id": 3, "kind": "wall", "x": 0.0, "nx": 1.0}]
+    marks = [{"number": 2, "kind": "pole", "x": 3.0, "y": 4.0}, {"number": 3, "kind": "wall", "x": 0.0, "nx": 1.0}]
     (slam / "landmarks.json").write_text(json.dumps(marks))
     file = tmp_path / "k.rrd"
     result = run("kitti", root / "result", "--dataroot", root, "--detections", root / "found", "--slam", slam,

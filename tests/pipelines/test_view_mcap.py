@@ -191,7 +191,7 @@ def test_the_command_writes_the_file_that_the_suffix_names(tmp_path: Path) -> No
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :2, 3] = 1.0
     write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
-    (slam / "landmarks.json").write_text('[{"id": 2, "kind": "pole", "x": 3.0, "y": 4.0}]')
+    (slam / "landmarks.json").write_text('[{"number": 2, "kind": "pole", "x": 3.0, "y": 4.0}]')
     file = tmp_path / "s.mcap"
     done = CliRunner().invoke(app, ["view", "slam", str(slam), "--save", str(file)])
     assert done.exit_code == 0, done.output

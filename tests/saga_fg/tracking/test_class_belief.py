@@ -33,7 +33,9 @@ def frame(time, *found, sensor="lidar"):
 
 
 def tracker(groups=GROUPS, estimator="kalman"):
-    settings = TrackerSettings({"default": ClassSettings(birth_speed=1.0)}, class_groups=groups, estimator=estimator)
+    settings = TrackerSettings(
+        {"default": ClassSettings(initial_speed_deviation=1.0)}, class_groups=groups, estimator=estimator
+    )
     return Tracker(settings, SENSORS)
 
 
