@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.coasting import coasting_errors
-from pipelines.bench.drawn_differences import drawn_differences
 from pipelines.bench.learned_folds import learn_by_folds
 from pipelines.bench.recordings import RecordingSet, Score
+from pipelines.bench.sampled_differences import sampled_differences
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
 from pipelines.evaluation.hota import HotaRow
@@ -160,7 +160,7 @@ def graph_differences(
         return {}
     result = {}
     if settings.draws:
-        result = drawn_differences(saga.figures_of, kf.figures_of, len(saga.errors), settings.draws, settings.seed)
+        result = sampled_differences(saga.figures_of, kf.figures_of, len(saga.errors), settings.draws, settings.seed)
     for name in ("position", "velocity", "heading"):
         a, b = ([errors.sample(name).square_sums for errors in score.errors] for score in (saga, kf))
         result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)

@@ -169,14 +169,14 @@ class JointTrackState:
         """Set the frame that providers see from now on; positions are from `origin` (2,)."""
         estimator = self.estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.hear(frame, origin)
+            estimator.set_frame(frame, origin)
             self._changed()
 
     def ask_providers(self) -> None:
         """Let factor providers add their factors."""
         estimator = self.estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.ask()
+            estimator.ask_providers()
             self._changed()
 
     @property
@@ -190,7 +190,7 @@ class JointTrackState:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
         estimator = self.estimator
         if isinstance(estimator, JointKalmanFilter):
-            return local_pose(estimator.beside)
+            return local_pose(estimator.auxiliary)
         return local_pose(estimator.graph()) if isinstance(estimator, GraphFilter) else None
 
     def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
