@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import typer
 
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
-from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscenes_tracking_metrics
+from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
 from pipelines.cli.options import Verbose, Version
 from pipelines.cli.reporting import working
@@ -102,7 +102,7 @@ def differences(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> Iterat
 
     GT over all classes is left out: the official figure is a mean over classes, ours the sum.
     """
-    for field in fields(TrackingFigures):
+    for field in fields(NuScenesClassMetrics):
         if field.name != "gt":
             yield field.name, _apart(getattr(ours.overall, field.name), theirs[field.name])
         for label, value in theirs["label_metrics"][field.name].items():

@@ -1,6 +1,6 @@
 """`gtsam.ISAM2` as the engine of a running graph: any factors, one variable a node and epoch, fluid relinearisation.
 
-iSAM2 is told linear factors on increments from the base of every variable (`saga_fg.graph.point`) and never
+iSAM2 gets linear factors on increments from the base of every variable (`saga_fg.graph.linearisation_point`) and never
 linearises itself: no callback runs inside it, and a factor that raises does so before. When a variable has moved by
 more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
 anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
@@ -22,13 +22,13 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.graph_engine import Engine, RelinearisationSettings
-from saga_fg.estimators.graph_moments import joint_gaussian
 from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
+from saga_fg.estimators.joint_gaussian import joint_gaussian
 from saga_fg.estimators.layout import Layout
 from saga_fg.graph.errors import GraphError, UndeterminedError
-from saga_fg.graph.point import Point
-from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
+from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.frame import Frame
@@ -77,7 +77,7 @@ class IncrementalSmoother:
         """
         unchanged, times, asked = self._graph, self._times, self.providers if providers is None else providers
         self.frame = frame
-        begun = beginnings(asked)
+        begun = predictors(asked)
         try:
             self.begin(time, begun or asked)
             if begun:
@@ -91,15 +91,15 @@ class IncrementalSmoother:
         self,
         time: float,
         providers: Sequence[FactorProvider],
-        standing: Iterable[int] = (),
+        carried_over: Iterable[int] = (),
         change: Callable[[SceneFactorGraph], None] | None = None,
     ) -> None:
         """The same, but keep all that is older than the lag.
 
-        standing: variables that are those of the new epoch, too; change: of the graph, after the first provider
+        carried_over: variables that are those of the new epoch, too; change: of the graph, after the first provider
         """
         graph = self._graph.copy()
-        graph.advance(time, standing)
+        graph.advance(time, carried_over)
         self._asked(graph, providers, change)
         self._times = [*self._times, graph.time]
 
@@ -116,7 +116,7 @@ class IncrementalSmoother:
         graph = self._graph.copy()
         for time, providers in epochs:
             graph.advance(time)
-            self._ask(graph, [*beginnings(providers), *providers])
+            self._ask(graph, [*predictors(providers), *providers])
         self._move_to(graph)
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
@@ -151,10 +151,12 @@ class IncrementalSmoother:
     def solution(self) -> GraphSolution:
         """The present solution as a value."""
         engine, graph = self._ready(), self._graph
-        return GraphSolution(Point(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged)
+        return GraphSolution(
+            LinearisationPoint(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged
+        )
 
     def joint_gaussian(self, layout: Layout, keys: Sequence[int]) -> BlockGaussian:
-        """The joint Gaussian of variables by components, as `saga_fg.estimators.graph_moments` has it."""
+        """The joint Gaussian of variables by components, as `saga_fg.estimators.joint_gaussian` has it."""
         engine = self._ready()
         return joint_gaussian(self._graph, engine.linear(), layout, keys)
 

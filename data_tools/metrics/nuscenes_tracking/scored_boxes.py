@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
@@ -30,7 +30,7 @@ RACKED = ("bicycle", "motorcycle")
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings(Columns):
+class ScoredBoxes(Columns):
     """N scored boxes of one scene, in order of time.
 
     moment    (N,)   which moment, from 0
@@ -47,13 +47,13 @@ class Sightings(Columns):
     score: FloatArray
 
 
-def sightings(
-    table: TrackTable,
+def scored_boxes(
+    table: SceneBoxes,
     ego_position: FloatArray,
     racks: Sequence[Boxes],
     timestamps: FloatArray,
     class_range: dict[str, float],
-) -> Sightings:
+) -> ScoredBoxes:
     """Filter a table, average its scores over tracks and fill its gaps.
 
     ego_position  (K, 2) of the vehicle, m; timestamps (K,) s; racks: bicycle racks at each moment, none if empty.
@@ -76,7 +76,7 @@ def sightings(
     identity = _numbered(table.id[rows])
     score = _track_means(table.score[rows], identity)
     micros = np.rint(timestamps * 1e6).astype(np.int64)  # the unit of the tables, so that ratios round as they do
-    return _filled(Sightings(moment[rows], identity, label[rows], position[rows, :2], score), micros)
+    return _filled(ScoredBoxes(moment[rows], identity, label[rows], position[rows, :2], score), micros)
 
 
 def _inside_any(points: FloatArray, boxes: Boxes) -> BoolArray:
@@ -106,7 +106,7 @@ def _track_means(score: FloatArray, identity: IntArray) -> FloatArray:
     return np.array([np.mean(part) for part in parts], dtype=np.float64)[identity]
 
 
-def _filled(rows: Sightings, micros: IntArray) -> Sightings:
+def _filled(rows: ScoredBoxes, micros: IntArray) -> ScoredBoxes:
     """Rows with the gaps of each track filled; what is put in comes last within its moment, by identity."""
     order = np.lexsort((rows.moment, rows.identity))
     by_track = rows.select(order)
@@ -118,6 +118,6 @@ def _filled(rows: Sightings, micros: IntArray) -> Sightings:
     ratio = (micros[b.moment] - micros[moment]) / (micros[b.moment] - micros[a.moment])
     xy = (1.0 - ratio[:, None]) * a.xy + ratio[:, None] * b.xy
     score = (1.0 - ratio) * a.score + ratio * b.score
-    added = Sightings(moment, b.identity, b.label, xy, score)
+    added = ScoredBoxes(moment, b.identity, b.label, xy, score)
     both = rows.extended(added)
     return both.select(np.argsort(both.moment, kind="stable"))

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from saga_fg.estimators.fixed_point import FixedPoint
+from saga_fg.estimators.anderson import AndersonAcceleration
 
 
 def iterate(g, x, accelerated, steps):
-    memory, scale = FixedPoint(), np.ones_like(x)
+    memory, scale = AndersonAcceleration(), np.ones_like(x)
     for count in range(steps):
         image = g(x)
         if np.abs(image - x).max() < 1e-10:
@@ -42,7 +42,7 @@ def test_a_map_with_kinks_does_not_send_it_away():
 
 
 def test_the_scale_decides_what_counts():
-    memory = FixedPoint()
+    memory = AndersonAcceleration()
     first = memory.next(np.zeros(2), np.array([1.0, 1e6]), np.array([1.0, 1e6]))
     np.testing.assert_array_equal(first, [1.0, 1e6])
     second = memory.next(first, first + np.array([0.5, 5e5]), np.array([1.0, 1e6]))

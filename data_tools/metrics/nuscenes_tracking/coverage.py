@@ -19,7 +19,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class SpanFigures:
+class TrackCoverage:
     """Each (T,): of the objects of one class, at T thresholds."""
 
     mostly_tracked: IntArray
@@ -29,7 +29,7 @@ class SpanFigures:
     longest_gap: FloatArray
 
 
-def span_figures(tracked: BoolArray, identity: IntArray, period: float) -> SpanFigures:
+def track_coverage(tracked: BoolArray, identity: IntArray, period: float) -> TrackCoverage:
     """Figures of `tracked` (N, T), whose rows are sorted by `identity` (N,), then time; `period` in s. N > 0."""
     start = np.flatnonzero(np.diff(identity, prepend=identity[0] - 1))
     length = np.diff(start, append=len(identity))
@@ -50,6 +50,6 @@ def span_figures(tracked: BoolArray, identity: IntArray, period: float) -> SpanF
     with np.errstate(invalid="ignore"):
         initialisation = period * np.where(ever, first - start[:, None], 0).sum(axis=0) / objects
         longest_gap = period * np.where(ever, longest, 0).sum(axis=0) / objects
-    return SpanFigures(
+    return TrackCoverage(
         (ratio >= 0.8).sum(axis=0), (ratio < 0.2).sum(axis=0), dropped.sum(axis=0), initialisation, longest_gap
     )

@@ -19,7 +19,7 @@ _MEMORY = 6  # evaluations that are kept
 _GROWTH = 2.0  # of the step, from which the memory misleads
 
 
-class FixedPoint:
+class AndersonAcceleration:
     """The memory of an iteration."""
 
     def __init__(self) -> None:

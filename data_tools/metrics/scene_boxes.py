@@ -17,7 +17,7 @@ from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)
-class TrackTable(Columns):
+class SceneBoxes(Columns):
     """N boxes of one scene, in order of time.
 
     moment  (N,) which of the scene's moments, from 0, never decreasing

@@ -14,7 +14,7 @@ SUMMED = frozenset({"gt", "tp", "fp", "fn", "ids", "frag", "mt", "ml"})
 
 
 @dataclass(frozen=True)
-class TrackingFigures:
+class NuScenesClassMetrics:
     """Figures of one class, at the threshold with the highest MOTA (amota and amotp: over all); NaN where undefined.
 
     amota   mean over the sweep of MOTAR = max(0, 1 - (ids + fp + fn - (1 - r) gt) / (r gt)), r = tp / gt
@@ -50,7 +50,7 @@ class TrackingFigures:
         return cls(**{field.name: float("nan") for field in fields(cls)})
 
     @classmethod
-    def over_classes(cls, classes: Iterable[TrackingFigures]) -> Self:
+    def over_classes(cls, classes: Iterable[NuScenesClassMetrics]) -> Self:
         """Sums of the counts, means of the rest over the classes where they are defined (official, but for gt: summed,
         where the official evaluation prints the mean)."""
         parts = list(classes)
@@ -69,7 +69,7 @@ class TrackingFigures:
 class RecallCurves:
     """One class over the sweep, each (T,), from the highest hypothetical recall to the lowest; NaN where not reached.
 
-    score is the threshold that the recall asks for; the others are as in `TrackingFigures`.
+    score is the threshold that the recall asks for; the others are as in `NuScenesClassMetrics`.
     """
 
     hypothetical_recall: FloatArray

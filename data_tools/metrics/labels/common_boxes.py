@@ -15,7 +15,7 @@ import numpy as np
 
 from data_tools.metrics.consistency import nees
 from data_tools.metrics.nearest_pairs import nearest_pairs
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle
 
@@ -33,15 +33,15 @@ class LabelledScene:
     systems   boxes by name of the system
     """
 
-    truth: TrackTable
+    truth: SceneBoxes
     visible: BoolArray
     velocity: FloatArray
     distance: FloatArray
-    systems: Mapping[str, TrackTable]
+    systems: Mapping[str, SceneBoxes]
 
 
 @dataclass(frozen=True, eq=False)
-class SameBoxes:
+class CommonBoxes:
     """M true boxes that every system matches.
 
     label (M,), distance (M,) m, visible (M,)
@@ -63,7 +63,7 @@ class SameBoxes:
         return type(self)(self.label[rows], self.distance[rows], self.visible[rows], errors)
 
     @classmethod
-    def pool(cls, parts: Iterable[SameBoxes]) -> Self:
+    def pool(cls, parts: Iterable[CommonBoxes]) -> Self:
         """The boxes of all scenes, which have the same systems."""
         scenes = list(parts)
         errors = {
@@ -88,18 +88,18 @@ class SameBoxes:
         return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-def same_boxes(scene: LabelledScene, gate: float) -> SameBoxes:
+def common_boxes(scene: LabelledScene, gate: float) -> CommonBoxes:
     """The true boxes that every system has within `gate` (m), with the errors of each."""
     errors = {name: _errors(scene, table, gate) for name, table in scene.systems.items()}
     found = np.ones(len(scene.truth), dtype=np.bool_)
     for of in errors.values():
         found &= np.isfinite(of["position"])
-    whole = SameBoxes(scene.truth.boxes.label, scene.distance, scene.visible, errors)
+    whole = CommonBoxes(scene.truth.boxes.label, scene.distance, scene.visible, errors)
     return whole.select(found)
 
 
 def visible_then_hidden(
-    truth: TrackTable, visible: BoolArray, found: TrackTable, gate: float
+    truth: SceneBoxes, visible: BoolArray, found: SceneBoxes, gate: float
 ) -> tuple[IntArray, IntArray]:
     """Rows of true boxes and of found boxes that are pairs: visible objects first, hidden ones of what is left."""
     free = np.arange(len(found))
@@ -112,7 +112,7 @@ def visible_then_hidden(
     return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
 
 
-def _errors(scene: LabelledScene, found: TrackTable, gate: float) -> dict[str, FloatArray]:
+def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> dict[str, FloatArray]:
     """The errors of one system at all true boxes, NaN where it has none."""
     columns = {name: np.full(len(scene.truth), np.nan) for name in QUANTITIES}
     row, column = visible_then_hidden(scene.truth, scene.visible, found, gate)

@@ -27,17 +27,16 @@ from factors import SingularSystemError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import WhitenedFactor, correct_whitened
 from saga_fg.estimators.dynamics import Dynamics, identity, predict
-from saga_fg.estimators.graph_moments import condense
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
+from saga_fg.estimators.joint_gaussian import replace_by_prior
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.partition import Partition
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import node_kind
-from saga_fg.graph.parts import NewVariable
-from saga_fg.graph.point import Point
+from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.providers import FactorProvider, GraphView, ask
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphVariable, insert_state
+from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state
 from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.frame import Frame
@@ -49,7 +48,7 @@ Linear = tuple[list[int], FloatArray]  # keys and [A | b]
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class AuxiliaryVariables:
     """What a filter holds of the running graph beside its joint state.
 
     graph    variables without factors: those beside the nodes, and the nodes as they were when last asked
@@ -67,18 +66,18 @@ class Beside:
 
     def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
         """Those of a transition over the nodes; the variables beside them stay as they are."""
-        motion, others = Motion(transition), self.rows(x.layout)
+        interval, others = IntervalDynamics(transition), self.rows(x.layout)
         if len(others) == 0:
-            return motion.dynamics(x.layout, x.mean)
+            return interval.linearised(x.layout, x.mean)
         nodes = x.without(others)
-        return motion.dynamics(nodes.layout, nodes.mean).beside(x.layout, others)
+        return interval.linearised(nodes.layout, nodes.mean).with_static(x.layout, others)
 
     def priors(self, x: BlockGaussian, time: float) -> SceneFactorGraph:
         """All that is known at `time`, as one prior for each component."""
         graph, ids = self.at(x, time)
         graph.marginalise([key for key in graph.variables if key not in ids])
         keys = {node: key for key, node in ids.items()}
-        condense(graph, x, keys, keys)
+        replace_by_prior(graph, x, keys, keys)
         return graph
 
     def at(self, x: BlockGaussian, time: float) -> tuple[SceneFactorGraph, dict[int, int]]:
@@ -101,18 +100,18 @@ class Beside:
 
 def asked(
     x: BlockGaussian,
-    beside: Beside,
+    auxiliary: AuxiliaryVariables,
     providers: Sequence[FactorProvider],
     time: float,
     origin: FloatArray,
     frame: Frame | None,
     last: bool,
-) -> tuple[BlockGaussian, Beside]:
+) -> tuple[BlockGaussian, AuxiliaryVariables]:
     """The joint state with what providers add at `time`; the epoch before leaves where they are the `last` ones.
 
     Raises `GraphError` for what the filter does not take.
     """
-    bare, ids = beside.at(x, time)
+    bare, ids = auxiliary.at(x, time)
     graph, known, prior = bare.copy(), dict(ids), x
     view = GraphView(graph, lambda key: _covariance(prior, known, graph.point(), key), origin, frame)
     for provider in providers:
@@ -124,7 +123,7 @@ def asked(
         bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
         x, factors = _born(graph, x, ids, new, factors)
         ids |= {key: key for key in new}
-    increment, others, told = np.zeros(len(x.mean)), x.layout.places(Beside(bare).rows(x.layout)), []
+    increment, others, told = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout)), []
     increment[others] = x.mean[others]
     for keys, A in factors:
         rows = x.layout.rows([ids[key] for key in keys])
@@ -134,7 +133,7 @@ def asked(
     bare.marginalise(gone)
     x = x.without(x.layout.rows([key for key in gone if key in ids]))
     _move(bare, x, ids)
-    return x, Beside(bare, beside.labels)
+    return x, AuxiliaryVariables(bare, auxiliary.labels)
 
 
 def _move(graph: SceneFactorGraph, x: BlockGaussian, ids: Mapping[int, int]) -> None:
@@ -227,7 +226,7 @@ def _stacked(factors: Sequence[Linear], dims: Mapping[int, int]) -> tuple[FloatA
     return np.concatenate([np.empty((0, width + 1)), *rows]), span
 
 
-def _covariance(x: BlockGaussian, ids: Mapping[int, int], point: Point, key: int) -> FloatArray:
+def _covariance(x: BlockGaussian, ids: Mapping[int, int], point: LinearisationPoint, key: int) -> FloatArray:
     """Marginal covariance of a variable; of a pose in its own frame."""
     if key not in ids:
         raise GraphError(f"{point.variables[key]}: expected a variable that was in the filter before this frame")

@@ -17,8 +17,8 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.graph.errors import GraphError
-from saga_fg.graph.point import Point
-from saga_fg.graph.providers import FactorProvider, GraphView, ask, beginnings
+from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.frame import Frame
@@ -61,14 +61,14 @@ class BatchSolver:
         frame: what they are told of the epoch
         """
         asked = self.providers if providers is None else providers
-        unchanged, begun = (self._graph, self._solution, self._lent), beginnings(asked)
+        unchanged, begun = (self._graph, self._solution, self._lent), predictors(asked)
         self._asked(time, begun or asked, frame)
         if begun:
             try:
                 self._asked(None, asked, frame)
             except GraphError:
                 self._graph, self._solution, self._lent = unchanged
-                self._graph.drop_strangers()
+                self._graph.erase_unknown_values()
                 raise
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
@@ -85,7 +85,7 @@ class BatchSolver:
         """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
         if self._solution is None:
             graph = self._graph.copy()
-            graph.drop_strangers()  # when a provider asks, others have added some already
+            graph.erase_unknown_values()  # when a provider asks, others have added some already
             self._solution = _solved(graph, self._settings)
             self._graph = graph
         return self._solution
@@ -133,7 +133,7 @@ class BatchSolver:
             for provider in providers:
                 ask(provider, graph, view)
         except GraphError:
-            known.drop_strangers()
+            known.erase_unknown_values()
             raise
         self._changed(graph)
 
@@ -143,14 +143,16 @@ class BatchSolver:
 
 def _solved(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
     """The minimum, to which the graph moves."""
-    native, ours = graph.parts()
+    native, ours = graph.solver_inputs()
     try:
         found = solve_graduated(native, ours, graph.values, settings)
-        rough = GraphSolution(Point(graph.variables, found.values, found.values), found.linear, found.converged)
+        rough = GraphSolution(
+            LinearisationPoint(graph.variables, found.values, found.values), found.linear, found.converged
+        )
         graph.moved_to(found.values.retract(rough.step))
         values = graph.values
         return GraphSolution(
-            Point(dict(graph.variables), values, values), linearised(native, ours, values), found.converged
+            LinearisationPoint(dict(graph.variables), values, values), linearised(native, ours, values), found.converged
         )
     except FactorError as error:
         raise graph.undetermined(error) from error

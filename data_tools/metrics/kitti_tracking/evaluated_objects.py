@@ -19,8 +19,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
-from data_tools.metrics.hota import Compared, HotaFigures, box_similarities, compared_figures
-from data_tools.metrics.kitti_tracking.class_rows import (
+from data_tools.metrics.hota import HotaMetrics, SceneSimilarities, box_similarities, similarity_metrics
+from data_tools.metrics.kitti_tracking.class_boxes import (
     NEIGHBOUR,
     UPRIGHT_T_CAMERA,
     KittiTrackingSequence,
@@ -35,17 +35,17 @@ KittiSimilarity = Literal["image", "bev_iou", "iou_3d"]
 _MATCHED = 0.5 - np.finfo(np.float64).eps  # overlap of image boxes
 
 
-def kitti_hota_figures(
+def kitti_hota_metrics(
     sequences: Sequence[KittiTrackingSequence],
     label: str,
     similarity: KittiSimilarity = "image",
     threshold: float = 0.5,
-) -> HotaFigures:
+) -> HotaMetrics:
     """Figures of class `label` (in lower case) over all sequences; CLEAR and Identity count pairs from `threshold` on.
 
     Objects without a 3D box overlap with nothing in space. Raises `MissingExtraError` without trackeval.
     """
-    return compared_figures([_compared(*_judged(each, label), similarity) for each in sequences], threshold)
+    return similarity_metrics([_compared(*_judged(each, label), similarity) for each in sequences], threshold)
 
 
 def image_overlaps(a: KittiObjects, b: KittiObjects) -> FloatArray:
@@ -87,11 +87,11 @@ def _matches(truth: KittiObjects, found: KittiObjects, exempt: BoolArray) -> tup
     return matched, of_exempt
 
 
-def _compared(truth: KittiObjects, found: KittiObjects, similarity: KittiSimilarity) -> Compared:
+def _compared(truth: KittiObjects, found: KittiObjects, similarity: KittiSimilarity) -> SceneSimilarities:
     """Frame by frame."""
     frames = range(1 + max(int(truth.frame.max(initial=-1)), int(found.frame.max(initial=-1))))
     pairs = [(truth.select(truth.frame == k), found.select(found.frame == k)) for k in frames]
-    return Compared(
+    return SceneSimilarities(
         [true.track_id for true, _ in pairs],
         [here.track_id for _, here in pairs],
         [_similarities(true, here, similarity) for true, here in pairs],

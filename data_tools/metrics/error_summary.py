@@ -20,7 +20,7 @@ OVERALL = "overall"
 
 
 @dataclass(frozen=True)
-class ErrorFigures:
+class ErrorSummary:
     """Figures of one class, NaN where undefined.
 
     labels, tracked      matched labels, and those of them with a track
@@ -67,11 +67,11 @@ class Calibration:
         return all(low <= self.held[p] <= high for p, (low, high) in BANDS.items())
 
 
-def error_figures(errors: LabelErrors) -> ErrorFigures:
+def error_summary(errors: LabelErrors) -> ErrorSummary:
     """Sum up errors."""
     heading = errors.sample("heading").values
     moving = errors.moving
-    return ErrorFigures(
+    return ErrorSummary(
         labels=int(errors.matched.sum()),
         tracked=int((errors.matched & errors.tracked).sum()),
         position=errors.sample("position").rmse,

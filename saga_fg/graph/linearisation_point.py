@@ -24,7 +24,7 @@ from saga_fg.numerics.arrays import FloatArray
 LARGEST = 1e30  # of whitened numbers, whose squares numbers can hold
 
 
-class Point:
+class LinearisationPoint:
     """values: where; base: of the variables of the graph. Both are read, never changed."""
 
     def __init__(self, variables: Mapping[int, GraphVariable], base: gtsam.Values, values: gtsam.Values) -> None:

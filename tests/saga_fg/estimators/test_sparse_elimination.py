@@ -12,7 +12,7 @@ from random_graphs import BUS, CAR, CONE, POLE, TRAM
 from factors import RangeBearing, Robust
 from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.estimators import BatchSmoother, GraduatedNonConvexity, Measurements, Observations
-from saga_fg.estimators.elimination_order import cheapest_order
+from saga_fg.estimators.sparse_elimination import cheapest_order
 from saga_fg.model.discretisation import discretise
 
 EXACT = 1e-9
@@ -88,8 +88,8 @@ def test_nodes_without_neighbours_do_not_end_the_interpreter():
         import sys
         sys.path[:0] = {sys.path!r}
         import numpy as np
-        from tests.saga_fg.estimators.test_elimination_order import recorded, queue
-        from saga_fg.estimators.elimination_order import sparse_ordering
+        from tests.saga_fg.estimators.test_sparse_elimination import recorded, queue
+        from saga_fg.estimators.sparse_elimination import sparse_ordering
         factors = [(k, k + 1) for k in range(50)] + [(k,) for k in range(100, 160)]
         assert sparse_ordering(factors, "metis").size() == 111
         assert sparse_ordering([(1,), (2,)], "metis").size() == 2

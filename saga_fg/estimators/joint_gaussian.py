@@ -20,10 +20,9 @@ from factors import FactorError, joint_prior_factor, marginal_factors, marginal_
 from factors.marginal import Elimination
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import Partition, zeros
-from saga_fg.estimators.prediction import Prediction
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
@@ -90,7 +89,7 @@ def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) 
 
     window: whether there is one to be lost, so that wide components are to keep their factors while that can be.
     """
-    prediction = Prediction.of(x, dynamics)
+    prediction = PredictionSummary.of(x, dynamics)
     label = prediction.components.label
     wide = np.bincount(label, weights=x.layout.dims)[label] > (np.inf if window else _SMALL)
     return np.isin(label, label[(prediction.ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
@@ -103,7 +102,9 @@ def by_covariance(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> Bl
     return predict(x.without(np.flatnonzero(~mine)), dynamics.restricted(np.flatnonzero(mine)))
 
 
-def condense(graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, int], now: Mapping[int, int]) -> None:
+def replace_by_prior(
+    graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, int], now: Mapping[int, int]
+) -> None:
     """Put the joint Gaussian `x` in the place of all that the graph holds of its components.
 
     Its variables by id, as they were and as they are now. Raises `InputError` where it has become singular.
@@ -121,5 +122,5 @@ def condense(graph: SceneFactorGraph, x: BlockGaussian, earlier: Mapping[int, in
         try:
             prior = joint_prior_factor(keys, increments, x.joint(rows))
         except FactorError as error:
-            raise InputError(f"transition: {graph.worded(str(error), keys)}") from error
-        graph.condense(gone, prior)
+            raise InputError(f"transition: {graph.with_names(str(error), keys)}") from error
+        graph.replace_by_prior(gone, prior)

@@ -1,6 +1,12 @@
-"""iSAM2 as told by a running graph: which of its factors are which rows of the graph's groups.
+"""iSAM2 as the solver of a running graph: which of its factors are which rows of the graph's groups.
 
-See `saga_fg.estimators.incremental_graph` for what it is to do.
+`saga_fg.estimators.incremental_smoother` has the method. Factors on a variable are linearised anew when it has moved by
+
+    || R (delta - delta_0) ||  >  threshold,      R^T R = P^-1
+
+from delta_0, where its factors were linearised, in its own standard deviations (Mahalanobis distance in its marginal
+covariance P). Fluid relinearisation after Kaess et al., "iSAM2", IJRR 31 (2012), section 4.1, whose threshold is in the
+units of each variable. R is computed anew whenever a variable gets new factors.
 """
 
 from __future__ import annotations
@@ -17,7 +23,6 @@ import numpy as np
 from factors import SingularSystemError, SolverSettings, marginal_moments
 from factors.marginal import Elimination
 from factors.singular import singular_system
-from saga_fg.estimators.linearisation_points import LinearisationPoints
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
@@ -49,10 +54,10 @@ class Engine:
         parameters.enableRelinearization = False
         parameters.findUnusedFactorSlots = True
         self.isam, self.elimination = gtsam.ISAM2(parameters), elimination
-        self.points = LinearisationPoints()
+        self.points = Displacements()
         self.slots: dict[int, IntArray] = {}
         self.converged = True
-        self.sharpness: dict[int, tuple[bool, int]] = {}
+        self.elimination_order: dict[int, tuple[bool, int]] = {}
 
     def solved(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """The engine with everything that has changed in the graph, which moves to the solution."""
@@ -96,7 +101,7 @@ class Engine:
     def linear(self) -> gtsam.GaussianFactorGraph:
         """All linear factors that it holds, the sharpest first."""
         held, linear = self.isam.getFactorsUnsafe(), gtsam.GaussianFactorGraph()
-        for number in sorted(self.slots, key=self.sharpness.__getitem__):
+        for number in sorted(self.slots, key=self.elimination_order.__getitem__):
             slots = self.slots[number]
             for slot in slots[slots >= 0].tolist():
                 factor = held.at(slot)
@@ -112,11 +117,11 @@ class Engine:
         rows: list[tuple[int, IntArray]] = []
         linear: list[gtsam.JacobianFactor] = []
         point, nonlinear = graph.point(), set[int]()
-        for number in sorted(graph.groups.keys() - self.slots.keys(), key=lambda n: graph.groups[n].sharpness):
+        for number in sorted(graph.groups.keys() - self.slots.keys(), key=lambda n: graph.groups[n].elimination_order):
             held = graph.groups[number]
             rows.append((number, held.rows))
             linear += graph.linear(number, point)
-            self.slots[number], self.sharpness[number] = np.full(len(held.active), -1), held.sharpness
+            self.slots[number], self.elimination_order[number] = np.full(len(held.active), -1), held.elimination_order
             if not held.factors.linear:
                 nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
         if alone := graph.without_factors():
@@ -155,7 +160,7 @@ class Engine:
             held = graph.groups.get(number)
             if held is None:
                 removed += slots[slots >= 0].tolist()
-                del self.slots[number], self.sharpness[number]
+                del self.slots[number], self.elimination_order[number]
             elif (out := (slots >= 0) & ~held.active).any():
                 removed += slots[out].tolist()
                 self.slots[number] = np.where(out, -1, slots)
@@ -199,7 +204,7 @@ class Engine:
         parameters.removeFactorIndices = removed
         for key, one in graph.variables.items():
             if (
-                one.epoch == graph.epoch or key in graph.standing
+                one.epoch == graph.epoch or key in graph.carried_over
             ):  # at the root, where the next frame's factors will touch the tree
                 last.insert2(key, 1)
         parameters.constrainedKeys = last
@@ -225,3 +230,73 @@ class Engine:
             for factor in graph.linear(number, point):
                 linear.push_back(factor)
         return graph.undetermined(singular_system(linear, error))
+
+
+class Displacements:
+    """Variables with delta_0 (d,), where their factors were linearised, and R (d, d), in a table for each dimension."""
+
+    def __init__(self) -> None:
+        self._tables: dict[int, _Table] = {}
+        self._dims: dict[int, int] = {}
+
+    def add(self, dims: dict[int, int]) -> None:
+        """New variables at their base."""
+        for key, dim in dims.items():
+            self._dims[key] = dim
+            self._tables.setdefault(dim, _Table(dim)).add(key)
+
+    def remove(self, keys: Iterable[int]) -> None:
+        """Forget variables."""
+        for key in keys:
+            self._tables[self._dims.pop(key)].remove(key)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._dims
+
+    @property
+    def keys(self) -> Iterable[int]:
+        """All variables."""
+        return self._dims.keys()
+
+    def set_root(self, key: int, R: FloatArray) -> None:
+        """Set R of a variable."""
+        table = self._tables[self._dims[key]]
+        table.root[table.row[key]] = R
+
+    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
+        """The variables that are farther off than the threshold; from now on they count from here."""
+        return [key for table in self._tables.values() for key in table.moved(delta, threshold)]
+
+
+class _Table:
+    """Variables of one dimension in rows without gaps."""
+
+    def __init__(self, dim: int) -> None:
+        self.keys: list[int] = []
+        self.row: dict[int, int] = {}
+        self.at = np.zeros((16, dim))
+        self.root = np.zeros((16, dim, dim))
+
+    def add(self, key: int) -> None:
+        n = len(self.keys)
+        if n == len(self.at):
+            self.at, self.root = (np.concatenate([a, np.zeros_like(a)]) for a in (self.at, self.root))
+        self.row[key] = n
+        self.keys.append(key)
+        self.at[n], self.root[n] = 0.0, 0.0
+
+    def remove(self, key: int) -> None:
+        n, last = self.row.pop(key), self.keys.pop()
+        if last != key:
+            self.keys[n], self.row[last] = last, n
+            self.at[n], self.root[n] = self.at[len(self.keys)], self.root[len(self.keys)]
+
+    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
+        n = len(self.keys)
+        if n == 0:
+            return []
+        now = np.asarray(delta.vector(self.keys)).reshape(n, -1)
+        way = (self.root[:n] @ (now - self.at[:n])[:, :, None])[:, :, 0]
+        rows = np.flatnonzero(np.linalg.norm(way, axis=1) > threshold)
+        self.at[rows] = now[rows]
+        return [self.keys[row] for row in rows.tolist()]

@@ -39,7 +39,7 @@ class KittiTrackingSequence:
 
 
 @dataclass(frozen=True, eq=False)
-class ClassRows:
+class ClassBoxes:
     """N rows of one class (and its neighbour) over all sequences, in order of frame key.
 
     frame_key  (N,) number of sequence and frame, the same for true and found rows
@@ -59,14 +59,14 @@ class ClassRows:
         return len(self.frame_key)
 
 
-def true_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassRows:
+def true_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
     """The true boxes of a class (name in lower case)."""
     kept = [_of_class(sequence.truth, label) for sequence in sequences]
     exempt = [hardly_seen(rows) | _neighbour(rows, label) for rows in kept]
     return _joined(kept, exempt, _frames(sequences))
 
 
-def found_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassRows:
+def found_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
     """The found boxes of a class (name in lower case)."""
     kept = [_of_class(sequence.found, label) for sequence in sequences]
     exempt = [
@@ -109,7 +109,7 @@ def _frames(sequences: Sequence[KittiTrackingSequence]) -> int:
     return 1 + max((int(o.frame.max(initial=0)) for s in sequences for o in (s.truth, s.found)), default=0)
 
 
-def _joined(parts: Sequence[KittiObjects], exempt: Sequence[BoolArray], frames: int) -> ClassRows:
+def _joined(parts: Sequence[KittiObjects], exempt: Sequence[BoolArray], frames: int) -> ClassBoxes:
     sequence = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     empty = np.empty(0, dtype=np.int64)
     frame_key = sequence * frames + np.concatenate([empty, *(part.frame for part in parts)])
@@ -118,7 +118,7 @@ def _joined(parts: Sequence[KittiObjects], exempt: Sequence[BoolArray], frames: 
     score = np.concatenate([np.empty(0), *(part.score for part in parts)])
     boxes = Boxes.concatenate([camera_boxes_to_world(part.boxes, part.type, UPRIGHT_T_CAMERA) for part in parts])
     order = np.argsort(frame_key, kind="stable")
-    return ClassRows(
+    return ClassBoxes(
         frame_key[order],
         identity.reshape(-1)[order],
         np.concatenate([np.empty(0, dtype=np.bool_), *exempt])[order],

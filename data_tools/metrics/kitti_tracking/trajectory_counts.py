@@ -20,7 +20,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class TrajectoryFigures:
+class TrajectoryCounts:
     """Each (T,), at T thresholds: numbers of switches and fragments, shares of trajectories."""
 
     switches: IntArray
@@ -29,7 +29,7 @@ class TrajectoryFigures:
     mostly_lost: FloatArray
 
 
-def trajectory_figures(track: IntArray, identity: IntArray, exempt: BoolArray) -> TrajectoryFigures:
+def trajectory_counts(track: IntArray, identity: IntArray, exempt: BoolArray) -> TrajectoryCounts:
     """Figures of `track` (N, T), the track matched to each row or -1, rows sorted by `identity` (N,), then frame.
 
     exempt (N,): rows in which the object does not count. N > 0.
@@ -61,7 +61,7 @@ def trajectory_figures(track: IntArray, identity: IntArray, exempt: BoolArray) -
     fragment &= np.repeat(known, length)[:, None]
     switch &= np.repeat(known, length)[:, None]
     total = max(1, int(known.sum()))
-    return TrajectoryFigures(
+    return TrajectoryCounts(
         switch.sum(axis=0),
         fragment.sum(axis=0),
         ((share > 0.8) & ~never).sum(axis=0) / total,
