@@ -17,10 +17,10 @@ from data_tools.simulator import simulate_scene
 from data_tools.simulator.street import SimulatedScans
 from pipelines.config import load_config
 from pipelines.demo import run_demo
-from pipelines.slam.joint import run_joint
-from pipelines.slam.kitti import write_lidar_slam
+from pipelines.slam.joint import run_joint, street
+from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import lidar_slam
-from pipelines.slam.simulated import street, write_joint
+from pipelines.slam.results import write_joint
 from saga_fg.slam.joint import JointSettings
 
 HERE = Path(__file__).parent

@@ -9,7 +9,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows, read_tracks
 from data_tools.files.located import unknown
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
@@ -25,7 +25,7 @@ class SceneResult:
     """
 
     scene: Scene
-    found: TrackTable
+    found: SceneBoxes
     coasting: FloatArray | None = field(default=None, kw_only=True)
 
 
@@ -66,7 +66,7 @@ def _placed(scene: Scene, rows: TrackRows, path: Path) -> SceneResult:
         )
     order = np.argsort(moment, kind="stable")
     chosen = mine[order]
-    found = TrackTable(
+    found = SceneBoxes(
         moment[order], rows.id[chosen], rows.boxes.select(chosen), rows.score[chosen], rows.position_covariance[chosen]
     )
     return SceneResult(scene, found, coasting=rows.coasting[chosen])

@@ -13,7 +13,7 @@ from data_tools.evaluation.errors import error_json, error_pictures, error_table
 from data_tools.evaluation.hota import HotaRow, hota, hota_json, hota_table
 from data_tools.evaluation.innovations import innovation_json, innovation_table
 from data_tools.figures import FigureTable, cell
-from data_tools.metrics import LabelErrors, SceneMetrics, TrackTable, label_errors, scene_metrics_by_label
+from data_tools.metrics import LabelErrors, SceneBoxes, SceneMetrics, label_errors, scene_metrics_by_label
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
@@ -69,7 +69,7 @@ class Evaluation:
 
 
 def evaluate_tracks(
-    results: Sequence[tuple[Scene, TrackTable]],
+    results: Sequence[tuple[Scene, SceneBoxes]],
     with_hota: bool = False,
     innovations: Mapping[str, FloatArray] | None = None,
 ) -> Evaluation:
@@ -86,9 +86,9 @@ def evaluate_tracks(
             raise InputError(f"scene {scene.name}: expected ground truth")
         for label, metrics in scene_metrics_by_label(scene.ground_truth, found.by_moment(len(scene))).items():
             by_label.setdefault(label, []).append(metrics)
-        visible = TrackTable.of_annotations(scene.ground_truth, hidden=False)
+        visible = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
         errors.append(label_errors(visible, found, visible.boxes.velocity))
-        pairs.append((TrackTable.of_annotations(scene.ground_truth), found))
+        pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
     whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
     return Evaluation(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.figures import FigureTable, cell
-from data_tools.metrics import HotaFigures, TrackTable, hota_figures
+from data_tools.metrics import HotaMetrics, SceneBoxes, hota_metrics
 from data_tools.metrics.hota import Similarity
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 
@@ -31,16 +31,16 @@ class HotaRow:
     label: str
     overlap: str
     threshold: float
-    figures: HotaFigures
+    figures: HotaMetrics
 
 
-def hota(scenes: Sequence[tuple[TrackTable, TrackTable]], thresholds: Mapping[str, float]) -> list[HotaRow]:
+def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[str, float]) -> list[HotaRow]:
     """Judge (truth, found) of all scenes for the classes of `thresholds`. Raises `MissingExtraError` w/o trackeval."""
     rows = []
     for label, threshold in thresholds.items():
         judged = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
         for overlap, similarity in SIMILARITIES.items():
-            rows.append(HotaRow(label, overlap, threshold, hota_figures(judged, label, similarity)))
+            rows.append(HotaRow(label, overlap, threshold, hota_metrics(judged, label, similarity)))
     return rows
 
 
@@ -61,7 +61,7 @@ def hota_json(rows: Sequence[HotaRow]) -> dict[str, Any]:
     return result
 
 
-def _surer(found: TrackTable, label: str, threshold: float) -> TrackTable:
+def _surer(found: SceneBoxes, label: str, threshold: float) -> SceneBoxes:
     """The tracks of a class whose mean score is at least `threshold`."""
     rows = np.flatnonzero(found.boxes.label == label)
     return found.select(rows[mean_scores(found.id[rows], found.score[rows]) >= threshold - 1e-12])
@@ -73,7 +73,7 @@ def mean_scores(track: IntArray | StrArray, score: FloatArray) -> FloatArray:
     return np.asarray((np.bincount(number, weights=score) / np.maximum(np.bincount(number), 1))[number])
 
 
-def _cells(f: HotaFigures) -> tuple[str, ...]:
+def _cells(f: HotaMetrics) -> tuple[str, ...]:
     percent = (cell(100 * value, 2) for value in (f.hota, f.deta, f.assa, f.loca, f.mota, f.motp))
     identity = (cell(100 * value, 2) for value in (f.idf1, f.idp, f.idr))
     return (*percent, cell(f.ids), cell(f.frag), *identity)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,24 +13,13 @@ from pipelines.cli import options
 from pipelines.cli import tracking_options as how
 from pipelines.cli.datasets import dataset_commands
 from pipelines.cli.reporting import progress_bar, working
-from pipelines.cli.tables import JsonFile, show_tables
+from pipelines.cli.tables import JsonFile, report
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from data_tools.datasets.results import SceneResult
     from data_tools.datasets.source import DatasetSource, Innovations
-    from data_tools.figures import FigureTable
     from pipelines.config import Method, TrackConfig
-
-
-class _Figures(Protocol):
-    """An evaluation of tracks or of labels."""
-
-    def tables(self) -> list[FigureTable]: ...
-    def figures(self) -> dict[str, Any]: ...
-
-
-_AnyFigures = TypeVar("_AnyFigures", bound=_Figures)
 
 
 def _evaluate(
@@ -78,7 +67,9 @@ def _evaluate(
                 raise InputError(f"{name} {value}: goes without a result, which is made by it")
         with working("reading"):
             found, nis = source.read_results(result), journal_innovations(journal_of(result)) if innovations else {}
-    evaluation = _report(lambda: source.evaluate(found, hota, nis), json_file, "scoring")
+    with working("scoring"):
+        evaluation = source.evaluate(found, hota, nis)
+    report(evaluation.tables(), evaluation.figures(), json_file)
     if plots is not None:
         with atomic_directory(plots) as folder:
             for name, picture in evaluation.pictures().items():
@@ -127,7 +118,8 @@ def _evaluate_labels(
     settings = load_smooth_config(source.family, config)
     chosen = source.restricted(scenes) if scenes else source
     with chosen.open(source.has_truth and not without_truth) as dataset, progress_bar(len(scenes)) as progress:
-        _report(lambda: evaluate_labels(table, dataset, settings, method, progress), json_file, "")
+        evaluation = evaluate_labels(table, dataset, settings, method, progress)
+    report(evaluation.tables(), evaluation.figures(), json_file)
 
 
 _commands = dataset_commands(
@@ -153,21 +145,6 @@ def evaluate() -> None:
 @labels_app.callback()
 def labels() -> None:
     """Judge labels that `saga-fg smooth` made, beside the online tracks and the detections."""
-
-
-def _report(run: Callable[[], _AnyFigures], json_file: Path | None, doing: str) -> _AnyFigures:
-    """Run an evaluation, show its tables, write its figures."""
-    from data_tools.figures import write_figures
-    from data_tools.files.atomic_files import check_writable
-
-    if json_file is not None:
-        check_writable(json_file)
-    with working(doing):
-        evaluation = run()
-    show_tables(evaluation.tables())
-    if json_file is not None:
-        write_figures(json_file, evaluation.figures())
-    return evaluation
 
 
 def _table(result: Path) -> Path:

@@ -47,8 +47,8 @@ def g2o(
     from data_tools.files.located import located
     from data_tools.pose_graphs import read_g2o
     from factors import Robust
-    from pipelines.slam.pose_graph import write_pose_graph
     from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
+    from pipelines.slam.results import write_pose_graph
     from saga_fg.errors import InputError
     from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
 

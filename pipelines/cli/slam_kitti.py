@@ -59,7 +59,7 @@ def kitti(
     from data_tools.datasets.kitti import KittiScans, KittiTracking
     from data_tools.files.atomic_files import check_writable_folder
     from pipelines.slam.configuration import load_slam_config
-    from pipelines.slam.kitti import write_lidar_slam
+    from pipelines.slam.lidar_results import write_lidar_slam
     from pipelines.slam.lidar_slam import lidar_slam
     from pipelines.slam.with_objects import with_objects
     from saga_fg.errors import InputError

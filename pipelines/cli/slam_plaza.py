@@ -27,8 +27,8 @@ def plaza(
     """
     from data_tools.datasets.plaza import read_plaza
     from data_tools.files.atomic_files import check_writable_folder
-    from pipelines.slam.landmark_results import LandmarkRecord, planar_trajectory, write_landmark_results
     from pipelines.slam.plaza import compared, map_beacons
+    from pipelines.slam.results import landmark_row, planar_trajectory, write_landmark_map
 
     check_writable_folder(output)
     drive = read_plaza(file)
@@ -37,13 +37,13 @@ def plaza(
     estimate = planar_trajectory(drive.time, beacons.world_T_pose)
     figures, paths = compared(drive, beacons)
     found = [
-        LandmarkRecord(
+        landmark_row(
             number, "beacon", dict(zip("xy", place.tolist(), strict=True)), beacons.covariances[number],
             int((drive.beacon == number).sum()),
         )
         for number, place in beacons.beacons.items()
     ]  # fmt: skip
-    write_landmark_results(output, estimate, found, figures, paths)
+    write_landmark_map(output, estimate, found, figures, paths)
     typer.echo(
         f"{output}: {counted(len(estimate), 'pose')}, {counted(len(drive.range), 'range')}, "
         f"{counted(len(found), 'beacon')}; ranges: scale {1 + beacons.scale:.4f}, offset {beacons.offset:+.2f} m"

@@ -41,10 +41,9 @@ def simulated(
 
     from data_tools.files.atomic_files import check_writable_folder
     from data_tools.simulator import simulate_scene
-    from data_tools.trajectories import trajectory_errors
     from pipelines.slam.configuration import load_slam_config
-    from pipelines.slam.joint import run_joint
-    from pipelines.slam.simulated import online_paths, street, write_joint
+    from pipelines.slam.joint import run_joint, street
+    from pipelines.slam.results import write_joint
 
     window = online_window(online, lag)
     check_writable_folder(output)
@@ -58,8 +57,9 @@ def simulated(
     with working("estimating"):
         run = run_joint(scene, settings, slam.joint, "lidar", seed, landmarks, window, slam.new_providers)
         write_joint(output, run)
-    odometry, joint = run.errors()
+    errors = run.errors()
+    joint = errors["joint"]
     typer.echo(f"{output}: {joint.poses} poses over {joint.path_length:.0f} m")
-    typer.echo(f"ATE: odometry {odometry.ate:.3f} m, joint {joint.ate:.3f} m")
-    for name, path in online_paths(run).items():
-        typer.echo(f"{name} (lag {window:g} s): ATE {trajectory_errors(path, run.truth).ate:.3f} m")
+    typer.echo(f"ATE: odometry {errors['odometry'].ate:.3f} m, joint {joint.ate:.3f} m")
+    for name in [name for name in errors if name not in ("odometry", "joint")]:
+        typer.echo(f"{name} (lag {window:g} s): ATE {errors[name].ate:.3f} m")

@@ -11,7 +11,7 @@ from pipelines.learning.noise import LearnedNoise
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.by_class import class_settings
 
-LEARNED = ("noise", "calibration", "detection_probability", "class_detection", "field_of_view", "confusion")
+LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view", "confusion")
 DIGITS = 4
 
 

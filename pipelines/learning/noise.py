@@ -126,7 +126,9 @@ def _trajectory_noise(
     for label, group in groups.items():
         settings = class_settings(config.tracker.classes, ClassSettings, label)
         q = settings.motion.acceleration_noise if isinstance(settings.motion, ConstantVelocity) else 1.0
-        of_sensors, process[label] = fit_trajectory_noise(group, config.sensors, label, q, settings.birth_speed)
+        of_sensors, process[label] = fit_trajectory_noise(
+            group, config.sensors, label, q, settings.initial_speed_deviation
+        )
         for name, model in of_sensors.items():
             noise.setdefault(name, {})[label] = model
     return noise, process

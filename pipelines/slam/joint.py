@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from data_tools.simulator import SimulatorSettings
+from data_tools.simulator.settings import LightSettings, SurroundingSettings
 from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odometry, trajectory_errors
 from pipelines.config import TrackConfig
 from saga_fg.errors import InputError
@@ -39,13 +41,24 @@ class JointRun:
     online: OnlineEstimate | None = None
 
     @property
-    def joint(self) -> Trajectory:
-        """The estimated path."""
-        return Trajectory(self.estimate.timestamps, self.estimate.world_T_ego)
+    def paths(self) -> dict[str, Trajectory]:
+        """Paths by name: truth, odometry, joint; online, with each pose as known at once, and settled, a lag later."""
+        paths = {"truth": self.truth, "odometry": self.odometry}
+        paths["joint"] = Trajectory(self.estimate.timestamps, self.estimate.world_T_ego)
+        if self.online is not None:
+            paths["online"] = Trajectory(self.online.timestamps, self.online.newest)
+            paths["settled"] = Trajectory(self.online.timestamps, self.online.settled)
+        return paths
 
-    def errors(self) -> tuple[TrajectoryErrors, TrajectoryErrors]:
-        """Of the odometry's path and of the estimated one, each moved to lie nearest to the truth."""
-        return trajectory_errors(self.odometry, self.truth), trajectory_errors(self.joint, self.truth)
+    def errors(self) -> dict[str, TrajectoryErrors]:
+        """Errors of each path but the true one, by name, each path moved to lie nearest to the truth."""
+        return {name: trajectory_errors(path, self.truth) for name, path in self.paths.items() if name != "truth"}
+
+
+def street(parked: bool = True, mapped: bool = False) -> SimulatorSettings:
+    """Simulated scenes with cars parked on both sides of the road, or on none; mapped: frames bring the lanes along."""
+    surroundings = SurroundingSettings(parking_probability=1.0 if parked else 0.0)
+    return SimulatorSettings(surroundings=surroundings, lights=LightSettings(mapped=mapped))
 
 
 def run_joint(

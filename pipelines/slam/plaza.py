@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Annotated
 
 import numpy as np
@@ -21,7 +22,7 @@ import numpy as np
 from data_tools.datasets.plaza import BeaconRanges
 from data_tools.trajectories import absolute_errors, matched, rigid_alignment
 from factors import Robust, SolverSettings, calibrated_range_factors, prior_factor
-from pipelines.slam.landmark_results import planar_trajectory
+from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
@@ -71,7 +72,7 @@ def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> B
     """Estimate all of a drive. Raises `InputError` for a beacon without ranges enough to place it."""
     settings = settings or PlazaSettings()
     steps = _steps(drive.distance, drive.turn)
-    reckoned = _chained(np.eye(3), steps[1:])
+    reckoned = np.stack(list(accumulate(steps[1:], np.matmul, initial=np.eye(3))))
     at = np.clip(np.searchsorted(drive.time, drive.measured), 0, len(drive.time) - 1)
     end = int(np.searchsorted(np.cumsum(np.abs(drive.distance)), settings.beginning)) + 1
     graph, numbers = SceneFactorGraph(), np.unique(drive.beacon).tolist()
@@ -173,11 +174,3 @@ def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
     T[:, :2, :2] = np.stack([np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)], axis=1).reshape(-1, 2, 2)
     T[:, :2, 2] = distance[:, None] * np.stack([np.cos(turn / 2), np.sin(turn / 2)], axis=1)
     return T
-
-
-def _chained(start: FloatArray, steps: FloatArray) -> FloatArray:
-    """The poses (K + 1, 3, 3) that K increments lead to."""
-    poses = [start]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return np.stack(poses)

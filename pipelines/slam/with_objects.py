@@ -72,7 +72,7 @@ def with_objects(
         np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),
     )
     at = np.searchsorted(rows, result.keyframes)
-    known = known_providers(result.landmarks, result.sightings, result.loops, at.tolist(), s.robust_scale)
+    known = known_providers(result.landmarks, result.observations, result.loops, at.tolist(), s.robust_scale)
     start = result.drive.poses[0]
     estimate = estimate_jointly(
         seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *new_providers()]
@@ -87,8 +87,8 @@ def with_objects(
     )
     if lag is not None:
         observed: list[list[Observation]] = [[] for _ in rows]
-        for sighting in result.sightings:
-            observed[at[sighting.pose]].append(sighting.observation)
+        for one in result.observations:
+            observed[at[one.pose]].append(one.observation)
         online = estimate_online(
             seen, odometry, new_tracker(), lag, s.objects, start, observed, s.mapper, new_providers()
         )

@@ -88,7 +88,7 @@ def label_states(
     heights = scalar_readings(at, boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
     z, _ = smooth_walks(states, HEIGHT_DRIFT**2 * duration, heights)
     label = lives.label[owner]
-    yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "lasting_error")
+    yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "position_bias")
     turning = yaw_drift**2 * duration
     turning = np.where(_stands(objects), 1e-6, turning)
     (moving,) = class_values(settings.classes, OfflineClass, lives.label, "motion_heading")

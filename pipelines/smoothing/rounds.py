@@ -136,7 +136,7 @@ class _Rounds:
 
     def velocity_prior(self, lives: Lives) -> FloatArray:
         """(n, 2, 2) covariance of the velocity of something new."""
-        (speed,) = class_values(self.tracker.classes, ClassSettings, lives.label, "birth_speed")
+        (speed,) = class_values(self.tracker.classes, ClassSettings, lives.label, "initial_speed_deviation")
         return np.asarray(speed[:, None, None] ** 2 * np.eye(2))
 
     def alone(self, lives: Lives, object_of: IntArray, ahead: float) -> StateTable:

@@ -1,9 +1,9 @@
-"""What `saga-fg slam kitti`, `victoria-park` or `plaza` wrote, as drawings: paths, the map, landmarks with their names.
+"""Results of `saga-fg slam kitti`, `victoria-park` or `plaza` as drawings: paths, the map, landmarks with their names.
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
     ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
     ROOT/map, ROOT/landmarks                      points of map.ply and landmarks.ply
-    ROOT/names                                    kind and number of the landmarks that are at a place (planes are not)
+    ROOT/names                                    kind and number of landmarks with a place (planes have none)
 
 Metres, about `origin`.
 """
@@ -58,7 +58,7 @@ def read_slam_view(folder: Path) -> SlamView:
 
 
 def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> Iterator[Drawing]:
-    """All of it in the frame `root`; origin (3,) in its coordinates, the first pose if None.
+    """Draw a run in the frame `root`; origin (3,) in its coordinates, the first pose if None.
 
     Times count from the first pose.
     """
@@ -81,13 +81,13 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
 
 
 def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:
-    """Kind and number of each landmark that is at a place, and the places (M, 3)."""
+    """Return kind and number of each landmark with a place, and the places (M, 3)."""
     if not path.is_file():
         return (), np.empty((0, 3))
     rows = parsed_json(read_bytes(path), str(path))
     try:
         marks = [row for row in rows if "nx" not in row]
-        names = tuple(f"{row.get('kind', row.get('type'))} {row.get('id', row.get('number'))}" for row in marks)
+        names = tuple(f"{row['kind']} {row['number']}" for row in marks)
         places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in marks], dtype=np.float64)
         return names, checked("places", places.reshape(-1, 3), (len(names), 3))
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:

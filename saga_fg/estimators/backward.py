@@ -1,8 +1,8 @@
 r"""Smoothing: from the filter's pass back to the marginals given everything (modified Bryson-Frazier smoother).
 
-Backwards through the same interval, from r = 0 and N = 0 after the last moment,
+Backwards through the same interval, from r = 0 and N = 0 after the last epoch,
 
-    smoothed    m + P r                      P - P N P              with m, P the filter's posterior of the moment
+    smoothed    m + P r                      P - P N P              with m, P the filter's posterior of the epoch
     correction  r <- r + H^T L^-T (w - W r)  N <- A^T N A + B^T B   B = L^-1 H, A = 1 - W^T B, w = L^-1 (z - H m)
     prediction  r <- F^T r                   N <- F^T N F
 
@@ -11,15 +11,15 @@ begin or end. Sources: Bierman, Fixed interval smoothing with discrete measureme
 and Koopman, Time Series Analysis by State Space Methods (2012), section 4.4. It gives the marginals of Rauch, Tung
 and Striebel (1965).
 
-What may still come after the last moment T acts on earlier ones through x_T alone, and moves it by d ~ N(0, D),
-D <= P_T. So it moves the smoothed mean of an earlier moment by P G^T P_T^-1 d, where G is the product of all A and F
+What may still come after the last epoch T acts on earlier ones through x_T alone, and moves it by d ~ N(0, D),
+D <= P_T. So it moves the smoothed mean of an earlier epoch by P G^T P_T^-1 d, where G is the product of all A and F
 from there to T (its transition to x_T, as corrections leave it), with a covariance of at most P M P, M = G^T P_T^-1 G:
 the recursion of N from M = P_T^-1 instead of 0 and without the terms B^T B.
 
 Components: what is uncorrelated when it is filtered may be joined by a later interaction, and is then correlated
-given the future. So joint covariances are smoothed over components joined through all moments. The marginals of single
+given the future. So joint covariances are smoothed over components joined through all epochs. The marginals of single
 nodes need no more of N than its blocks over the components of P, for P N P has no others on its diagonal, and those of
-a moment follow from those of the next: F does not leave the components that it leads to. (Where a component has been
+an epoch follow from those of the next: F does not leave the components that it leads to. (Where a component has been
 taken apart in between, the rest of its N acts through what had decayed to `BlockGaussian.decoupled`'s last digit.)
 """
 
@@ -35,19 +35,19 @@ from scipy.sparse.csgraph import connected_components
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian, block_product, joint_block
 from saga_fg.estimators.correction import Gain, solve_lower
+from saga_fg.estimators.epoch import FilterStep
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.moment import Pass
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped, zeros
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
-def smoothed_means(passes: Sequence[Pass]) -> list[FloatArray]:
-    """Smoothed joint mean of every moment, over all its nodes."""
+def smoothed_means(steps: Sequence[FilterStep]) -> list[FloatArray]:
+    """Smoothed joint mean of every epoch, over all its nodes."""
     means = []
-    after: FloatArray | None = None  # r of the next moment, before it saw anything
-    for k in range(len(passes) - 1, -1, -1):
-        state = passes[k]
-        x, dynamics = state.filtered, state.dynamics
+    after: FloatArray | None = None  # r of the next epoch, before it saw anything
+    for k in range(len(steps) - 1, -1, -1):
+        step = steps[k]
+        x, dynamics = step.filtered, step.dynamics
         r = np.zeros(len(x.mean))
         if after is None or dynamics is None:
             means.append(x.mean)
@@ -58,18 +58,18 @@ def smoothed_means(passes: Sequence[Pass]) -> list[FloatArray]:
             else:
                 r[x.layout.places(x.layout.rows(dynamics.layout.nodes))] = back
             means.append(x.mean + block_product(x.blocks, x.partition, r))
-        for gain in reversed(state.gains):
+        for gain in reversed(step.gains):
             local = r[gain.places]
             unexplained = gain.whitened - (gain.W @ local[:, :, None])[:, :, 0]
             y = solve_lower(gain.L, unexplained[:, :, None], transposed=True)
             r[gain.places] = local + (np.swapaxes(gain.H, 1, 2) @ y)[:, :, 0]
-        after = r[: x.layout.offsets[state.carried]]
+        after = r[: x.layout.offsets[step.carried]]
     return means[::-1]
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedCovariance:
-    """P - P N P of one moment, computed where it is asked for; P and N over one partition."""
+    """P - P N P of one epoch, computed where it is asked for; P and N over one partition."""
 
     partition: Partition
     P: BlockDiagonal
@@ -101,7 +101,7 @@ class SmoothedCovariance:
 
 @dataclass(frozen=True, eq=False)
 class MarginalCovariances:
-    """The covariances of single nodes of one moment: for each size of states, its rows and blocks (k, d, d)."""
+    """The covariances of single nodes of one epoch: for each size of states, its rows and blocks (k, d, d)."""
 
     layout: Layout
     own: dict[int, FloatArray]
@@ -128,62 +128,64 @@ class MarginalCovariances:
         raise InputError("joint covariance: only those of single nodes were kept; ask for joint covariances")
 
 
-def smoothed_covariances(passes: Sequence[Pass], joint: bool) -> Iterator[SmoothedCovariance]:
-    """Smoothed covariance of every moment, from the last to the first; those of single nodes alone if not `joint`."""
-    return _swept(passes, joined_partitions(passes) if joint else _own_partitions(passes), future_known=False)
+def smoothed_covariances(steps: Sequence[FilterStep], joint: bool) -> Iterator[SmoothedCovariance]:
+    """Smoothed covariance of every epoch, from the last to the first; those of single nodes alone if not `joint`."""
+    return _swept(steps, joined_partitions(steps) if joint else _own_partitions(steps), future_known=False)
 
 
-def future_influence(passes: Sequence[Pass]) -> Iterator[FloatArray]:
-    """For every moment from the last to the first: (D,) standard deviations, of each component of its joint state.
+def future_influence(steps: Sequence[FilterStep]) -> Iterator[FloatArray]:
+    """For every epoch from the last to the first: (D,) standard deviations, of each component of its joint state.
 
-    Nothing that is measured after the last moment can be expected to move a smoothed mean by more.
+    Nothing that is measured after the last epoch can be expected to move a smoothed mean by more.
     """
-    for reduced in _swept(passes, _own_partitions(passes), future_known=True):
+    for reduced in _swept(steps, _own_partitions(steps), future_known=True):
         variance: FloatArray = np.empty(reduced.partition.layout.size)
         for places, P, M in zip(reduced.partition.groups, reduced.P, reduced.N, strict=True):
             variance[places] = ((P @ M) * P).sum(axis=2)
         yield np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _own_partitions(passes: Sequence[Pass]) -> list[Partition]:
-    """The components of every moment as they are filtered."""
-    return [state.filtered.partition for state in passes]
+def _own_partitions(steps: Sequence[FilterStep]) -> list[Partition]:
+    """The components of every epoch as they are filtered."""
+    return [step.filtered.partition for step in steps]
 
 
-def _swept(passes: Sequence[Pass], partitions: Sequence[Partition], future_known: bool) -> Iterator[SmoothedCovariance]:
-    """N of every moment from the last to the first, or M with `future_known`, over the partition of each."""
-    after: BlockDiagonal | None = None  # N of the next moment, before it saw anything, over the nodes carried there
+def _swept(
+    steps: Sequence[FilterStep], partitions: Sequence[Partition], future_known: bool
+) -> Iterator[SmoothedCovariance]:
+    """N of every epoch from the last to the first, or M with `future_known`, over the partition of each."""
+    after: BlockDiagonal | None = None  # N of the next epoch, before it saw anything, over the nodes carried there
     after_partition: Partition | None = None
-    for k in range(len(passes) - 1, -1, -1):
-        state, partition = passes[k], partitions[k]
-        x = state.filtered.over(partition)
-        if after is not None and after_partition is not None and state.dynamics is not None:
-            back = state.dynamics.pulled_back(after_partition, after)
+    for k in range(len(steps) - 1, -1, -1):
+        step, partition = steps[k], partitions[k]
+        x = step.filtered.over(partition)
+        if after is not None and after_partition is not None and step.dynamics is not None:
+            back = step.dynamics.pulled_back(after_partition, after)
             N = _moved(back, after_partition, partition)
         elif future_known:
             N = tuple(np.asarray(np.linalg.pinv(P, hermitian=True), dtype=np.float64) for P in x.blocks)
         else:
             N = zeros(partition)
         yield SmoothedCovariance(partition, x.blocks, N)
-        for gain in reversed(state.gains):
-            N = _before(gain, N, state.filtered, partition, 0.0 if future_known else 1.0)
+        for gain in reversed(step.gains):
+            N = _before(gain, N, step.filtered, partition, 0.0 if future_known else 1.0)
         after_partition = partition
-        if state.carried < len(partition.layout):
-            carried = np.arange(state.carried)
+        if step.carried < len(partition.layout):
+            carried = np.arange(step.carried)
             layout = Layout(partition.layout.nodes[carried], partition.layout.dims[carried])
             after_partition = partition.restricted(layout, carried)
         after = _moved(N, partition, after_partition)
 
 
-def joined_partitions(passes: Sequence[Pass]) -> list[Partition]:
-    """The components of every moment's nodes, joined through all moments before and after."""
-    fine = [state.filtered.partition for state in passes]
+def joined_partitions(steps: Sequence[FilterStep]) -> list[Partition]:
+    """The components of every epoch's nodes, joined through all epochs before and after."""
+    fine = [step.filtered.partition for step in steps]
     starts = np.concatenate([[0], np.cumsum([partition.count for partition in fine])]).astype(np.int64)
     a, b = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
-    for k, state in enumerate(passes[:-1]):
-        if state.dynamics is not None:
-            stay = state.dynamics.layout
-            rows = state.layout.rows(stay.nodes) if len(stay) < len(state.layout) else np.arange(len(stay))
+    for k, step in enumerate(steps[:-1]):
+        if step.dynamics is not None:
+            stay = step.dynamics.layout
+            rows = step.layout.rows(stay.nodes) if len(stay) < len(step.layout) else np.arange(len(stay))
             a.append(starts[k] + fine[k].label[rows])
             b.append(starts[k + 1] + fine[k + 1].label[: len(stay)])
     i, j = np.concatenate(a), np.concatenate(b)

@@ -1,7 +1,7 @@
 """The batch smoother: a whole recording, every state given everything measured.
 
-All factors since the start are solved at once, with the means and covariances of every node at every moment, in
-whichever order of elimination takes least time (`saga_fg.estimators.elimination_order`). Robust losses are solved by
+All factors since the start are solved at once, with the means and covariances of every node at every epoch, in
+whichever order of elimination takes least time (`saga_fg.estimators.sparse_elimination`). Robust losses are solved by
 iteratively reweighted least squares, or by graduated non-convexity, which finds outliers without a good start
 (`saga_fg.estimators.graduated`).
 """
@@ -13,30 +13,24 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import FactorError, Robust, nonlinear_graph
+from factors import FactorError, Robust
 from saga_fg.errors import InputError
-from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.elimination import NoSolution, marginal_covariances, solved_tree, tree_covariances
-from saga_fg.estimators.elimination_order import Order, cheapest_order
-from saga_fg.estimators.factor_graph import recording_factors
+from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.graduated import GraduatedNonConvexity
-from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.moment import Moment
-from saga_fg.estimators.motion import Motion
-from saga_fg.estimators.newest import NewestMarginals, live_rows
+from saga_fg.estimators.graph_solution import NoSolution
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
-from saga_fg.estimators.sighting import Observations, Sighting
-from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
+from saga_fg.estimators.sparse_elimination import Order, SparseSolution, cheapest_order
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +45,7 @@ class BatchState:
     graduated: bool
 
 
-class BatchSmoother(NewestMarginals):
+class BatchSmoother(RecordedSmoother):
     """The exact smoother over everything. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     settings     of Gauss-Newton, for what is nonlinear or robust
@@ -60,7 +54,7 @@ class BatchSmoother(NewestMarginals):
     order        of elimination: "time", "colamd", "metis", or "auto" for the cheapest (that of time where something is
                  nonlinear). Where sparse elimination has not the digits, and for joint covariances, it is that of time
 
-    `mean`, `covariance` and their like speak of the newest moment, `smoothed` of all moments.
+    `mean`, `covariance` and their like speak of the newest epoch, `smoothed` of all epochs.
     """
 
     def __init__(
@@ -75,24 +69,15 @@ class BatchSmoother(NewestMarginals):
         self._recording = Recording(self._settings, lazy=not likelihoods)
         self._wanted = order
         self._order: Order | None = None  # of the recording as it is
-        self._sparse: _Sparse | None = None  # its solution, where that is not in the order of time
+        self._sparse: SparseSolution | None = None  # its solution, where that is not in the order of time
         self._graduated = True  # whether the weights of graduated non-convexity are those of the whole recording
 
-    @property
-    def time(self) -> float:
-        """Of the newest moment: the sum of all intervals, s."""
-        return self._recording.time
-
-    @property
-    def nodes(self) -> IntArray:
-        return self._recording.layout.nodes
-
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
-        self._recording.add(nodes, means, covariances)
+        super().add(nodes, means, covariances)
         self._changed()
 
     def predict(self, transition: Transition) -> None:
-        self._recording.move(Motion(transition))
+        super().predict(transition)
         self._changed()
 
     def update(
@@ -101,19 +86,11 @@ class BatchSmoother(NewestMarginals):
         time: float | None = None,
         robust: Robust | GraduatedNonConvexity | None = None,
     ) -> float:
-        """Take in measurements made at `time` (s, on the smoother's clock), None for now.
-
-        An interval that contains `time` is split: its recorded graph is discretised anew over both parts. Returns the
-        log-likelihood of the measurements given all taken in before; where something is nonlinear or robust, that of
-        the linearisation.
-        """
-        likelihood = self._recording.see(Sighting(measurements, robust), time)
+        """Take in measurements, as `RecordedSmoother.update`; a loss may be reached by graduated non-convexity."""
+        likelihood = self._recording.update(RecordedMeasurements(measurements, robust), time)
         self._graduated &= not isinstance(robust, GraduatedNonConvexity)
         self._changed()
         return likelihood
-
-    def marginalise(self, nodes: ArrayLike) -> None:
-        self._recording.leave(nodes)
 
     @property
     def order(self) -> Order:
@@ -123,40 +100,40 @@ class BatchSmoother(NewestMarginals):
             if self._wanted != "auto":
                 self._order = self._wanted
             elif recording.linear:
-                self._order = cheapest_order(recording.moments, recording.layouts)
+                self._order = cheapest_order(recording.epochs, recording.layouts)
             else:  # the filter finds a better start than the dynamics alone
                 self._order = "time"
         return self._order
 
-    def smoothed(self, covariances: bool = True, joint: bool = False) -> tuple[Smoothed, ...]:
-        """Every moment, oldest first.
+    def smoothed(self, covariances: bool = True, joint: bool = False) -> tuple[SmoothedState, ...]:
+        """Every epoch, oldest first.
 
-        Without `covariances` means only, which costs much less; with `joint` the joint covariances of each moment's
+        Without `covariances` means only, which costs much less; with `joint` the joint covariances of each epoch's
         nodes too, which takes more memory.
         """
         self._graduate()
         recording, sparse = self._recording, None if joint else self._solution()
         if sparse is None:
-            return smoothed_moments(recording, covariances, joint)
+            return self._smoothed(covariances, joint)
         try:
             P = sparse.covariances(recording.layouts) if covariances else None
         except NoSolution as reason:
             self._give_up(reason)
-            return smoothed_moments(recording, covariances, joint)
+            return self._smoothed(covariances, joint)
         return tuple(
-            Smoothed(moment.time, layout, mean, None if P is None else P[k])
-            for k, (moment, layout, mean) in enumerate(
-                zip(recording.moments, recording.layouts, sparse.means, strict=True)
+            SmoothedState(epoch.time, layout, mean, None if P is None else P[k])
+            for k, (epoch, layout, mean) in enumerate(
+                zip(recording.epochs, recording.layouts, sparse.means, strict=True)
             )
         )
 
     def weights(self) -> list[list[FloatArray]]:
-        """For each moment, for each of its updates, (m,) how much each measurement counts: 1 fully, 0 not at all."""
+        """For each epoch, for each of its updates, (m,) how much each measurement counts: 1 fully, 0 not at all."""
         self._graduate()
-        moments, layouts = self._recording.moments, self._recording.layouts
+        epochs, layouts = self._recording.epochs, self._recording.layouts
         return [
-            [sighting.counted(layout, mean) for sighting in moment.sightings]
-            for moment, layout, mean in zip(moments, layouts, self._means(), strict=True)
+            [recorded.weights_at(layout, mean) for recorded in epoch.measurements]
+            for epoch, layout, mean in zip(epochs, layouts, self._means(), strict=True)
         ]
 
     def graph(self) -> SceneFactorGraph:
@@ -175,15 +152,15 @@ class BatchSmoother(NewestMarginals):
         self._graduated = state.graduated
         self._changed()
 
-    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+    def posterior(self) -> BlockGaussian:
         self._graduate()
-        return live_rows(self._recording.newest(), self._recording.layout, nodes)
+        return super().posterior()
 
     def _graduate(self) -> None:
         """Find the weights of graduated non-convexity, from all ones."""
         if self._graduated:
             return
-        losses = {sighting.robust for sighting in _sightings(self._recording.moments)}
+        losses = {recorded.robust for recorded in _all_measurements(self._recording.epochs)}
         kinds = [loss for loss in losses if isinstance(loss, GraduatedNonConvexity)]
         weights = {loss: np.ones(len(self._distances(loss))) for loss in kinds}
         self._weigh(weights)
@@ -205,41 +182,41 @@ class BatchSmoother(NewestMarginals):
 
     def _distances(self, loss: GraduatedNonConvexity) -> FloatArray:
         """Of all residuals under this loss, standard deviations."""
-        moments, layouts = self._recording.moments, self._recording.layouts
+        epochs, layouts = self._recording.epochs, self._recording.layouts
         parts = [
-            sighting.distances(layout, mean)
-            for moment, layout, mean in zip(moments, layouts, self._means(), strict=True)
-            for sighting in moment.sightings
-            if sighting.robust == loss
+            recorded.distances(layout, mean)
+            for epoch, layout, mean in zip(epochs, layouts, self._means(), strict=True)
+            for recorded in epoch.measurements
+            if recorded.robust == loss
         ]
         return np.concatenate([np.empty(0), *parts])
 
     def _weigh(self, weights: dict[GraduatedNonConvexity, FloatArray]) -> None:
         """Set the weights of all measurements under each loss, in their order."""
         used = dict.fromkeys(weights, 0)
-        moments: list[Moment] = []
-        for moment in self._recording.moments:
-            sightings = []
-            for sighting in moment.sightings:
-                loss, count = sighting.robust, len(sighting.measured)
+        epochs: list[Epoch] = []
+        for epoch in self._recording.epochs:
+            measurements = []
+            for recorded in epoch.measurements:
+                loss, count = recorded.robust, len(recorded.measured)
                 if isinstance(loss, GraduatedNonConvexity):
-                    sighting = sighting.weighted(weights[loss][used[loss] : used[loss] + count])
+                    recorded = recorded.with_weights(weights[loss][used[loss] : used[loss] + count])
                     used[loss] += count
-                sightings.append(sighting)
-            moments.append(replace(moment, sightings=tuple(sightings)))
-        self._recording.reweigh(moments)
+                measurements.append(recorded)
+            epochs.append(replace(epoch, measurements=tuple(measurements)))
+        self._recording.reweigh(epochs)
         self._sparse = None
 
     def _means(self) -> Sequence[FloatArray]:
-        """Joint mean of every moment."""
+        """Joint mean of every epoch."""
         sparse = self._solution()
         return self._recording.means() if sparse is None else sparse.means
 
-    def _solution(self) -> _Sparse | None:
+    def _solution(self) -> SparseSolution | None:
         """The solution in a sparse order, None where that of time is better or the only one."""
         if self.order != "time" and self._sparse is None:
             try:
-                self._sparse = _Sparse.of(self._recording, self.order, self._settings.max_iterations)
+                self._sparse = SparseSolution.of(self._recording, self.order, self._settings.max_iterations)
             except (NoSolution, FactorError, GraphError) as reason:
                 self._give_up(reason)
         return self._sparse
@@ -253,41 +230,5 @@ class BatchSmoother(NewestMarginals):
         self._order = self._sparse = None
 
 
-@dataclass(eq=False)
-class _Sparse:
-    """Means of every moment, and the tree from which covariances can be had."""
-
-    means: list[FloatArray]
-    keys: list[dict[int, int]]  # of each moment's nodes
-    dims: dict[int, int]
-    tree: gtsam.GaussianBayesTree
-    known: list[MarginalCovariances] | None = None
-
-    @staticmethod
-    def of(recording: Recording, order: Order, max_iterations: int) -> _Sparse:
-        """Raises `NoSolution`, `FactorError` or `GraphError` where it cannot be had in this order."""
-        means = recording.rough_means()
-        recorded = recording_factors(recording.prior, recording.moments, recording.layouts, means)
-        states, dims, start = dict[int, FloatArray](), dict[int, int](), gtsam.Values()
-        for one, layout, mean in zip(recorded, recording.layouts, means, strict=True):
-            states |= zip(one.keys.values(), np.split(mean, layout.offsets[1:-1]), strict=False)
-        for key, state in states.items():
-            start.insert(key, state)
-            dims[key] = len(state)
-        factors = [factor for one in recorded for kind in one.factors.values() for factor in kind]
-        linear = nonlinear_graph([factor for factor in factors if isinstance(factor, gtsam.JacobianFactor)], dims)
-        others = [factor for factor in factors if not isinstance(factor, gtsam.JacobianFactor)]
-        values, tree = solved_tree(linear, others, start, order, max_iterations)
-        keys = [one.keys for one in recorded]
-        solved = [np.concatenate([np.empty(0), *(values.atVector(key) for key in own.values())]) for own in keys]
-        return _Sparse(solved, keys, dims, tree)
-
-    def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
-        """Of all single states, by moment."""
-        if self.known is None:
-            self.known = marginal_covariances(tree_covariances(self.tree, self.dims), self.keys, layouts)
-        return self.known
-
-
-def _sightings(moments: Sequence[Moment]) -> Iterable[Sighting]:
-    return (sighting for moment in moments for sighting in moment.sightings)
+def _all_measurements(epochs: Sequence[Epoch]) -> Iterable[RecordedMeasurements]:
+    return (recorded for epoch in epochs for recorded in epoch.measurements)

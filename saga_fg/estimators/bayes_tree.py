@@ -1,7 +1,7 @@
-"""`gtsam.ISAM2` as a value: what it holds of one moment, and what it is to be told next.
+"""`gtsam.ISAM2` over the states of one epoch, as a value.
 
-GTSAM's object is never changed in place: an update works on a copy, which costs microseconds, so that whatever GTSAM
-refuses leaves the last good one untouched.
+GTSAM's object is never changed in place: an update works on a copy, which costs microseconds, so that an update that
+GTSAM refuses leaves the last good one untouched.
 """
 
 from __future__ import annotations
@@ -13,90 +13,95 @@ import numpy as np
 
 from factors import nonlinear_graph
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.cells import Cells
-from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.block_variables import BlockVariables
+from saga_fg.estimators.dynamics import Dynamics, PredictionSummary
+from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.prediction import Prediction
-from saga_fg.estimators.sighting import WhitenedRows
 from saga_fg.numerics.arrays import IntArray
 
 
 @dataclass(frozen=True, eq=False)
 class BayesTree:
-    """iSAM2 over the states of one moment.
+    """iSAM2, and the changes that its next update takes in.
 
-    isam, cells (its present variables), components (what they are correlated with); and what it has not been told yet:
-    factors, fresh (keys of new variables and their sizes), leaving (keys of the past, to be marginalised)
+    isam        as of the last update
+    variables   of the present states
+    components  nodes that are correlated
+    factors     to be added
+    new         keys of the variables to be added, with their sizes
+    leaving     keys of the past variables, to be marginalised, with their sizes
     """
 
     isam: gtsam.ISAM2
-    cells: Cells
+    variables: BlockVariables
     components: Partition
     factors: tuple[gtsam.JacobianFactor, ...]
-    fresh: dict[int, int]
+    new: dict[int, int]
     leaving: dict[int, int]
 
     @staticmethod
     def begun(x: BlockGaussian, qr: bool) -> BayesTree:
-        """From what is known of some nodes; by QR or by Cholesky elimination. LinAlgError where P has no root."""
+        """Start from a Gaussian, by QR or by Cholesky elimination. Raises LinAlgError where P has no root."""
         variances = x.variances()
         if not (variances > 0).all():
             raise np.linalg.LinAlgError("a variance is not positive")
-        cells = Cells.over(x.partition, 0, x.mean, np.sqrt(variances))
-        priors = tuple(cells.priors(x, np.arange(len(x.layout))))
-        return BayesTree(gtsam.ISAM2(_parameters(qr)), cells, x.partition, priors, cells.dims(), {})
+        variables = BlockVariables.over(x.partition, 0, x.mean, np.sqrt(variances))
+        priors = tuple(variables.priors(x, np.arange(len(x.layout))))
+        return BayesTree(gtsam.ISAM2(_parameters(qr)), variables, x.partition, priors, variables.dims(), {})
 
-    def born(self, x: BlockGaussian) -> BayesTree:
-        """With the nodes that `x` has at its end and the tree has not, which are correlated with nobody."""
-        known, first = self.cells.partition.layout, self._next_key
+    def with_births(self, x: BlockGaussian) -> BayesTree:
+        """Add the nodes that `x` has at its end and the tree has not, independent of all others."""
+        known, first = self.variables.partition.layout, self._next_key
         rows = np.arange(len(known), len(x.layout))
         scale = np.sqrt(x.variances()[known.size :])
-        cells = self.cells.extended(x.layout, x.mean[known.size :], scale, first)
-        fresh = {key: size for key, size in cells.dims().items() if key >= first}
-        factors = self.factors + tuple(cells.births(rows, x.covariances(rows)))
-        return replace(self, cells=cells, components=x.partition, factors=factors, fresh=self.fresh | fresh)
+        variables = self.variables.extended(x.layout, x.mean[known.size :], scale, first)
+        new = {key: size for key, size in variables.dims().items() if key >= first}
+        factors = self.factors + tuple(variables.births(rows, x.covariances(rows)))
+        return replace(self, variables=variables, components=x.partition, factors=factors, new=self.new | new)
 
-    def seen(self, rows: WhitenedRows) -> BayesTree:
-        """With linear measurements of some nodes."""
-        return replace(self, factors=self.factors + tuple(self.cells.detections(rows)))
+    def with_measurements(self, rows: WhitenedMeasurements) -> BayesTree:
+        """Add linear measurements."""
+        return replace(self, factors=self.factors + tuple(self.variables.detections(rows)))
 
-    def moved(self, rows: IntArray, dynamics: Dynamics, prediction: Prediction, in_moments: BlockGaussian) -> BayesTree:
-        """After an interval, of the nodes that stay, which stood at `rows`.
+    def predicted(
+        self, rows: IntArray, dynamics: Dynamics, prediction: PredictionSummary, by_covariance: BlockGaussian
+    ) -> BayesTree:
+        """Move over an interval; rows: of the nodes that stay.
 
-        dynamics: of those whose new state is told by interaction factors; in_moments: the prediction of the others.
+        dynamics: of the nodes predicted by interaction factors; by_covariance: the prediction of the others.
         """
         components = prediction.components
-        cells = Cells.over(components, self._next_key, prediction.mean, prediction.scale, dynamics)
-        others = components.layout.rows(in_moments.layout.nodes)
-        factors = (*cells.interactions(self.cells, rows, dynamics), *cells.priors(in_moments, others))
+        variables = BlockVariables.over(components, self._next_key, prediction.mean, prediction.scale, dynamics)
+        others = components.layout.rows(by_covariance.layout.nodes)
+        factors = (*variables.interactions(self.variables, rows, dynamics), *variables.priors(by_covariance, others))
         return BayesTree(
             self.isam,
-            cells,
+            variables,
             components,
             self.factors + factors,
-            self.fresh | cells.dims(),
-            self.leaving | self.cells.dims(),
+            self.new | variables.dims(),
+            self.leaving | self.variables.dims(),
         )
 
     @property
     def qr(self) -> bool:
-        """Whether it is eliminated by QR, or by Cholesky."""
+        """True where it is eliminated by QR, false by Cholesky."""
         return self.isam.params().getFactorization() == "QR"
 
     @property
     def _next_key(self) -> int:
-        return int(self.cells.keys.max(initial=-1)) + 1
+        return int(self.variables.keys.max(initial=-1)) + 1
 
     def updated(self) -> tuple[BayesTree, BlockGaussian]:
-        """With everything told and the past marginalised; and what is known of the present.
+        """Take in all changes and marginalise the past; returns the posterior as well.
 
         GTSAM raises RuntimeError where its arithmetic fails.
         """
         isam = gtsam.ISAM2(self.isam)
-        present = self.cells.dims()
-        graph = nonlinear_graph(self.factors, present | self.leaving | self.fresh)
+        present = self.variables.dims()
+        graph = nonlinear_graph(self.factors, present | self.leaving | self.new)
         values = gtsam.Values()
-        for key, size in self.fresh.items():
+        for key, size in self.new.items():
             values.insert(key, np.zeros(size))
         parameters = gtsam.ISAM2UpdateParams()
         if self.leaving:
@@ -110,11 +115,11 @@ class BayesTree:
         isam.update(graph, values, parameters)
         if self.leaving:
             isam.marginalizeLeaves(leaving)
-        mean = self.cells.mean(isam.getDelta())
+        mean = self.variables.mean(isam.getDelta())
         if not np.isfinite(mean).all():
             raise RuntimeError("iSAM2 answers with numbers that are not finite")
-        x = BlockGaussian(self.components, mean, self.cells.marginals(isam, self.components))
-        return replace(self, isam=isam, factors=(), fresh={}, leaving={}), x
+        x = BlockGaussian(self.components, mean, self.variables.marginals(isam, self.components))
+        return replace(self, isam=isam, factors=(), new={}, leaving={}), x
 
 
 def _parameters(qr: bool) -> gtsam.ISAM2Params:

@@ -38,12 +38,11 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.factor_graph import prior_graph
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.motion import Motion
-from saga_fg.estimators.newest import NewestMarginals
 from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
-from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -58,7 +57,7 @@ class BoundedState:
     time: float
 
 
-class BoundedKalmanFilter(NewestMarginals):
+class BoundedKalmanFilter(LatestMarginals):
     """The filter that keeps correlations within `hops` of clusters of about `core` nodes.
 
     A node whose distance grows beyond `hops` is kept for `patience` further predictions, so that edges which come
@@ -103,7 +102,7 @@ class BoundedKalmanFilter(NewestMarginals):
 
     def predict(self, transition: Transition) -> None:
         layout = self._clusters.layout
-        dynamics = Motion(transition).dynamics(layout, self.joint_mean(layout.nodes))
+        dynamics = IntervalDynamics(transition).linearised(layout, self.joint_mean(layout.nodes))
         F = dynamics.matrix.copy()
         F.eliminate_zeros()
         acting = [blocks.values.any(axis=(1, 2)) for blocks in dynamics.F]

@@ -1,14 +1,14 @@
-"""The fixed-lag smoother: everything within a window of seconds, smoothed; late measurements where they belong.
+"""The fixed-lag smoother: everything within a window of seconds, smoothed; late measurements in their place.
 
-The factors of the window, with what the filter knew at its start as prior,
+The factors of the window, with the filter's posterior at its start as prior,
 
     prior        phi(x(t0))
     interaction  || x_i(t+dt) - sum_j F_ij x_j(t) - b_i ||_{Q_i}     one a node and interval
     detection    || z - h(x_i(t)) ||_{R}                              optionally robust
 
-are solved exactly where they are linear, by Gauss-Newton over the window where they are not. The elimination order is
-that of time, which for a chain of dense joint states is the best there is; it is carried out in covariance form, as
-filter and smoother, by components (`saga_fg.estimators.backward`). The newest state is the filter's.
+are solved exactly where they are linear, by Gauss-Newton over the window where they are not. They are eliminated in the
+order of time, the best one for a chain of dense joint states, in covariance form as filter and smoother, by components
+(`saga_fg.estimators.backward`). The newest state is the filter's.
 """
 
 from __future__ import annotations
@@ -16,30 +16,21 @@ from __future__ import annotations
 import copy
 import math
 
-from numpy.typing import ArrayLike
-
-from factors import Robust
 from saga_fg.errors import InputError
-from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.motion import Motion
-from saga_fg.estimators.newest import NewestMarginals, live_rows
-from saga_fg.estimators.protocol import Measurements
+from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
-from saga_fg.estimators.sighting import Observations, along_the_way
-from saga_fg.estimators.smoothed import Smoothed, smoothed_moments
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import IntArray
 
 
-class FixedLagSmoother(NewestMarginals):
+class FixedLagSmoother(RecordedSmoother):
     """The exact smoother over the last `lag` seconds. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
-    lag       s; at 0 it is the filter. The window begins at the last moment that is at least `lag` old, so that every
+    lag       s; at 0 it is the filter. The window begins at the last epoch that is at least `lag` old, so that every
               measurement up to `lag` late finds its interval
-    settings  of Gauss-Newton, for what is nonlinear or robust
+    settings  of Gauss-Newton, for nonlinear and robust factors
 
-    `mean`, `covariance` and their like speak of the newest moment, `smoothed` of all moments in the window.
+    `mean`, `covariance` and their like are those of the newest epoch, `smoothed` gives all epochs in the window.
     """
 
     def __init__(self, lag: float, settings: GaussNewtonSettings | None = None) -> None:
@@ -58,48 +49,13 @@ class FixedLagSmoother(NewestMarginals):
         """Length of the window, s."""
         return self._lag
 
-    @property
-    def time(self) -> float:
-        """Of the newest moment: the sum of all intervals, s."""
-        return self._recording.time
-
-    @property
-    def start(self) -> float:
-        """Time at which the window begins; nothing older can be taken in, s."""
-        return self._recording.moments[0].time
-
-    @property
-    def nodes(self) -> IntArray:
-        return self._recording.layout.nodes
-
-    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
-        self._recording.add(nodes, means, covariances)
-
     def predict(self, transition: Transition) -> None:
-        self._recording.move(Motion(transition))
-        self._recording.forget(self.time - self._lag)
+        super().predict(transition)
+        self._recording.drop_before(self.time - self._lag)
 
-    def update(
-        self, measurements: Measurements | Observations, time: float | None = None, robust: Robust | None = None
-    ) -> float:
-        """Take in measurements made at `time` (s, on the smoother's clock), None for now.
-
-        An interval that contains `time` is split: its recorded graph is discretised anew over both parts, its edges
-        kept. Returns the log-likelihood of the measurements given all taken in before; where the window holds something
-        nonlinear or robust, that of its linearisation. Raises `InputError` for a time outside the window.
-        """
-        return self._recording.see(along_the_way(measurements, robust), time)
-
-    def marginalise(self, nodes: ArrayLike) -> None:
-        self._recording.leave(nodes)
-
-    def smoothed(self, covariances: bool = True) -> tuple[Smoothed, ...]:
-        """Every moment in the window, oldest first; without `covariances` means only, which costs much less."""
-        return smoothed_moments(self._recording, covariances, joint=True)
-
-    def posterior(self) -> BlockGaussian:
-        """The filter's, of the nodes that are there now, and perhaps of some that just went."""
-        return self._recording.newest()
+    def smoothed(self, covariances: bool = True) -> tuple[SmoothedState, ...]:
+        """Every epoch in the window, oldest first; without `covariances` means only, which costs much less."""
+        return self._smoothed(covariances, joint=True)
 
     def graph(self) -> SceneFactorGraph:
         """The window as a running graph: a prior at its start, all factors since, the smoothed means as values."""
@@ -112,6 +68,3 @@ class FixedLagSmoother(NewestMarginals):
     def restore(self, state: RecordingState) -> None:
         """Continue from a snapshot, bit-identically."""
         self._recording.restore(state)
-
-    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
-        return live_rows(self.posterior(), self._recording.layout, nodes)

@@ -1,4 +1,4 @@
-"""A record of moments with the filter's pass over it: what the smoothers are made of.
+"""A record of epochs with the filter's pass over it: what the smoothers are made of.
 
 Told of the past, the filter's pass is done again from there. Where something is nonlinear or robust, everything
 recorded is linearised again at the smoothed means until they stand still, which is Gauss-Newton over the recording
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
+from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import (
     MarginalCovariances,
     SmoothedCovariance,
@@ -23,13 +24,12 @@ from saga_fg.estimators.backward import (
     smoothed_means,
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
 from saga_fg.estimators.factor_graph import recording_graph
-from saga_fg.estimators.fixed_point import FixedPoint
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.moment import Birth, Moment, Pass, arrival, passed, reckoned
-from saga_fg.estimators.motion import Motion, Standstill
+from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.protocol import require_kind
-from saga_fg.estimators.sighting import Sighting
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.settings import setting
@@ -57,14 +57,14 @@ class GaussNewtonSettings:
 class RecordingState:
     """A recording as a value.
 
-    prior of the first moment; moments; layout of each one's nodes; the filter's pass as far as it has come; whether
+    prior of the first epoch; epochs; layout of each one's nodes; the filter's pass as far as it has come; whether
     everything is linearised where it should be
     """
 
     prior: BlockGaussian
-    moments: tuple[Moment, ...]
+    epochs: tuple[Epoch, ...]
     layouts: tuple[Layout, ...]
-    passes: tuple[Pass, ...]
+    steps: tuple[FilterStep, ...]
     converged: bool
 
 
@@ -83,7 +83,7 @@ class Recording:
         self._covariances: list[SmoothedCovariance] | None = None
         self._marginals: list[MarginalCovariances] | None = None
         nothing = BlockGaussian.empty()
-        self.restore(RecordingState(nothing, (Moment(0.0),), (nothing.layout,), (arrival(nothing),), True))
+        self.restore(RecordingState(nothing, (Epoch(0.0),), (nothing.layout,), (initial_step(nothing),), True))
 
     def __copy__(self) -> Recording:
         twin = Recording(self._settings, self._lazy)
@@ -92,29 +92,29 @@ class Recording:
 
     def snapshot(self) -> RecordingState:
         return RecordingState(
-            self._prior, tuple(self._moments), tuple(self._layouts), tuple(self._passes), self._converged
+            self._prior, tuple(self._epochs), tuple(self._layouts), tuple(self._steps), self._converged
         )
 
     def restore(self, state: RecordingState) -> None:
         require_kind("state", state, RecordingState)
         self._prior, self._converged = state.prior, state.converged
-        self._moments, self._layouts, self._passes = list(state.moments), list(state.layouts), list(state.passes)
-        self._nonlinear = not all(moment.linear for moment in state.moments)
+        self._epochs, self._layouts, self._steps = list(state.epochs), list(state.layouts), list(state.steps)
+        self._nonlinear = not all(epoch.linear for epoch in state.epochs)
         self._changed()
 
     @property
     def time(self) -> float:
-        """Of the newest moment, s."""
-        return self._moments[-1].time
+        """Of the newest epoch, s."""
+        return self._epochs[-1].time
 
     @property
     def prior(self) -> BlockGaussian:
-        """What was known before the first moment, of the nodes that were there already."""
+        """What was known before the first epoch, of the nodes that were there already."""
         return self._prior
 
     @property
-    def moments(self) -> Sequence[Moment]:
-        return self._moments
+    def epochs(self) -> Sequence[Epoch]:
+        return self._epochs
 
     @property
     def linear(self) -> bool:
@@ -123,20 +123,20 @@ class Recording:
 
     @property
     def layouts(self) -> Sequence[Layout]:
-        """Of each moment: all its nodes, those that go afterwards too."""
+        """Of each epoch: all its nodes, those that go afterwards too."""
         return self._layouts
 
     @property
-    def passes(self) -> Sequence[Pass]:
+    def steps(self) -> Sequence[FilterStep]:
         """The filter's pass, complete and converged."""
         self.solve()
-        return self._passes
+        return self._steps
 
     @property
     def layout(self) -> Layout:
         """The nodes that are there now."""
         if self._layout is None:
-            gone = self._layouts[-1].rows(self._moments[-1].gone)
+            gone = self._layouts[-1].rows(self._epochs[-1].gone)
             self._layout = self._layouts[-1].without(gone) if len(gone) else self._layouts[-1]
         return self._layout
 
@@ -145,130 +145,132 @@ class Recording:
         added = self.layout.extended(nodes, mean.shape[1]).nodes[len(self.layout) :]
         if len(added) == 0:
             return
-        if np.isin(added, self._moments[-1].gone).any():  # gone and back at the same time: another moment
-            self._move(Standstill())
-        birth, moment = Birth(added, mean, covariance), self._moments[-1]
-        if len(self._passes) == len(self._moments):
-            self._passes[-1] = self._passes[-1].born(birth)
-        self._moments[-1] = replace(moment, births=(*moment.births, birth))
+        if np.isin(added, self._epochs[-1].gone).any():  # gone and back at the same time: another epoch
+            self._begin_epoch(ZeroInterval())
+        birth, epoch = Birth(added, mean, covariance), self._epochs[-1]
+        if len(self._steps) == len(self._epochs):
+            self._steps[-1] = self._steps[-1].with_birth(birth)
+        self._epochs[-1] = replace(epoch, births=(*epoch.births, birth))
         self._layouts[-1] = self._layouts[-1].extended(added, mean.shape[1])
         self._changed()
 
-    def move(self, motion: Motion) -> None:
-        """Begin a new moment."""
-        motion.check(self.layout)
-        self._move(motion)
+    def predict(self, interval: IntervalDynamics) -> None:
+        """Begin a new epoch."""
+        interval.check(self.layout)
+        self._begin_epoch(interval)
 
-    def see(self, sighting: Sighting, time: float | None = None) -> float:
-        """Take in measurements, of the newest moment or of any `time` within the recording.
+    def update(self, recorded: RecordedMeasurements, time: float | None = None) -> float:
+        """Take in measurements, of the newest epoch or of any `time` within the recording.
 
         Returns their log-likelihood given all that was known, NaN if lazy. An interval that contains `time` is split.
         """
-        k, moments, layouts = self._moment_at(self.time if time is None else time)
-        newest = k == len(moments) - 1
-        sighting.check(self.layout if newest else layouts[k])
-        if len(sighting.measured) == 0:
+        k, epochs, layouts = self._epoch_at(self.time if time is None else time)
+        newest = k == len(epochs) - 1
+        recorded.check(self.layout if newest else layouts[k])
+        if len(recorded.measured) == 0:
             return 0.0
-        inserted = len(moments) > len(self._moments)
-        moments[k] = replace(moments[k], sightings=(*moments[k].sightings, sighting))
-        passes, likelihood = self._passes[:k], math.nan
-        if not (self._lazy and sighting.linear):
-            known = _completed(self._passes, self._prior, self._moments)
-            passes = known[:k]
+        inserted = len(epochs) > len(self._epochs)
+        epochs[k] = replace(epochs[k], measurements=(*epochs[k].measurements, recorded))
+        steps, likelihood = self._steps[:k], math.nan
+        if not (self._lazy and recorded.linear):
+            known = _completed(self._steps, self._prior, self._epochs)
+            steps = known[:k]
             if not inserted:
-                passes.append(known[k].seen(sighting))
-            passes = _completed(passes, self._prior, moments)
+                steps.append(known[k].updated(recorded))
+            steps = _completed(steps, self._prior, epochs)
             if not self._lazy:
-                likelihood = sum(state.log_likelihood for state in passes[k:])
-                likelihood -= sum(state.log_likelihood for state in known[k:])
-        elif newest and not inserted and len(self._passes) == len(moments):
-            passes.append(self._passes[k].seen(sighting))
-        self._moments, self._layouts, self._passes = moments, layouts, passes
-        self._nonlinear |= not sighting.linear
+                likelihood = sum(step.log_likelihood for step in steps[k:])
+                likelihood -= sum(step.log_likelihood for step in known[k:])
+        elif newest and not inserted and len(self._steps) == len(epochs):
+            steps.append(self._steps[k].updated(recorded))
+        self._epochs, self._layouts, self._steps = epochs, layouts, steps
+        self._nonlinear |= not recorded.linear
         self._converged = not self._nonlinear
         self._changed()
         return likelihood
 
-    def leave(self, nodes: ArrayLike) -> None:
+    def marginalise(self, nodes: ArrayLike) -> None:
         rows = self.layout.rows(nodes)
         if len(set(rows.tolist())) < len(rows):
             raise InputError("nodes: expected each node once")
-        moment = self._moments[-1]
-        self._moments[-1] = replace(moment, gone=(*moment.gone, *self.layout.nodes[rows].tolist()))
+        epoch = self._epochs[-1]
+        self._epochs[-1] = replace(epoch, gone=(*epoch.gone, *self.layout.nodes[rows].tolist()))
         self._layout = None
 
-    def forget(self, time: float) -> None:
-        """Drop the moments before the last one that is not after `time`; what they told becomes the prior."""
+    def drop_before(self, time: float) -> None:
+        """Drop the epochs before the last one that is not after `time`; what they told becomes the prior."""
         k = 0
-        while k + 1 < len(self._moments) and self._moments[k + 1].time <= time + _SAME_TIME:
+        while k + 1 < len(self._epochs) and self._epochs[k + 1].time <= time + _SAME_TIME:
             k += 1
         self.drop(k)
 
     def drop(self, k: int) -> None:
-        """Drop the first k moments; what they told becomes the prior."""
+        """Drop the first k epochs; what they told becomes the prior."""
         if k == 0:
             return
         self.solve()
-        self._prior = self._passes[k].arrived
-        first = replace(self._passes[k], carried=len(self._prior.layout))
-        self._moments = [replace(self._moments[k], births=()), *self._moments[k + 1 :]]
-        self._layouts, self._passes = self._layouts[k:], [first, *self._passes[k + 1 :]]
-        self._nonlinear = not all(moment.linear for moment in self._moments)
+        self._prior = self._steps[k].prior
+        first = replace(self._steps[k], carried=len(self._prior.layout))
+        self._epochs = [replace(self._epochs[k], births=()), *self._epochs[k + 1 :]]
+        self._layouts, self._steps = self._layouts[k:], [first, *self._steps[k + 1 :]]
+        self._nonlinear = not all(epoch.linear for epoch in self._epochs)
         self._changed()
 
-    def newest(self) -> BlockGaussian:
-        """The filter's posterior at the newest moment, over all its nodes."""
+    def latest(self) -> BlockGaussian:
+        """The filter's posterior at the newest epoch, over all its nodes."""
         self.solve()
-        return self._passes[-1].filtered
+        return self._steps[-1].filtered
 
     def means(self) -> list[FloatArray]:
-        """Smoothed joint mean of every moment, over all its nodes (those that go afterwards, too)."""
+        """Smoothed joint mean of every epoch, over all its nodes (those that go afterwards, too)."""
         self.solve()
         if self._means is None:
-            self._means = smoothed_means(self._passes)
+            self._means = smoothed_means(self._steps)
         return self._means
 
     def covariances(self, joint: bool) -> Sequence[SmoothedCovariance | MarginalCovariances]:
-        """Smoothed covariance of every moment, joint ones or only those of single nodes, which take less memory."""
+        """Smoothed covariance of every epoch, joint ones or only those of single nodes, which take less memory."""
         self.solve()
         if self._covariances is None and joint:
-            self._covariances = list(smoothed_covariances(self._passes, joint=True))[::-1]
+            self._covariances = list(smoothed_covariances(self._steps, joint=True))[::-1]
         if self._covariances is not None:
             return self._covariances
         if self._marginals is None:
-            wholes = smoothed_covariances(self._passes, joint=False)
+            wholes = smoothed_covariances(self._steps, joint=False)
             self._marginals = [MarginalCovariances.of(whole) for whole in wholes][::-1]
         return self._marginals
 
     def graph(self, means: Sequence[FloatArray] | None = None) -> SceneFactorGraph:
         """The equivalent factor graph, with the smoothed means, or others, as values."""
-        return recording_graph(self._prior, self._moments, self._layouts, self.means() if means is None else means)
+        return recording_graph(self._prior, self._epochs, self._layouts, self.means() if means is None else means)
 
     def rough_means(self) -> list[FloatArray]:
-        """Joint mean of every moment from which a solution can be found: the filter's, if it takes a good start."""
+        """Joint mean of every epoch from which a solution can be found: the filter's, if it takes a good start."""
         if not self._nonlinear:
-            return reckoned(self._prior, self._moments, self._layouts)
-        self._passes = _completed(self._passes, self._prior, self._moments)
-        return [state.filtered.mean for state in self._passes]
+            return dead_reckoned(self._prior, self._epochs, self._layouts)
+        self._steps = _completed(self._steps, self._prior, self._epochs)
+        return [step.filtered.mean for step in self._steps]
 
-    def reweigh(self, moments: Sequence[Moment]) -> None:
-        """Put moments in place that differ in the weights of their sightings only."""
-        passes = [] if self._lazy else passed(self._prior, list(moments), self.means() if self._nonlinear else None)
-        self._moments, self._passes = list(moments), passes
+    def reweigh(self, epochs: Sequence[Epoch]) -> None:
+        """Put epochs in place that differ in the weights of their measurements only."""
+        steps = (
+            [] if self._lazy else filter_epochs(self._prior, list(epochs), self.means() if self._nonlinear else None)
+        )
+        self._epochs, self._steps = list(epochs), steps
         self._converged = not self._nonlinear
         self._changed()
 
     def solve(self) -> None:
         """Complete the filter's pass; linearise until the smoothed means stand still where that makes a difference."""
-        self._passes = _completed(self._passes, self._prior, self._moments)
+        self._steps = _completed(self._steps, self._prior, self._epochs)
         if self._converged:
             return
-        means, step, iteration = smoothed_means(self._passes), math.inf, FixedPoint()
+        means, step, iteration = smoothed_means(self._steps), math.inf, AndersonAcceleration()
         ends = np.cumsum([len(mean) for mean in means])[:-1]
         for count in range(self._settings.max_iterations):
-            passes = passed(self._prior, self._moments, means)
-            solved = smoothed_means(passes)
-            sigma = np.sqrt(np.concatenate([state.filtered.variances() for state in passes]))
+            steps = filter_epochs(self._prior, self._epochs, means)
+            solved = smoothed_means(steps)
+            sigma = np.sqrt(np.concatenate([step.filtered.variances() for step in steps]))
             before, after = np.concatenate(means), np.concatenate(solved)
             step = float(np.max(np.abs(after - before) / sigma, initial=0.0))
             log.debug("iteration %d: largest step %.3g standard deviations", count + 1, step)
@@ -277,60 +279,60 @@ class Recording:
             means = np.split(iteration.next(before, after, sigma), ends)
         else:
             log.warning("no convergence in %d iterations; last step %.2g sigma", self._settings.max_iterations, step)
-        self._passes, self._converged = passes, True
+        self._steps, self._converged = steps, True
         self._changed()
         self._means = solved
 
-    def _move(self, motion: Motion | Standstill) -> None:
-        moment, layout, passes = self._moments[-1], self.layout, self._passes
+    def _begin_epoch(self, interval: IntervalDynamics | ZeroInterval) -> None:
+        epoch, layout, steps = self._epochs[-1], self.layout, self._steps
         if not self._lazy:
             self.solve()
-        if not (self._lazy and motion.linear):
-            known = _completed(self._passes, self._prior, self._moments)
-            state, prior = known[-1].moved(moment.gone, motion)
-            passes = [*known[:-1], state, arrival(prior)]
-        self._moments = [*self._moments[:-1], replace(moment, motion=motion), Moment(moment.time + motion.dt)]
-        self._layouts, self._passes = [*self._layouts, layout], passes
-        self._nonlinear |= not motion.linear
-        self._converged &= motion.linear or not self._lazy
+        if not (self._lazy and interval.linear):
+            known = _completed(self._steps, self._prior, self._epochs)
+            step, prior = known[-1].to_next(epoch.gone, interval)
+            steps = [*known[:-1], step, initial_step(prior)]
+        self._epochs = [*self._epochs[:-1], replace(epoch, interval=interval), Epoch(epoch.time + interval.dt)]
+        self._layouts, self._steps = [*self._layouts, layout], steps
+        self._nonlinear |= not interval.linear
+        self._converged &= interval.linear or not self._lazy
         self._changed()
 
-    def _moment_at(self, time: float) -> tuple[int, list[Moment], list[Layout]]:
-        """The moment of `time`, with moments and layouts in which it is, an interval split if need be."""
-        moments, layouts = list(self._moments), list(self._layouts)
+    def _epoch_at(self, time: float) -> tuple[int, list[Epoch], list[Layout]]:
+        """The epoch of `time`, with epochs and layouts in which it is, an interval split if need be."""
+        epochs, layouts = list(self._epochs), list(self._layouts)
         time = float(checked("time", time, ()))
-        first, last = moments[0].time, moments[-1].time
+        first, last = epochs[0].time, epochs[-1].time
         if time > last + _SAME_TIME:
-            raise InputError(f"time: {time:.6f} s is after the newest moment, {last:.6f} s; predict first")
+            raise InputError(f"time: {time:.6f} s is after the newest epoch, {last:.6f} s; predict first")
         if time < first - _SAME_TIME:
             raise InputError(f"time: {time:.6f} s is before what is remembered, which begins at {first:.6f} s")
-        k = len(moments) - 1
-        while moments[k].time > time + _SAME_TIME:
+        k = len(epochs) - 1
+        while epochs[k].time > time + _SAME_TIME:
             k -= 1
-        if moments[k].time >= time - _SAME_TIME:
-            return k, moments, layouts
-        motion = moments[k].motion
-        assert isinstance(motion, Motion)  # a standstill has no inside
-        start, rest = motion.parts(time - moments[k].time)
-        gone = layouts[k].rows(moments[k].gone)
-        moments[k] = replace(moments[k], motion=start)
-        moments.insert(k + 1, Moment(time, motion=rest))
+        if epochs[k].time >= time - _SAME_TIME:
+            return k, epochs, layouts
+        interval = epochs[k].interval
+        assert isinstance(interval, IntervalDynamics)  # a zero interval has no inside
+        start, rest = interval.split(time - epochs[k].time)
+        gone = layouts[k].rows(epochs[k].gone)
+        epochs[k] = replace(epochs[k], interval=start)
+        epochs.insert(k + 1, Epoch(time, interval=rest))
         layouts.insert(k + 1, layouts[k].without(gone) if len(gone) else layouts[k])
-        return k + 1, moments, layouts
+        return k + 1, epochs, layouts
 
     def _changed(self) -> None:
         self._layout = None
         self._means = self._covariances = self._marginals = None
 
 
-def _completed(passes: list[Pass], prior: BlockGaussian, moments: list[Moment]) -> list[Pass]:
-    """The filter's pass over all moments, given that over the first ones."""
-    k = len(passes)
-    if k == len(moments):
-        return passes
-    done = list(passes)
+def _completed(steps: list[FilterStep], prior: BlockGaussian, epochs: list[Epoch]) -> list[FilterStep]:
+    """The filter's pass over all epochs, given that over the first ones."""
+    k = len(steps)
+    if k == len(epochs):
+        return steps
+    done = list(steps)
     if k > 0:
-        motion = moments[k - 1].motion
-        assert motion is not None
-        done[-1], prior = done[-1].moved(moments[k - 1].gone, motion)
-    return done + passed(prior, moments[k:])
+        interval = epochs[k - 1].interval
+        assert interval is not None
+        done[-1], prior = done[-1].to_next(epochs[k - 1].gone, interval)
+    return done + filter_epochs(prior, epochs[k:])

@@ -1,7 +1,7 @@
 r"""Measurement noise from errors that are known: the sensor's own noise model by maximum likelihood, robustly.
 
     (along, across) ~ (1 - e) N(0, f^2 (position^2 + (range_noise r)^2)) N(0, f^2 (position^2 + (bearing_noise r)^2))
-                      + e / (area of the gate),                  f = 1 + low_score (1 - p)
+                      + e / (area of the gate),                  f = 1 + low_score_growth (1 - p)
 
 The uniform part takes up wrong matches, so that they do not widen the rest. All parameters are positive and are sought
 as logarithms; a normal prior of width 1 around what is known of other classes decides where there is little data.
@@ -19,10 +19,10 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.sensor import NoiseModel
 
-PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_score=0.3)
+PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_score_growth=0.3)
 PRIOR_WIDTH = 1.0  # of the logarithms
 WRONG = 0.05  # share of wrong matches expected
-POSITION = ("position", "range_noise", "bearing_noise", "low_score")
+POSITION = ("position", "range_noise", "bearing_noise", "low_score_growth")
 LEAST = 1e-4  # below, a parameter is nothing
 NINE_IN_TEN = 1.6448536269514722  # standard deviations of a normal distribution
 FEWEST = 10  # errors, to say anything of a standard deviation
@@ -48,9 +48,9 @@ def fit_position_noise(
     odds = math.log(WRONG / (1 - WRONG))
 
     def cost(theta: FloatArray) -> float:
-        position, range_noise, bearing_noise, low_score = np.exp(theta[:4])
+        position, range_noise, bearing_noise, low_score_growth = np.exp(theta[:4])
         wrong = 1 / (1 + math.exp(-theta[4]))
-        f = 1 + low_score * spread
+        f = 1 + low_score_growth * spread
         var_along = (f**2) * (position**2 + (range_noise * distance) ** 2)
         var_across = (f**2) * (position**2 + (bearing_noise * distance) ** 2)
         density = np.exp(-0.5 * (along**2 / var_along + across**2 / var_across)) / (
@@ -74,7 +74,7 @@ def fit_position_noise(
 
 def _starts(prior: NoiseModel) -> list[FloatArray]:
     """Logarithms from which a good and a poor sensor are found; the cost has minima of which one calls all wrong."""
-    low = max(prior.low_score, 0.1)
+    low = max(prior.low_score_growth, 0.1)
     return [np.log([0.1, 0.005, 0.005, low]), np.log([0.3, 0.03, 0.01, low])]
 
 

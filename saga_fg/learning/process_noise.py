@@ -45,19 +45,23 @@ class MeasuredTrajectory:
 
 
 def fit_acceleration_noise(
-    objects: Sequence[MeasuredTrajectory], birth_speed: float = 10.0, bounds: tuple[float, float] = (1e-4, 1e2)
+    objects: Sequence[MeasuredTrajectory],
+    initial_speed_deviation: float = 10.0,
+    bounds: tuple[float, float] = (1e-4, 1e2),
 ) -> float:
     """The most likely `ConstantVelocity.acceleration_noise`, m^2/s^3, of some objects.
 
-    birth_speed: standard deviation of a velocity component before the second measurement, m/s. Raises `InputError` when
-    no object was seen at least three times.
+    initial_speed_deviation: standard deviation of a velocity component before the second measurement, m/s.
+    Raises `InputError` when no object was seen at least three times.
     """
     useful = [o for o in objects if len(o) >= 3]
     if not useful:
         raise InputError("objects: expected at least one object seen three times or more")
     low, high = np.log(bounds)
     found = minimize_scalar(
-        lambda log_q: -log_likelihood(useful, float(np.exp(log_q)), birth_speed), bounds=(low, high), method="bounded"
+        lambda log_q: -log_likelihood(useful, float(np.exp(log_q)), initial_speed_deviation),
+        bounds=(low, high),
+        method="bounded",
     )
     return float(np.exp(found.x))
 
@@ -75,13 +79,18 @@ def fit_acceleration_noise_by_class(objects: Mapping[str, Sequence[MeasuredTraje
 
 
 def log_likelihood(
-    objects: Sequence[MeasuredTrajectory], acceleration_noise: float, birth_speed: float = 10.0
+    objects: Sequence[MeasuredTrajectory], acceleration_noise: float, initial_speed_deviation: float = 10.0
 ) -> float:
     """Log-likelihood of all measurements but each object's first, under independent constant-velocity motion."""
     order = sorted(objects, key=len, reverse=True)
     columns = [np.concatenate([getattr(o, name) for o in order]) for name in ("time", "position", "R")]
     return innovation_likelihood(
-        np.array([len(o) for o in order]), columns[0], columns[1], columns[2], acceleration_noise, birth_speed
+        np.array([len(o) for o in order]),
+        columns[0],
+        columns[1],
+        columns[2],
+        acceleration_noise,
+        initial_speed_deviation,
     )
 
 
@@ -91,7 +100,7 @@ def innovation_likelihood(
     position: FloatArray,
     R: FloatArray,
     acceleration_noise: float,
-    birth_speed: float,
+    initial_speed_deviation: float,
     wrong: float = 0.0,
 ) -> float:
     """Log-likelihood of all measurements but each object's first, of objects of these lengths (n,), the longest first.
@@ -105,7 +114,7 @@ def innovation_likelihood(
     mean[:, :2] = position[start]
     P = np.zeros((len(lengths), 4, 4))
     P[:, :2, :2] = R[start]
-    P[:, 2:, 2:] = birth_speed**2 * np.eye(2)
+    P[:, 2:, 2:] = initial_speed_deviation**2 * np.eye(2)
     anything = wrong / (math.pi * WRONG_REACH**2)
     total = 0.0
     for k in range(1, int(lengths[0])):

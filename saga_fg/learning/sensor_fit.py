@@ -35,7 +35,7 @@ def fit_sensor(sample: DetectionSample, base: Sensor, gate: float) -> Sensor:
     in_view = sample.objects.select(view.holds(sample.objects.range, sample.objects.azimuth))
     overall, by_class = detection_probabilities(in_view, base.detection_probability)
     noise = fit_noise(seen, model, gate)
-    return replace(model, noise=noise, detection_probability=overall, class_detection=by_class)
+    return replace(model, noise=noise, detection_probability=overall, class_detection_probability=by_class)
 
 
 def fit_field_of_view(sample: SampledDetections, known: FieldOfView) -> FieldOfView:

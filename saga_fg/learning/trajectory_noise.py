@@ -40,12 +40,13 @@ def fit_trajectory_noise(
     sensors: Mapping[str, Sensor],
     label: str,
     acceleration_noise: float,
-    birth_speed: float,
+    initial_speed_deviation: float,
 ) -> tuple[dict[str, NoiseModel], float]:
     """The noise of each sensor for a class and the class's acceleration noise, m^2/s^3.
 
-    trajectories: of the class; label: whose noise in the sensors' models is the start; birth_speed: standard deviation
-    of a velocity component before the second detection, m/s. A sensor with fewer than ten detections keeps its noise.
+    trajectories: of the class; label: whose noise in the sensors' models is the start; initial_speed_deviation:
+    standard deviation of a velocity component before the second detection, m/s. A sensor with fewer than ten detections
+    keeps its noise.
     """
     pieces = _pieces(trajectories)
     if not pieces:
@@ -83,7 +84,9 @@ def fit_trajectory_noise(
 
     def cost(theta: FloatArray) -> float:
         q = float(np.exp(theta[-1]))
-        likelihood = innovation_likelihood(lengths, time, position, covariances(theta), q, birth_speed, WRONG)
+        likelihood = innovation_likelihood(
+            lengths, time, position, covariances(theta), q, initial_speed_deviation, WRONG
+        )
         return float(0.5 * (((theta - start_logs) / PRIOR_WIDTH) ** 2).sum() - likelihood) / len(time)
 
     bounds = [(math.log(LEAST), math.log(30.0))] * (len(start_logs) - 1) + [(math.log(1e-3), math.log(1e2))]

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from factors import Robust
-from saga_fg.estimators import BatchSmoother, Births, Measurements, Smoothed, WindowedSmoother
+from saga_fg.estimators import BatchSmoother, Births, Measurements, SmoothedState, WindowedSmoother
 from saga_fg.graph import FactorProvider
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import VELOCITY
@@ -71,7 +71,7 @@ def smooth_states(
     standing: Standing | None = None,
     providers: Sequence[FactorProvider] = (),
 ) -> StateTable:
-    """Smoothed states of every object at every moment of its life.
+    """SmoothedState states of every object at every moment of its life.
 
     object_of (N,) the object of each detection, negative for none; velocity_prior (n, 2, 2) of the lives' velocities;
     weight (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
@@ -136,7 +136,7 @@ def _epochs(
 
 def _smoothed(epochs: Iterable[Epoch], smoother: BatchSmoother | WindowedSmoother) -> StateTable:
     """By recursions over the joint state, in NumPy."""
-    states: list[Smoothed] = []
+    states: list[SmoothedState] = []
     begin = 0
     for count, epoch in enumerate(epochs):
         begin = epoch.moment - count

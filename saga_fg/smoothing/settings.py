@@ -27,7 +27,7 @@ class OfflineClass(Settings):
     """How objects of one class are smoothed."""
 
     acceleration_noise: Positive = setting(1.0, "spectral density of the acceleration, m^2/s^3")
-    lasting_error: NonNegative = setting(
+    position_bias: NonNegative = setting(
         0.1, "standard deviation of the part of a detector's position errors that lasts over a track, m"
     )
     motion_heading: Positive = setting(2.0, "speed from which the direction of motion tells the heading, m/s")

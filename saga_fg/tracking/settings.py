@@ -42,26 +42,26 @@ class ClassSettings(Settings):
     motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
         lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
     )
-    birth_speed: Positive = setting(
+    initial_speed_deviation: Positive = setting(
         5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s"
     )
-    birth_drift: Positive = setting(
+    initial_lateral_speed_deviation: Positive = setting(
         1.0, "standard deviation of an unmeasured velocity at birth, across the heading, m/s"
     )
     min_score: Fraction = setting(0.0, "detections with a lower probability are not used at all")
-    birth_score: Fraction = setting(0.1, "detections with a lower probability start no track")
-    duplicate_distance: NonNegative = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
-    shadow_distance: NonNegative = setting(
+    initiation_score: Fraction = setting(0.1, "detections with a lower probability start no track")
+    nms_distance: NonNegative = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
+    weak_nms_distance: NonNegative = setting(
         0.0, "a detection this close to a much stronger one of the class is its shadow, m"
     )
-    shadow_ratio: Fraction = setting(0.5, "much stronger: the weaker has less than this share of its probability")
+    weak_nms_ratio: Fraction = setting(0.5, "much stronger: the weaker has less than this share of its probability")
     merge_distance: NonNegative = setting(
         0.0, "a track that is not seen ends this close to one of the class that is, m"
     )
-    class_overlap: Fraction = setting(
+    cross_class_nms_iou: Fraction = setting(
         1.0, "a detection whose IoU, from above, with a more probable one of another class is larger goes; 1: never"
     )
-    overlap_weight: NonNegative = setting(
+    giou_weight: NonNegative = setting(
         0.0, "what a whole unit of 3D GIoU counts in matching, as a squared distance in sigmas"
     )
     gate: Fraction = setting(0.999, "share of true pairs that the chi-square gate lets through")
@@ -77,7 +77,7 @@ class ClassSettings(Settings):
 
 @dataclass(frozen=True)
 class AssociationSettings(Settings):
-    """How detections are matched to tracks, see `saga_fg.tracking.matching`; gates and caps are the classes'."""
+    """How detections are matched to tracks, see `saga_fg.tracking.association`; gates and caps are the classes'."""
 
     method: AssociationName = setting(
         "hungarian", "least total cost, the cheapest pair first, or graph: what pairs say of each other counts too"
@@ -133,7 +133,7 @@ class FlowSettings(Settings):
 
 @dataclass(frozen=True)
 class StandingSettings(Settings):
-    """The belief that an object stands still, see `saga_fg.tracking.standing`."""
+    """The belief that an object stands still, see `saga_fg.tracking.stationarity`."""
 
     prior: Fraction = setting(0.0, "share of new objects that stand; 0: standing is no case of its own")
     depart: NonNegative = setting(0.02, "rate at which what stands starts to move, 1/s")

@@ -51,13 +51,19 @@ class NoiseModel(Settings):
     bearing_noise: NonNegative = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
     velocity: Positive = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
     range_rate: Positive = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
-    low_score: NonNegative = setting(0.0, "all deviations grow by the factor 1 + low_score * (1 - probability)")
-    told_scale: Positive = setting(1.0, "factor on the standard deviation that is told of a track's position")
-    told_low_score: Annotated[float, Range(-0.99)] = setting(
-        0.0, "it grows by the factor 1 + told_low_score * (1 - probability); > -1"
+    low_score_growth: NonNegative = setting(
+        0.0, "all deviations grow by the factor 1 + low_score_growth * (1 - probability)"
     )
-    shared_error: NonNegative = setting(0.0, "standard deviation of what all detections of an object err alike, m")
-    shared_low_score: NonNegative = setting(0.0, "it grows by the factor 1 + shared_low_score * (1 - probability)")
+    reported_deviation_scale: Positive = setting(
+        1.0, "factor on the standard deviation that is told of a track's position"
+    )
+    reported_low_score_growth: Annotated[float, Range(-0.99)] = setting(
+        0.0, "it grows by the factor 1 + reported_low_score_growth * (1 - probability); > -1"
+    )
+    position_bias: NonNegative = setting(0.0, "standard deviation of what all detections of an object err alike, m")
+    position_bias_growth: NonNegative = setting(
+        0.0, "it grows by the factor 1 + position_bias_growth * (1 - probability)"
+    )
     yaw: Positive = setting(0.2, "standard deviation of the heading, rad")
     height: Positive = setting(0.2, "standard deviation of the centre's height, m")
 
@@ -120,7 +126,7 @@ class Sensor(Settings):
         150.0, "velocities and range rates beyond this are errors and are not taken in, m/s"
     )
     detection_probability: Fraction = setting(0.9, "chance that a visible object in the field of view is detected")
-    class_detection: Mapping[str, Fraction] = settings_group(dict, "that chance by class, where it differs")
+    class_detection_probability: Mapping[str, Fraction] = settings_group(dict, "that chance by class, where it differs")
     score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
@@ -137,7 +143,7 @@ class Sensor(Settings):
     clutter_area: PositiveOrInf | None = setting(
         None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
     )
-    births: Literal["alone", "confirmed"] = setting(
+    initiation: Literal["alone", "confirmed"] = setting(
         "alone", "whether a track born of its detections counts at once, or when other evidence has confirmed it"
     )
     field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
@@ -177,7 +183,7 @@ class Sensor(Settings):
     def detection_chance(self, label: StrArray) -> FloatArray:
         """(N,) chance that a visible object of each class in the field of view is detected."""
         occurring, index = distinct(label)
-        chance = [self.class_detection.get(c, self.detection_probability) for c in occurring]
+        chance = [self.class_detection_probability.get(c, self.detection_probability) for c in occurring]
         return np.array(chance, dtype=np.float64)[index]
 
     def confusion_among(self, group: Sequence[str]) -> FloatArray:
@@ -202,9 +208,11 @@ class Sensor(Settings):
         Where each has an origin (N, 2) of its own that is the position itself, range and bearing add no noise.
         """
         offset = position - origin
-        own, along, across, low_score = self.deviations(label, "position", "range_noise", "bearing_noise", "low_score")
+        own, along, across, low_score_growth = self.deviations(
+            label, "position", "range_noise", "bearing_noise", "low_score_growth"
+        )
         # along and across the line of sight u: (a r u)(a r u)^T + (b r n)(b r n)^T = b^2 r^2 I + (a^2 - b^2) r^2 u u^T
-        along, across, factor = along**2, across**2, _score_factor(low_score, probability)
+        along, across, factor = along**2, across**2, _score_factor(low_score_growth, probability)
         isotropic = factor * (own**2 + across * np.einsum("ni,ni->n", offset, offset))
         rays = (factor * (along - across))[:, None, None] * (offset[:, :, None] * offset[:, None, :])
         return np.asarray(isotropic[:, None, None] * np.eye(2) + rays)
@@ -220,19 +228,19 @@ class Sensor(Settings):
 
     def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """R (N, 2, 2), (m/s)^2."""
-        deviation, low_score = self.deviations(label, "velocity", "low_score")
-        variance = deviation**2 * _score_factor(low_score, probability)
+        deviation, low_score_growth = self.deviations(label, "velocity", "low_score_growth")
+        variance = deviation**2 * _score_factor(low_score_growth, probability)
         return np.asarray(variance[:, None, None] * np.eye(2))
 
     def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """(N,), (m/s)^2."""
-        deviation, low_score = self.deviations(label, "range_rate", "low_score")
-        return np.asarray(deviation**2 * _score_factor(low_score, probability))
+        deviation, low_score_growth = self.deviations(label, "range_rate", "low_score_growth")
+        return np.asarray(deviation**2 * _score_factor(low_score_growth, probability))
 
     def told(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What is told of positions (N,): the factor on their deviations, and the shared error, m."""
         scale, shared, scale_growth, shared_growth = self.deviations(
-            label, "told_scale", "shared_error", "told_low_score", "shared_low_score"
+            label, "reported_deviation_scale", "position_bias", "reported_low_score_growth", "position_bias_growth"
         )
         doubt = 1 - probability
         return scale * (1 + scale_growth * doubt), shared * (1 + shared_growth * doubt)
@@ -267,9 +275,9 @@ class Sensor(Settings):
         return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
 
 
-def _score_factor(low_score: FloatArray, probability: FloatArray) -> FloatArray:
+def _score_factor(low_score_growth: FloatArray, probability: FloatArray) -> FloatArray:
     """(N,) what a score below 1 multiplies a variance by."""
-    return np.asarray((1 + low_score * (1 - probability)) ** 2)
+    return np.asarray((1 + low_score_growth * (1 - probability)) ** 2)
 
 
 def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:

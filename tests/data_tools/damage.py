@@ -57,7 +57,7 @@ UNIT = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
 G2O_3D = f"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {UNIT}\n"
 POSES = "1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 2 0 0 1 3\n"
 TUM = "# timestamp tx ty tz qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"
-CONFIG = "tracker:\n  max_delay: 0.5\n  classes:\n    car: {birth_speed: 3.0}\nsensors:\n  default: {score: logit}\n"
+CONFIG = "tracker:\n  max_delay: 0.5\n  classes:\n    car: {max_distance: 3.0}\nsensors:\n  default: {score: logit}\n"
 RECORD = json.dumps({"method": "kf", "version": "1", "configuration": "a", "milliseconds": {"s": [1.0, 2.0]}})
 MESSAGES = (
     '{"seq": 1, "timestamp": 0.5, "sensor": "a", "coordinates": "ego", "ego": {"x": 1, "y": 2, "yaw": 0.1}, '
@@ -80,7 +80,7 @@ PLAZA = {
     "TL": "7 20 30\n3 -1 -2\n",
 }
 OBSMAT = "780 1 8.0 0 3.0 1.0 0 0.0\n786 1 8.4 0 3.0 1.0 0 0.0\n786 2 1.0 0 2.0 0.0 0 -0.5\n"
-JOURNAL = '{"event": "born", "track": 1, "scene": "a"}\n{"event": "ended", "track": 1, "scene": "a"}\n'
+JOURNAL = '{"event": "initiated", "track": 1, "scene": "a"}\n{"event": "deleted", "track": 1, "scene": "a"}\n'
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ def test_a_kind_of_landmark_is_found_and_holds_the_path(street: Path) -> None:
     done = run(street / "posts", "slam: {landmarks: ['own_slam_parts:Posts']}")
     assert done.exit_code == 0, done.output
     posts = json.loads((street / "posts" / "landmarks.json").read_text())
-    assert {post["type"] for post in posts} == {"post"}
+    assert {post["kind"] for post in posts} == {"post"}
     assert len(posts) == 6
     assert ate(street / "posts") < 0.8 * ate(street / "plain")
     assert json.loads((street / "plain" / "landmarks.json").read_text()) == []

@@ -14,10 +14,10 @@ from data_tools.lidar import read_scan
 from data_tools.simulator.street import KERB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
-from pipelines.slam.kitti import covered_spans, write_lidar_slam
+from pipelines.slam.lidar_results import covered_spans, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, find_loops
-from pipelines.slam.sightings import LINE, POLE
+from pipelines.slam.scan_landmarks import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
@@ -113,7 +113,7 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Lida
     assert len(read_scan(folder / "landmarks.ply")) > 0
     landmarks = json.loads((folder / "landmarks.json").read_text())
     assert {mark["kind"] for mark in landmarks} == {"pole", "wall"}
-    assert all(mark["sightings"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
+    assert all(mark["observations"] >= 4 and np.isfinite([mark["x"], mark["y"]]).all() for mark in landmarks)
     covariances = np.loadtxt(folder / "covariances.csv", delimiter=",", skiprows=1)
     assert covariances.shape == (len(result.keyframes), 22)
     assert json.loads((folder / "metrics.json").read_text()) == figures

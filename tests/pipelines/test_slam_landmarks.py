@@ -59,7 +59,7 @@ def test_trees_are_told_apart_without_their_names(tmp_path: Path) -> None:
     evidence = {float(scale): value for scale, value in figures["log evidence by odometry scale"].items()}
     assert figures["odometry scale"] == max(evidence, key=lambda scale: evidence[scale]) < 256
     landmarks = json.loads((output / "landmarks.json").read_text())
-    assert abs(sum(landmark["sightings"] > 2 for landmark in landmarks) - trees) <= 1
+    assert abs(sum(landmark["observations"] > 2 for landmark in landmarks) - trees) <= 1
     assert all(np.linalg.eigvalsh(landmark["covariance"])[0] > 0 for landmark in landmarks)
     assert len(read_tum_poses(output / "trajectory.tum")) == len(read_kitti_poses(output / "trajectory.kitti")) == 240
     assert (output / "landmarks.ply").read_bytes().startswith(b"ply")

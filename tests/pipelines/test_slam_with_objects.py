@@ -14,7 +14,7 @@ from data_tools.simulator.street import SimulatedScans
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.slam.kitti import write_lidar_slam
+from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.with_objects import with_objects
 from saga_fg import Boxes, Detections, Frame, InputError

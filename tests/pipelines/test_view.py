@@ -78,9 +78,9 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
         [str(id_), label] for id_, label in zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
     ]
     assert len(at("saga/ellipses", "Ellipsoids3D:half_sizes")) == len(tracks)
-    trails = at("saga/trails", "LineStrips3D:strips")
-    np.testing.assert_allclose([trail[-1] for trail in trails], tracks.boxes.position - origin, atol=1e-3)
-    assert max(map(len, trails)) == k + 1
+    paths = at("saga/trajectories", "LineStrips3D:strips")
+    np.testing.assert_allclose([path[-1] for path in paths], tracks.boxes.position - origin, atol=1e-3)
+    assert max(map(len, paths)) == k + 1
     strips = np.array(at("saga/edges", "LineStrips3D:strips"))
     assert strips.shape[1:] == (2, 3)  # from the place of one track to that of another
     places = tracks.boxes.position - origin
@@ -127,7 +127,7 @@ def test_kitti_with_scans_and_a_map(tmp_path: Path) -> None:
     poses[1, 0, 3] = 1.0
     write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
     write_ply(slam / "landmarks.ply", np.array([[3.0, 4.0, 0.5]]))
-    marks = [{"id": 2, "kind": "pole", "x": 3.0, "y": 4.0}, {"id": 3, "kind": "wall", "x": 0.0, "nx": 1.0}]
+    marks = [{"number": 2, "kind": "pole", "x": 3.0, "y": 4.0}, {"number": 3, "kind": "wall", "x": 0.0, "nx": 1.0}]
     (slam / "landmarks.json").write_text(json.dumps(marks))
     file = tmp_path / "k.rrd"
     result = run("kitti", root / "result", "--dataroot", root, "--detections", root / "found", "--slam", slam,

@@ -145,8 +145,8 @@ def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path: Path, show
     lengths = [arrow.shaft_length + arrow.head_length for arrow in arrows]
     np.testing.assert_allclose(lengths, np.hypot(*velocity.T), atol=2e-3)
     assert [rgb(arrow) for arrow in arrows] == colours
-    trails = layer("trails", "lines")
-    ends = [xyz(trail.points[-1]) for trail in trails]
+    paths = layer("trajectories", "lines")
+    ends = [xyz(path.points[-1]) for path in paths]
     np.testing.assert_allclose(ends, table.boxes.position[rows] - origin, atol=1e-3)
     spread = [sphere.size.x * sphere.size.y for sphere in layer("ellipses", "spheres")]
     determinant = np.linalg.det(table.position_covariance[rows])
@@ -191,7 +191,7 @@ def test_the_command_writes_the_file_that_the_suffix_names(tmp_path: Path) -> No
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :2, 3] = 1.0
     write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
-    (slam / "landmarks.json").write_text('[{"id": 2, "kind": "pole", "x": 3.0, "y": 4.0}]')
+    (slam / "landmarks.json").write_text('[{"number": 2, "kind": "pole", "x": 3.0, "y": 4.0}]')
     file = tmp_path / "s.mcap"
     done = CliRunner().invoke(app, ["view", "slam", str(slam), "--save", str(file)])
     assert done.exit_code == 0, done.output

@@ -79,7 +79,7 @@ def test_groups_are_made_anew():
         (Sensor, {"time_offset": math.nan}, "time_offset: expected a number from"),
         (Sensor, {"score": "logits"}, "score: expected one of probability, logit, got 'logits'"),
         (ClassSettings, {"gate": 1.0}, "gate: expected a share below 1"),
-        (ClassSettings, {"birth_score": 2.0}, "birth_score: expected a number from 0 to 1"),
+        (ClassSettings, {"initiation_score": 2.0}, "initiation_score: expected a number from 0 to 1"),
         (ClassSettings, {"max_distance": 0.0}, "max_distance: expected a number > 0"),
         (ExistenceSettings, {"clutter_score": 1.0}, "clutter_score: expected a probability inside 0 to 1, got 1.0"),
         (ExistenceSettings, {"report": 1.1}, "report: expected a number from 0 to 1, got 1.1"),

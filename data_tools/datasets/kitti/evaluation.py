@@ -1,7 +1,7 @@
 """A KITTI tracking result scored: figures averaged over recall, errors at labels, calibration, HOTA.
 
-HOTA is of what the benchmark judges (`data_tools.metrics.kitti_tracking.judged_objects`), by the overlap in the image
-as well, as published figures are.
+HOTA is of what the benchmark judges (`data_tools.metrics.kitti_tracking.evaluated_objects`), by the overlap in the
+image as well, as published figures are.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from data_tools.figures import FigureTable, cell
 from data_tools.kitti_objects import KittiObjects
 from data_tools.metrics import (
     KittiSimilarity,
-    KittiTrackingFigures,
+    KittiTrackingMetrics,
     KittiTrackingSequence,
     LabelErrors,
-    kitti_hota_figures,
-    kitti_tracking_figures,
+    kitti_hota_metrics,
+    kitti_tracking_metrics,
     label_errors,
     label_velocities,
 )
@@ -37,7 +37,7 @@ _COLUMNS = (
     *("TP", "FP", "FN", "GT", "MT", "ML"),
 )
 SIMILARITIES: dict[str, KittiSimilarity] = {"image": "image", "2D": "bev_iou", "3D": "iou_3d"}
-ByIou = Mapping[float, KittiTrackingFigures]
+ByIou = Mapping[float, KittiTrackingMetrics]
 
 
 def evaluate_kitti(
@@ -56,7 +56,7 @@ def evaluate_kitti(
     pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
     tracking: dict[str, ByIou] = {}
     for label in classes:
-        by_iou = {iou: figures for iou in ious if (figures := kitti_tracking_figures(pairs, label, iou)) is not None}
+        by_iou = {iou: figures for iou in ious if (figures := kitti_tracking_metrics(pairs, label, iou)) is not None}
         if by_iou:
             tracking[label] = by_iou
     best = {label: next(iter(by_iou.values())).threshold for label, by_iou in tracking.items()}
@@ -82,7 +82,7 @@ def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[s
     for label, threshold in thresholds.items():
         judged = [replace(each, found=_surer_lines(each.found, label, threshold)) for each in sequences]
         for overlap, similarity in SIMILARITIES.items():
-            rows.append(HotaRow(label, overlap, threshold, kitti_hota_figures(judged, label, similarity)))
+            rows.append(HotaRow(label, overlap, threshold, kitti_hota_metrics(judged, label, similarity)))
     return rows
 
 
@@ -99,7 +99,7 @@ def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:
     return FigureTable(title, _COLUMNS, tuple((label, iou, *_cells(f)) for label, iou, f in rows))
 
 
-def _cells(f: KittiTrackingFigures) -> tuple[str, ...]:
+def _cells(f: KittiTrackingMetrics) -> tuple[str, ...]:
     def percent(*values: float) -> tuple[str, ...]:
         return tuple(cell(100 * value, 2) for value in values)
 

@@ -93,7 +93,7 @@ def test_a_large_component_is_cut_into_cells():
         present.append(nodes[30 + frame])
         tell(textbook, calls), tell(estimator, calls)
         assert_textbook(estimator, textbook)
-        keys = estimator._held.tree.cells.keys
+        keys = estimator._state.tree.variables.keys
         assert 3 < len(keys) < len(present)  # neither one variable nor one a node
 
 
@@ -132,7 +132,7 @@ def test_nothing_grows_with_time():
     for _ in range(300):
         estimator.predict(discretise(ring(nodes, rng, 0.3), 0.1))
         estimator.update(Measurements(nodes, rng.normal(size=(12, 2)), np.eye(2, 4), 0.1 * np.eye(2)))
-        isam = estimator._held.tree.isam
+        isam = estimator._state.tree.isam
         sizes.append(
             (
                 isam.getFactorsUnsafe().size(),

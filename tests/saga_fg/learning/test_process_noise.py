@@ -27,10 +27,10 @@ def drawn(rng, acceleration_noise, count=40, length=30, noise=0.2):
     return objects
 
 
-def by_the_book(objects, acceleration_noise, birth_speed):
+def by_the_book(objects, acceleration_noise, initial_speed_deviation):
     car, H, total = NodeType("car", ConstantVelocity(acceleration_noise)), np.eye(2, 4), 0.0
     for o in objects:
-        P = np.diag([0.0, 0.0, birth_speed**2, birth_speed**2])
+        P = np.diag([0.0, 0.0, initial_speed_deviation**2, initial_speed_deviation**2])
         P[:2, :2] = o.R[0]
         x = Gaussian(np.concatenate([o.position[0], [0, 0]]), P)
         for k in range(1, len(o)):
@@ -49,7 +49,7 @@ def test_the_likelihood_is_that_of_one_textbook_filter_an_object():
 
 @pytest.mark.parametrize("truth", [0.05, 1.0, 8.0])
 def test_the_noise_of_the_model_is_found_again(truth):
-    fitted = fit_acceleration_noise(drawn(np.random.default_rng(1), truth), birth_speed=5.0)
+    fitted = fit_acceleration_noise(drawn(np.random.default_rng(1), truth), initial_speed_deviation=5.0)
     assert fitted == pytest.approx(truth, rel=0.3)
 
 

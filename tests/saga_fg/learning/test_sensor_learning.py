@@ -25,7 +25,7 @@ from saga_fg.types.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalib
 def errors(rng, noise, n, wrong=0.0, gate=4.0):
     """Errors along and across, ranges and probabilities of n detections, a share of which are matched wrongly."""
     r, p = rng.uniform(3, 50, n), rng.uniform(0.2, 1.0, n)
-    f = 1 + noise.low_score * (1 - p)
+    f = 1 + noise.low_score_growth * (1 - p)
     along = f * np.hypot(noise.position, noise.range_noise * r) * rng.standard_normal(n)
     across = f * np.hypot(noise.position, noise.bearing_noise * r) * rng.standard_normal(n)
     stray = rng.random(n) < wrong
@@ -36,8 +36,8 @@ def errors(rng, noise, n, wrong=0.0, gate=4.0):
 @pytest.mark.parametrize(
     "noise",
     [
-        NoiseModel(position=0.15, range_noise=0.035, bearing_noise=0.005, low_score=0.5),
-        NoiseModel(position=0.08, range_noise=0.004, bearing_noise=0.003, low_score=1.0),
+        NoiseModel(position=0.15, range_noise=0.035, bearing_noise=0.005, low_score_growth=0.5),
+        NoiseModel(position=0.08, range_noise=0.004, bearing_noise=0.003, low_score_growth=1.0),
     ],
     ids=["camera", "lidar"],
 )
@@ -48,7 +48,7 @@ def test_noise_is_found_again_whether_or_not_some_matches_are_wrong(noise, wrong
     for name in ("range_noise", "bearing_noise"):
         sigma, true = (np.hypot(model.position, getattr(model, name) * at) for model in (found, noise))
         assert sigma == pytest.approx(true, rel=0.1)
-    assert found.low_score == pytest.approx(noise.low_score, abs=0.2)
+    assert found.low_score_growth == pytest.approx(noise.low_score_growth, abs=0.2)
 
 
 def test_no_error_tells_nothing():
@@ -86,8 +86,8 @@ def test_detection_probability_is_the_share_of_chances_taken():
     detected = np.concatenate([np.arange(400) % 4 > 0, np.zeros(5, dtype=bool)])
     objects = SampledObjects(np.repeat(["car", "bus"], [400, 5]), np.full(405, 20.0), np.zeros(405), detected)
     model = fit_sensor(DetectionSample(detections_at(np.empty(0)), objects), Sensor(), gate=4.0)
-    assert model.class_detection["car"] == pytest.approx(0.75, abs=0.01)
-    assert "bus" not in model.class_detection  # seldom in view: the share of all classes serves
+    assert model.class_detection_probability["car"] == pytest.approx(0.75, abs=0.01)
+    assert "bus" not in model.class_detection_probability  # seldom in view: the share of all classes serves
     assert model.noise == Sensor().noise
 
 

@@ -46,7 +46,7 @@ def gathered(paths: dict[int, FloatArray], times: FloatArray = TIMES, score: flo
         boxes = Boxes.of(["car"] * len(there), position, yaw=np.zeros(len(there)))
         frames.append(Frame(time, "lidar", Detections(boxes, np.full(len(there), score))))
         numbers += there
-    near = {"default": ClassSettings(duplicate_distance=0.0)}
+    near = {"default": ClassSettings(nms_distance=0.0)}
     return gather_evidence(frames, times, SENSORS, near), np.array(numbers, dtype=np.int64)
 
 

@@ -80,7 +80,7 @@ def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
         boxes = Boxes.of([label for _, label, _ in seen], position)
         frames.append(Frame(0.5 * k + 1.7e9, "lidar", Detections(boxes, np.full(len(seen), 0.9))))
         owner += [i for i, _, _ in seen]
-    near = {"default": ClassSettings(duplicate_distance=0.0)}
+    near = {"default": ClassSettings(nms_distance=0.0)}
     evidence = gather_evidence(frames, np.array([1.7e9 + 7.25]), SENSORS, near)
     object_of = np.array(owner)
     lives = lives_of_evidence(object_of, evidence.boxes.label, evidence.moment)

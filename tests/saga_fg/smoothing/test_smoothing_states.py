@@ -40,7 +40,7 @@ def evidence_of(times: list[float], positions: list[list[list[float]]]) -> Evide
         Frame(t, "lidar", Detections(Boxes.of(["car"] * len(p), [[*xy, 0.0] for xy in p]), np.full(len(p), 0.999)))
         for t, p in zip(times, positions, strict=True)
     ]
-    near = {"default": ClassSettings(duplicate_distance=0.0)}
+    near = {"default": ClassSettings(nms_distance=0.0)}
     return gather_evidence(frames, np.array(times), SENSORS, near)
 
 

@@ -107,7 +107,7 @@ def test_tracks_are_born_where_no_track_explains_a_detection():
 
 
 def test_weak_detections_start_no_track_but_keep_one_alive():
-    tracker = Tracker(settings(birth_score=0.5, min_score=0.1))
+    tracker = Tracker(settings(initiation_score=0.5, min_score=0.1))
     assert len(tracker.step(frame(0.0, [(0, 0)], score=0.4))) == 0
     assert len(tracker.step(frame(0.1, [(0, 0)], score=0.6))) == 1
     weak = tracker.step(frame(0.2, [(0.5, 0)], score=0.2))
@@ -339,7 +339,7 @@ def test_the_tracker_tells_which_detection_went_where():
         tracker.step(Frame(timestamp, "lidar", Detections.of(detections)))
         return dict(zip(tracker.assignment.detection.tolist(), tracker.assignment.id.tolist(), strict=True))
 
-    tracker = Tracker(settings(birth_score=0.5, min_score=0.1))
+    tracker = Tracker(settings(initiation_score=0.5, min_score=0.1))
     born = told(0.0, ((0, 0), 0.05), ((9, 0), 0.9), ((0, 9), 0.9))
     assert born.keys() == {1, 2}  # the first is too weak for anything
     later = told(0.1, ((0, 9.1), 0.9), ((50, 0), 0.9), ((9.1, 0), 0.9))

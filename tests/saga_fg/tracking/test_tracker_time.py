@@ -16,7 +16,7 @@ SENSORS = {
 
 
 def tracker(**overall):
-    classes = {"default": ClassSettings(motion=ConstantVelocity(1.0), birth_speed=15.0, gate=1 - 1e-7)}
+    classes = {"default": ClassSettings(motion=ConstantVelocity(1.0), initial_speed_deviation=15.0, gate=1 - 1e-7)}
     return Tracker(TrackerSettings(classes, edges=(), **overall), SENSORS)
 
 

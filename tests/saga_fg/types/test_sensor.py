@@ -53,10 +53,10 @@ def test_at_the_sensors_own_place_there_is_no_direction():
 
 
 def test_deviations_grow_as_the_score_falls():
-    noise = NoiseModel(position=0.2, low_score=1.5)
+    noise = NoiseModel(position=0.2, low_score_growth=1.5)
     assert covariance(noise, (5.0, 0.0), probability=1.0) == pytest.approx(0.04 * np.eye(2))
     assert covariance(noise, (5.0, 0.0), probability=0.4) == pytest.approx((0.2 * (1 + 1.5 * 0.6)) ** 2 * np.eye(2))
-    velocity = Sensor(noise={"default": NoiseModel(velocity=0.5, low_score=1.0)}).velocity_covariance(
+    velocity = Sensor(noise={"default": NoiseModel(velocity=0.5, low_score_growth=1.0)}).velocity_covariance(
         labels("car", "car"), np.array([1.0, 0.5])
     )
     assert velocity == pytest.approx(np.stack([0.25 * np.eye(2), (0.5 * 1.5) ** 2 * np.eye(2)]))
@@ -97,10 +97,10 @@ def test_calibration_is_straight_on_the_logit_class_by_class():
 
 
 def test_classes_differ_in_their_chance_of_detection():
-    sensor = Sensor(detection_probability=0.8, class_detection={"pedestrian": 0.5})
+    sensor = Sensor(detection_probability=0.8, class_detection_probability={"pedestrian": 0.5})
     assert sensor.detection_chance(labels("car", "pedestrian")).tolist() == [0.8, 0.5]
-    with pytest.raises(InputError, match=r"class_detection\.car: expected a number from 0 to 1"):
-        Sensor(class_detection={"car": 1.5})
+    with pytest.raises(InputError, match=r"class_detection_probability\.car: expected a number from 0 to 1"):
+        Sensor(class_detection_probability={"car": 1.5})
 
 
 # field of view

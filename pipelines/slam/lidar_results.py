@@ -1,0 +1,154 @@
+"""Results of LiDAR SLAM on a recording as files; `pipelines.slam.results` says what the common ones hold.
+
+trajectory.txt, times.txt   poses of the vehicle, KITTI's format: world_T_ego of every scan, and its time
+trajectory.tum              the same in the TUM format
+odometry.tum                by odometry alone; online.tum: as estimated when each keyframe came
+covariances.csv             of the sensor's pose at the keyframes
+map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
+landmarks.json              each landmark
+landmarks.ply               points along the poles and on the observed pieces of the walls
+tracks.csv                  objects, where there are any
+above.png                   map, paths, landmarks and the objects' tracks from above
+metrics.json                errors of the trajectories against the recording's own poses, and the map's sharpness
+
+World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.figures import write_figures
+from data_tools.files.atomic_files import atomic_directory, write_bytes
+from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
+from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.plots import png, scan_map_from_above
+from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.slam.lidar_slam import LidarSlam
+from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
+from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
+from pipelines.slam.with_objects import SlamWithObjects
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import transform_points
+from saga_fg.types.landmark import Landmark
+
+HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
+_GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
+POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
+
+
+def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
+    """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts."""
+    truth = Trajectory(scans.timestamps, scans.world_T_ego)
+    kinds = [landmark.kind.name for landmark in result.landmarks]
+    return {
+        "keyframes": len(result.keyframes),
+        "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
+        "loops": len(result.loops),
+        "scan_to_map_residual": scan_to_map_residual(result.clouds, result.world_T_lidar),
+        **{
+            name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
+            for name in ("odometry", "online", "trajectory")
+        },
+    }
+
+
+def write_lidar_slam(
+    output: Path, found: LidarSlam | SlamWithObjects, scans: ScanSequence, spacing: float = 0.2
+) -> dict[str, Any]:
+    """Write all files of a run to a folder, or none; returns the metrics. `spacing` of the map's points, m."""
+    result, objects = (found, None) if isinstance(found, LidarSlam) else (found.slam, found.estimate)
+    points = accumulated_map(result, spacing)
+    figures = metrics(result, scans)
+    if isinstance(found, SlamWithObjects):
+        figures["objects"] = len(object_paths(found.estimate))
+        figures["without_objects"] = metrics(found.alone, scans)["trajectory"]
+    with atomic_directory(output) as folder:
+        write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
+        for name, trajectory in (
+            ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)
+        ):  # fmt: skip
+            write_tum_poses(folder / f"{name}.tum", trajectory)
+        times = result.trajectory.timestamps[result.keyframes].tolist()
+        write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
+        write_ply(folder / "map.ply", points)
+        _write_landmarks(folder, result)
+        paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
+        if objects is not None:
+            write_objects(folder / "tracks.csv", objects)
+        driven = () if objects is None else tuple(object_paths(objects).values())
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _lines(result), driven)
+        write_bytes(folder / "above.png", png(figure))
+        write_figures(folder / "metrics.json", figures)
+    return figures
+
+
+def accumulated_map(result: LidarSlam, spacing: float) -> FloatArray:
+    """Points (N, 3) of all keyframes in world coordinates, m, one in each voxel of `spacing` m."""
+    placed = zip(result.world_T_lidar, result.clouds, strict=True)
+    points = np.concatenate([transform_points(pose, cloud) for pose, cloud in placed])
+    return points[voxel_downsample(points, spacing)]
+
+
+def _write_landmarks(folder: Path, result: LidarSlam) -> None:
+    write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
+    ground, lines, poles = float(result.world_T_lidar[0, 2, 3]), _lines(result), _poles(result.landmarks)
+    shapes = [(pole[None], np.arange(ground - 1.5, ground + HEIGHT, 0.1), POLE_COLOUR) for pole in poles]
+    shapes += [(_sampled(*ends), np.array([ground - 1.7]), LINE_COLOUR) for ends in lines["road lines"]]
+    shapes += [(_sampled(*ends), np.arange(ground - 1.0, ground + HEIGHT, 0.4), WALL_COLOUR) for ends in lines["walls"]]
+    points, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
+    for foot, z, colour in shapes:
+        points.append(np.column_stack([np.repeat(foot, len(z), axis=0), np.tile(z, len(foot))]))
+        colours.append(np.full((len(points[-1]), 3), colour, dtype=np.uint8))
+    write_ply(folder / "landmarks.ply", np.concatenate(points), np.concatenate(colours))
+
+
+def _sampled(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Places (n, 2) from a to b, 0.2 m apart at most."""
+    return np.linspace(a, b, max(2, int(np.linalg.norm(b - a) / 0.2)))
+
+
+def _lines(result: LidarSlam) -> dict[str, FloatArray]:
+    """Pieces of walls and road lines, under their names."""
+    return {"walls": _pieces(result, WALL.name), "road lines": _pieces(result, LINE.name)}
+
+
+def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
+    """Places (P, 2) of all but planes and lines."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, GROUND, WALL)]
+    return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
+
+
+def _pieces(result: LidarSlam, kind: str) -> FloatArray:
+    """Ends (W, 2, 2), from above, of the pieces of walls or road lines that were observed, one or several of each."""
+    ends = []
+    for mark in result.landmarks:
+        if mark.kind.name != kind:
+            continue
+        place = mark.kind.coordinates(mark.state)
+        normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
+        along = np.array([-normal[1], normal[0]])
+        foot = (np.array([place["x"], place["y"]]) @ normal) * normal
+        spans = []
+        for seen, extent in zip(result.observations, result.extents, strict=True):
+            if seen.landmark == mark.number:
+                u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
+                spans.append((float(u.min()), float(u.max())))
+        ends += [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]
+    return np.array(ends).reshape(-1, 2, 2)
+
+
+def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the union of spans, gaps up to `_GAP` filled: houses on both sides of a street may lie in one plane."""
+    covered: list[tuple[float, float]] = []
+    for low, high in sorted(spans):
+        if covered and low <= covered[-1][1] + _GAP:
+            covered[-1] = (covered[-1][0], max(high, covered[-1][1]))
+        else:
+            covered.append((low, high))
+    return covered

@@ -1,0 +1,143 @@
+"""Results of SLAM as files, in a folder that is written whole or not at all.
+
+All runs share the forms of these:
+
+*.tum             a path in the TUM format; *.kitti, joint.txt, trajectory.txt in KITTI's
+landmarks.json    each landmark: number, kind, coordinates (m), covariance of its tangent, number of observations
+landmarks.ply     landmarks for viewers of point clouds
+covariances.csv   of each pose: its name, then the upper triangle in the pose's own frame, rad and m: (x, y, heading) or
+                  (rotation vector, translation)
+tracks.csv        a row for each object and moment: timestamp (s), id, class, x, y (m), vx, vy (m/s) in world
+                  coordinates, and the standard deviations of the last four
+above.png         the results from above
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.figures import write_figures
+from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.lidar.ply import write_ply
+from data_tools.plots import paths_from_above, png
+from data_tools.pose_graphs import write_g2o
+from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
+from pipelines.slam.joint import JointRun
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.joint import JointEstimate
+from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
+from saga_fg.types.landmark import Landmark
+
+
+def landmark_row(
+    number: int, kind: str, coordinates: Mapping[str, float], covariance: FloatArray, observations: int
+) -> dict[str, Any]:
+    """Return the entry of landmarks.json for a landmark."""
+    counts = {"covariance": covariance.tolist(), "observations": observations}
+    return {"number": number, "kind": kind, **coordinates, **counts}
+
+
+def landmark_rows(landmarks: Iterable[Landmark]) -> list[dict[str, Any]]:
+    """Return the content of landmarks.json for a map."""
+    return [
+        landmark_row(mark.number, mark.kind.name, mark.kind.coordinates(mark.state), mark.covariance, mark.observations)
+        for mark in landmarks
+    ]
+
+
+def write_covariances(path: Path, key: str, names: Sequence[object], covariances: FloatArray) -> None:
+    """Write covariances.csv: the covariance (N, k, k) of each pose, its name in column `key`."""
+    upper = np.triu_indices(covariances.shape[1])
+    rows = [",".join([key, *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))])]
+    for name, covariance in zip(names, covariances, strict=True):
+        rows.append(",".join([str(name), *(f"{x:.9g}" for x in covariance[upper])]))
+    write_text(path, "\n".join(rows) + "\n")
+
+
+def object_paths(estimate: JointEstimate) -> dict[int, FloatArray]:
+    """Return the places (n, 2), m, of each object, by id, from first to last."""
+    found: dict[int, list[FloatArray]] = {}
+    for objects in estimate.objects:
+        for name, place in zip(objects.id.tolist(), objects.position, strict=True):
+            found.setdefault(name, []).append(place)
+    return {name: np.array(places) for name, places in found.items()}
+
+
+def write_objects(path: Path, estimate: JointEstimate) -> None:
+    """Write tracks.csv."""
+    rows = ["timestamp,id,class,x,y,vx,vy,sigma_x,sigma_y,sigma_vx,sigma_vy"]
+    for moment, (time, objects) in enumerate(zip(estimate.timestamps, estimate.objects, strict=True)):
+        sigma = np.sqrt(np.diagonal(estimate.object_covariances(moment), axis1=1, axis2=2))
+        table = np.concatenate([objects.position, objects.velocity, sigma], axis=1)
+        rows += [
+            f"{time:.6f},{name},{label}," + ",".join(f"{x:.4f}" for x in row)
+            for name, label, row in zip(objects.id.tolist(), objects.label, table, strict=True)
+        ]
+    write_text(path, "\n".join(rows) + "\n")
+
+
+def planar_trajectory(time: FloatArray, world_T_pose: FloatArray) -> Trajectory:
+    """Return a trajectory in the plane, (N, 3, 3), as one in space at z = 0."""
+    poses = np.tile(np.eye(4), (len(world_T_pose), 1, 1))
+    poses[:, :2, :2] = world_T_pose[:, :2, :2]
+    poses[:, :2, 3] = world_T_pose[:, :2, 2]
+    return Trajectory(time, poses)
+
+
+def write_landmark_map(
+    output: Path,
+    trajectory: Trajectory,
+    landmarks: Sequence[Mapping[str, Any]],
+    figures: Mapping[str, object],
+    others: Mapping[str, FloatArray] | None = None,
+) -> None:
+    """Write trajectory.tum, trajectory.kitti, landmarks.json, landmarks.ply, figures.json and above.png.
+
+    landmarks: rows of landmarks.json; others: further paths (n, 2 or 3) for the picture, by name
+    """
+    places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in landmarks]).reshape(-1, 3)
+    picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
+    with atomic_directory(output) as folder:
+        write_tum_poses(folder / "trajectory.tum", trajectory)
+        write_kitti_poses(folder / "trajectory.kitti", trajectory)
+        write_figures(folder / "landmarks.json", landmarks)
+        write_ply(folder / "landmarks.ply", places)
+        write_figures(folder / "figures.json", dict(figures))
+        write_bytes(folder / "above.png", png(picture))
+
+
+def write_joint(output: Path, run: JointRun) -> None:
+    """Write the results of a simulated scene: the paths of the run as NAME.tum, and errors.json against the truth."""
+    last = np.array([path[-1] for path in object_paths(run.estimate).values()]).reshape(-1, 2)
+    drawn = {name: path.positions for name, path in run.paths.items() if name != "settled"}
+    with atomic_directory(output) as folder:
+        for name, path in run.paths.items():
+            write_tum_poses(folder / f"{name}.tum", path)
+        write_kitti_poses(folder / "joint.txt", run.paths["joint"], folder / "times.txt")
+        times = [f"{time:.6f}" for time in run.estimate.timestamps.tolist()]
+        write_covariances(folder / "covariances.csv", "timestamp", times, run.estimate.pose_covariances)
+        write_objects(folder / "tracks.csv", run.estimate)
+        write_figures(folder / "errors.json", {name: asdict(errors) for name, errors in run.errors().items()})
+        write_figures(folder / "landmarks.json", landmark_rows(run.estimate.landmarks))
+        write_bytes(folder / "above.png", png(paths_from_above(drawn, {"objects": last})))
+
+
+def write_pose_graph(
+    output: Path, graph: PoseGraph, optimised: OptimisedPoses, covariances: FloatArray, errors: Mapping[str, float]
+) -> None:
+    """Write poses.g2o, the graph with its optimised poses, their covariances relative to the first, and errors.json.
+
+    errors: by name: of each start, of the guess itself, of the baselines where they were run
+    """
+    d = graph.dim
+    paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
+    with atomic_directory(output) as folder:
+        write_g2o(folder / "poses.g2o", graph.at(optimised.world_T_pose))
+        write_covariances(folder / "covariances.csv", "id", graph.ids.tolist(), covariances)
+        write_figures(folder / "errors.json", {"best": optimised.start, **errors})
+        write_bytes(folder / "above.png", png(paths_from_above(paths)))

@@ -1,0 +1,166 @@
+r"""What was measured of some nodes at one time, in the form that an estimator can linearise, and linearise again.
+
+    z = h(x_node) + v,   v ~ N(0, R)        h(x) = H x for `Measurements`, any measurement model for `Observations`
+
+Around x0, with J = dh/dx and the weight w of the robust loss at the residual's distance || z - h(x0) ||_R,
+
+    sqrt(w) ( z - h(x0) + J x0 ) = sqrt(w) J x + v
+
+is what a linear estimator takes in (iteratively reweighted least squares). Angles among z are wrapped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from factors import FactorError, MeasurementModel, Robust
+from saga_fg.errors import InputError
+from saga_fg.estimators.graduated import GraduatedNonConvexity
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.numerics.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """m independent measurements by one measurement model, which may be nonlinear (range, bearing, range rate, ...).
+
+    nodes (m,) ids, may repeat; z (m, k); R (m, k, k) or (k, k) for all; model: see `factors.measurement`
+
+    Raises `InputError` for wrong shapes, numbers that are not finite, or an R that is not symmetric positive definite.
+    """
+
+    nodes: IntArray
+    z: FloatArray
+    model: MeasurementModel
+    R: FloatArray
+
+    def __post_init__(self) -> None:
+        empty = np.zeros((self.model.dim, self.model.state_dim))
+        checked = Measurements(self.nodes, self.z, empty, self.R)  # shapes and R are checked alike
+        for name in ("nodes", "z", "R"):
+            object.__setattr__(self, name, getattr(checked, name))
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+
+class LinearisedMeasurements(NamedTuple):
+    """rows (m,) of the nodes; z (m, k); H (m, k, d); R (m, k, k)."""
+
+    rows: IntArray
+    z: FloatArray
+    H: FloatArray
+    R: FloatArray
+
+
+class WhitenedMeasurements(NamedTuple):
+    """The same in units of its noise, R = 1; log_det: the sum of the logarithms of the determinants of R."""
+
+    rows: IntArray
+    z: FloatArray
+    H: FloatArray
+    log_det: float
+
+
+def whitened(seen: LinearisedMeasurements) -> WhitenedMeasurements:
+    """W z and W H, W R W^T = 1."""
+    L = np.linalg.cholesky(seen.R)
+    white = np.linalg.solve(L, np.concatenate([seen.H, seen.z[:, :, None]], axis=2))
+    log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+    return WhitenedMeasurements(seen.rows, white[:, :, -1], white[:, :, :-1], log_det)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMeasurements:
+    """Measurements as an estimator records them.
+
+    robust: a loss whose weights follow the residuals, or one whose `weights` (m,) a batch smoother sets.
+    """
+
+    measured: Measurements | Observations
+    robust: Robust | GraduatedNonConvexity | None = None
+    weights: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        require_kind("measurements", self.measured, Measurements, Observations)
+        if self.robust is not None:
+            require_kind("robust", self.robust, Robust, GraduatedNonConvexity)
+
+    @property
+    def loss(self) -> Robust | None:
+        """The loss whose weights follow the residuals."""
+        return self.robust if isinstance(self.robust, Robust) else None
+
+    @property
+    def linear(self) -> bool:
+        """Whether linearising it again elsewhere gives the same."""
+        return isinstance(self.measured, Measurements) and self.loss is None
+
+    @property
+    def state_dim(self) -> int:
+        """Size d of the states measured."""
+        measured = self.measured
+        return int(measured.H.shape[2]) if isinstance(measured, Measurements) else measured.model.state_dim
+
+    def check(self, layout: Layout) -> None:
+        """Raise `UnknownNodeError` or `InputError` unless the nodes are in `layout` and of the right size."""
+        span = layout.spans(layout.rows(self.measured.nodes))
+        if len(span) and span.shape[1] != self.state_dim:
+            raise InputError(
+                f"H: expected {span.shape[1]} columns, the size of the nodes' states, got {self.state_dim}"
+            )
+
+    def linearised(self, layout: Layout, mean: FloatArray) -> LinearisedMeasurements:
+        """Around the joint state `mean` (D,) of `layout`."""
+        measured = self.measured
+        rows = layout.rows(measured.nodes)
+        if self.linear and self.weights is None:
+            assert isinstance(measured, Measurements)
+            return LinearisedMeasurements(rows, measured.z, measured.H, measured.R)
+        x = mean[layout.spans(rows)]
+        residual, H = self._residual(x)
+        z = measured.z if isinstance(measured, Measurements) else residual + (H @ x[:, :, None])[:, :, 0]
+        root = np.sqrt(self.weights_at(layout, mean))
+        return LinearisedMeasurements(rows, root[:, None] * z, root[:, None, None] * H, measured.R)
+
+    def distances(self, layout: Layout, mean: FloatArray) -> FloatArray:
+        """(m,) distances || z - h(x) ||_R of the residuals at the joint state `mean`, in standard deviations."""
+        residual, _ = self._residual(mean[layout.spans(layout.rows(self.measured.nodes))])
+        return _distances(residual, self.measured.R)
+
+    def weights_at(self, layout: Layout, mean: FloatArray) -> FloatArray:
+        """(m,) the weight of each measurement at the joint state `mean`."""
+        if self.weights is not None:
+            return self.weights
+        return np.ones(len(self.measured)) if self.loss is None else self.loss.weight(self.distances(layout, mean))
+
+    def with_weights(self, weights: FloatArray) -> RecordedMeasurements:
+        """The same with fixed weights."""
+        return replace(self, weights=weights)
+
+    def _residual(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """z - h(x) (m, k) and dh/dx (m, k, d) at states x (m, d)."""
+        measured = self.measured
+        if isinstance(measured, Measurements):
+            return measured.z - (measured.H @ x[:, :, None])[:, :, 0], measured.H
+        model = measured.model
+        try:
+            residual = measured.z - model.predict(x)
+            H = np.array(model.jacobian(x), dtype=np.float64)
+        except Exception as error:  # of a researcher's model: anything
+            reason = error if isinstance(error, FactorError) else repr(error)
+            raise InputError(f"{model.name}: {reason}") from error
+        angles = list(model.angles)
+        residual[:, angles] = (residual[:, angles] + np.pi) % (2 * np.pi) - np.pi
+        if not (np.isfinite(residual).all() and np.isfinite(H).all()):
+            raise InputError(f"{model.name}: the prediction or its Jacobian is not finite")
+        return residual, H
+
+
+def _distances(residual: FloatArray, R: FloatArray) -> FloatArray:
+    whitened = np.linalg.solve(np.linalg.cholesky(R), residual[:, :, None])[:, :, 0]
+    return np.asarray(np.linalg.norm(whitened, axis=1))
