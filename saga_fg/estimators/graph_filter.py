@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, predictors

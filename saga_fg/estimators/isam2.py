@@ -26,10 +26,10 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
-from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
+from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph

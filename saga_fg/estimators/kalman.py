@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
-from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph

@@ -25,10 +25,10 @@ from saga_fg.estimators.backward import (
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
-from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
+from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked

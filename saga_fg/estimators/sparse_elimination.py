@@ -29,10 +29,10 @@ from factors import Linearisable, linearised, nonlinear_graph
 from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.factor_graph import recording_factors
 from saga_fg.estimators.graph_solution import NoSolution, tree_covariances
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.object_factors import recording_factors
 from saga_fg.estimators.recording import Recording
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
