@@ -78,7 +78,7 @@ class JointKalmanFilter(LatestMarginals):
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
 
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
-        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
         self._frame, self._origin = frame, origin
 
     def ask_providers(self) -> None:
@@ -118,8 +118,8 @@ class JointKalmanFilter(LatestMarginals):
     def marginalise(self, nodes: ArrayLike) -> None:
         self._state = self._state.without(self._state.layout.rows(nodes))
         if self.providers:
-            gone = set(np.asarray(nodes).tolist())
-            labels = {node: label for node, label in self._auxiliary.labels.items() if node not in gone}
+            leaving = set(np.asarray(nodes).tolist())
+            labels = {node: label for node, label in self._auxiliary.labels.items() if node not in leaving}
             self._auxiliary = replace(self._auxiliary, labels=labels)
 
     def posterior(self) -> BlockGaussian:

@@ -105,8 +105,8 @@ def recording_factors(
         }
         result.append(EpochFactors(keys, factors))
         if epoch.interval is not None:
-            gone = layout.rows(epoch.gone)
-            stay = layout.without(gone) if len(gone) else layout
+            leaving = layout.rows(epoch.leaving)
+            stay = layout.without(leaving) if len(leaving) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
             resting = stay.nodes[epoch.interval.linearised(stay, at).still].tolist()
             now, keys = keys, {node: keys[node] for node in resting}
@@ -195,16 +195,16 @@ def interval_factors(
     for row in np.flatnonzero(~together & ~moves_nonlinearly).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
-        heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
+        sources = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
         if not _is_regular(Q):
             raise FactorError(f"node {node}: expected noise in all directions of its state")
-        native.append(interaction_factor(int(then[row]), [key for key, _ in heard], [F for _, F in heard], b, Q))
+        native.append(interaction_factor(int(then[row]), [key for key, _ in sources], [F for _, F in sources], b, Q))
     return native, nonlinear
 
 
 def _is_regular(Q: FloatArray) -> BoolArray:
-    """Which of the covariances (..., d, d) have variance in all directions, in units in which those of axes are 1."""
+    """(...,) true where covariances (..., d, d), scaled to unit variances of the axes, have variance in all directions."""
     deviation = np.sqrt(np.diagonal(Q, axis1=-2, axis2=-1))
     scale = np.where(deviation > 0, deviation, 1.0)
     return np.asarray(np.linalg.eigvalsh(Q / scale[..., :, None] / scale[..., None, :])[..., 0] > _SINGULAR)
@@ -231,11 +231,11 @@ class Births:
         ids = np.asarray(self.nodes).tolist()
         if not ids:
             return Additions()
-        born = [
+        new = [
             NewVariable(*node_kind(i), mean, label=self.labels.get(i, ""))
             for i, mean in zip(ids, self.means, strict=True)
         ]
-        return Additions(born, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
+        return Additions(new, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
 
 
 @dataclass(frozen=True, eq=False)
