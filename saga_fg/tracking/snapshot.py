@@ -46,7 +46,7 @@ class TrackTables:
             SensorEvidence.empty(),
             Standing.empty(),
             np.empty((0, classes)),
-            TrafficFlow(settings.flow),
+            TrafficFlow(settings.traffic_flow_prior),
             Roadside(settings.signals),
             EgoNode.of(settings),
         )

@@ -29,7 +29,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import mahalanobis_of_pairs
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.joint_state import Kinematics
-from saga_fg.tracking.settings import StandingSettings
+from saga_fg.tracking.settings import StationaritySettings
 
 _MOST_LOG_ODDS = 12.0  # no belief is beyond being changed by what is seen
 
@@ -51,10 +51,10 @@ class Standing(Columns):
         """Of new tracks: they stand where they are."""
         return cls(now.position.copy(), now.P.copy(), belief)
 
-    def predict(self, dt: float, moving: Kinematics, settings: StandingSettings) -> None:
+    def predict(self, dt: float, moving: Kinematics, settings: StationaritySettings) -> None:
         """`dt` s pass; `moving` is the joint filter's state before."""
-        rate = settings.depart + settings.halt
-        balance, lost = settings.halt / max(rate, 1e-12), -math.expm1(-rate * dt)
+        rate = settings.start_rate + settings.stop_rate
+        balance, lost = settings.stop_rate / max(rate, 1e-12), -math.expm1(-rate * dt)
         stays, halts = self.belief * (1 - (1 - balance) * lost), (1 - self.belief) * balance * lost
         self.belief = stays + halts
         new = (halts / np.maximum(self.belief, 1e-12))[:, None]
@@ -87,9 +87,9 @@ class Standing(Columns):
         self.P[rows] = self.P[rows] - gain @ self.P[rows]
         self.belief[rows] = after_evidence(self.belief[rows], evidence)
 
-    def noise_scale(self, settings: StandingSettings) -> FloatArray:
+    def noise_scale(self, settings: StationaritySettings) -> FloatArray:
         """(n,) the share of the process noise that is expected."""
-        return np.asarray(1 - self.belief * (1 - settings.noise))
+        return np.asarray(1 - self.belief * (1 - settings.noise_scale))
 
     def told(self, moving: Kinematics) -> Kinematics:
         """The joint filter's state with the velocity that is told."""

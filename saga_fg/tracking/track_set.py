@@ -143,7 +143,7 @@ class TrackSet:
         rows = np.concatenate([matching.detection, born])
         ids = np.concatenate([self._columns.id[matching.track], self._columns.id[len(self) - len(born) :]])
         self._bury()
-        self._columns.ready |= speed_deviation(self._told()) <= self.settings.report_speed_known
+        self._columns.ready |= speed_deviation(self._told()) <= self.settings.report_speed_deviation_below
         self._tell("deaths", frame, observed, matching)
         self._tell("report", frame, observed, matching)
         return Assignment(ids, observed.row[rows])
@@ -175,7 +175,7 @@ class TrackSet:
 
     def _standing_noise(self, dt: float) -> FloatArray | None:
         """`dt` s pass for the belief that tracks stand; factors on the nodes' noise over this time."""
-        settings = self.settings.standing
+        settings = self.settings.stationarity
         if settings.prior == 0:
             return None
         self._tables.standing.predict(dt, self._kinematics(), settings)
@@ -217,7 +217,7 @@ class TrackSet:
         columns, boxes = self._columns, observed.boxes
         t, d = matching.track, matching.detection
         z = np.concatenate([boxes.position[d, :2] - self._origin, boxes.velocity[d]], axis=1)
-        if self.settings.standing.prior > 0:
+        if self.settings.stationarity.prior > 0:
             position, P = self._state.positions_before(columns.id, columns.label, delay)
             then = self._kinematics()._replace(position=position, P=P)
             moving = Kinematics._make(column[t] for column in then)
@@ -263,10 +263,10 @@ class TrackSet:
         missed = np.ones(len(columns.id), dtype=bool)
         missed[matching.track] = False
         p_detect = np.where(visible, sensor.detection_chance(columns.label), 0.0)
-        if self.settings.existence.occlusion > 0 and observed.viewpoint is not None and missed.any():
+        if self.settings.existence.occlusion_weight > 0 and observed.viewpoint is not None and missed.any():
             now = self._kinematics()
             boxes = self._boxes(now.position, now.velocity)
-            hidden = self.settings.existence.occlusion * covered(boxes, observed.viewpoint, ~missed)
+            hidden = self.settings.existence.occlusion_weight * covered(boxes, observed.viewpoint, ~missed)
             p_detect, visible = p_detect * (1 - hidden), visible & (hidden < HIDDEN)
         p, settings = observed.probability[matching.detection], self.settings.existence
         # what another sensor has just seen exists, whatever this one misses
@@ -278,16 +278,16 @@ class TrackSet:
         fused = self._tables.evidence.probability(self._time, max(self.settings.score_memory, delay))
         columns.score = np.where(np.isfinite(fused), fused, columns.score)
         columns.hits, columns.looks = self._tables.evidence.steadiest()
-        columns.accepted |= self._tables.evidence.confirmed(self.settings.confirmations)
+        columns.accepted |= self._tables.evidence.confirmed(self.settings.confirming_detections)
         for column, told in zip((columns.told, columns.shared), observed.told, strict=True):
             column[matching.track] = told[matching.detection]
         columns.last_seen[matching.track] = np.maximum(columns.last_seen[matching.track], self._time - delay)
         columns.last_in_view[matching.track] = self._time
-        columns.confirmed |= columns.existence >= settings.confirm
+        columns.confirmed |= columns.existence >= settings.confirm_above
 
     def _watch_traffic(self, matching: Matching) -> None:
         """Where detected tracks pass, for those that are born after them."""
-        if self.settings.flow.weight == 0:
+        if self.settings.traffic_flow_prior.weight == 0:
             return
         now, stands = self._kinematics(), self._tables.standing.belief
         passages = passages_of(self._columns, self._tables.box, matching.track, now, stands, self._origin, self._time)
@@ -318,12 +318,12 @@ class TrackSet:
         ids = np.arange(self._next_id, self._next_id + len(born), dtype=np.int64)
         self._next_id += len(born)
         kinematics, stands = newborn(
-            observed, born, self._origin, self.settings.classes, self._tables.flow, self.settings.standing.prior
+            observed, born, self._origin, self.settings.classes, self._tables.flow, self.settings.stationarity.prior
         )
         mine = None if sightings is None else sightings.select(born)
         self._state.add(ids, boxes.label, kinematics, delay, mine)
         self._update_range_rate(observed, born, ids, boxes.label, delay)
-        confirmed = p >= self.settings.existence.confirm
+        confirmed = p >= self.settings.existence.confirm_above
         seen, told = self._time - delay, (observed.told[0][born], observed.told[1][born])
         self._tables.columns = self._columns.extended(
             TrackColumns.born(ids, boxes.label, p, told, seen, self._time, confirmed, accepted)
@@ -345,7 +345,7 @@ class TrackSet:
         max_coasting, merging = self._of_class(columns.label, "max_coasting", "merge_distance")
         dead = coasting > max_coasting
         dead |= np.round(self._time - columns.last_in_view, 6) > self.settings.max_out_of_view
-        dead |= ~columns.confirmed & (columns.existence < self.settings.existence.give_up)
+        dead |= ~columns.confirmed & (columns.existence < self.settings.existence.delete_below)
         dead |= self._untrackable()
         if (merging > 0).any():
             dead |= duplicates(self._kinematics().position, columns.label, coasting <= 0, merging)
@@ -455,7 +455,7 @@ class TrackSet:
     def _told(self) -> Kinematics:
         """What is told of the tracks: the joint state, the velocity with the belief that they stand."""
         now = self._kinematics()
-        return self._tables.standing.told(now) if self.settings.standing.prior > 0 else now
+        return self._tables.standing.told(now) if self.settings.stationarity.prior > 0 else now
 
     def _nodes(self) -> NodeTable:
         """The present estimates as edge rules see them: the tracks, then the nodes of the roadside."""

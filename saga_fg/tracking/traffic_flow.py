@@ -23,7 +23,7 @@ import numpy as np
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.settings import FlowSettings
+from saga_fg.tracking.settings import TrafficFlowSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Expected(NamedTuple):
 class TrafficFlow:
     """The passages of the last `memory` seconds."""
 
-    settings: FlowSettings
+    settings: TrafficFlowSettings
     passages: Passages | None = None
 
     def pass_by(self, passages: Passages) -> None:
@@ -61,7 +61,7 @@ class TrafficFlow:
         settings = self.settings
         if settings.weight == 0:
             return
-        known = np.isfinite(passages.heading) & (passages.variance < settings.known_speed**2)
+        known = np.isfinite(passages.heading) & (passages.variance < settings.max_speed_deviation**2)
         if len(known) == 0:
             return
         new = passages.select(known)

@@ -106,8 +106,8 @@ def reported_tracks(
     """The tracks that are believed and were seen of late, as of `timestamp`; `now`, s, is the state's time."""
     coasting = columns.coasting(now)
     shown = (
-        (columns.accepted | (settings.unconfirmed_share > 0))
-        & (columns.confirmed | (columns.existence >= settings.existence.report))
+        (columns.accepted | (settings.unconfirmed_score_factor > 0))
+        & (columns.confirmed | (columns.existence >= settings.existence.report_above))
         & (coasting <= settings.report_coasting)
         & columns.ready
     )
@@ -116,5 +116,5 @@ def reported_tracks(
     boxes = boxes_of(columns, box, rows, position + origin, velocity)
     P = told_covariance(P, boxes.yaw, columns.told[rows], columns.shared[rows])
     score = reported_score(columns, coasting > 0, settings.existence)[rows]
-    score = np.where(columns.accepted[rows], score, settings.unconfirmed_share * score)
+    score = np.where(columns.accepted[rows], score, settings.unconfirmed_score_factor * score)
     return Tracks(timestamp, columns.id[rows], boxes, score, P, P_velocity, coasting[rows])
