@@ -11,13 +11,14 @@ measured velocities to the sample's time; unknown velocities are NaN.
 from __future__ import annotations
 
 import json
-import struct
-import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.nuscenes.classes import DETECTION_CLASSES
+from data_tools.datasets.nuscenes.records import Record, box_fields
 from data_tools.files.atomic_files import atomic_directory
 from data_tools.simulator.nuscenes_tables import (
     Tables,
@@ -30,11 +31,14 @@ from data_tools.simulator.nuscenes_tables import (
 )
 from data_tools.simulator.scene import SimulatedTraffic
 from saga_fg.errors import InputError
-from saga_fg.numerics.geometry import yaw_quaternion
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
 
-ATTRIBUTE_OF_DETECTIONS = ""  # not estimated
+CLASSES = ("car", "truck", "bus", "pedestrian")  # of every simulated dataset
+BLACK_PIXEL = bytes.fromhex(
+    "89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55"
+    "0000000a49444154789c636000000002000148afa4710000000049454e44ae426082"
+)  # a PNG image of one black pixel
 
 
 def write_nuscenes(directory: str | Path, dataset: SimulatedTraffic, version: str = "v1.0-mini") -> None:
@@ -46,14 +50,19 @@ def write_nuscenes(directory: str | Path, dataset: SimulatedTraffic, version: st
         raise InputError(f"version: expected a plain name such as v1.0-mini, got {version!r}")
     sensors = dataset.settings.sensors
     with atomic_directory(directory) as folder:
-        tables: Tables = shared_tables(sensors, list(dataset.scenes))
+        tables: Tables = {}
+        classes = dict.fromkeys(CLASSES)
         results: dict[str, dict[str, Any]] = {name: {} for name in sensors}
         for name in dataset.scenes:
             scene = dataset.scene(name)
             for table, records in scene_tables(scene, sensors).items():
                 tables.setdefault(table, []).extend(records)
+            classes |= dict.fromkeys(
+                label for truth in scene.ground_truth or () for label in truth.boxes.label.tolist()
+            )
             for sensor, samples in results.items():
                 samples.update(_detections(scene, sensor))
+        tables |= shared_tables(sensors, list(dataset.scenes), classes)
         (folder / version).mkdir()
         for table, records in tables.items():
             _write_json(folder / version / f"{table}.json", records)
@@ -62,10 +71,10 @@ def write_nuscenes(directory: str | Path, dataset: SimulatedTraffic, version: st
         for sensor, samples in results.items():
             _write_json(folder / "detections" / f"{sensor}.json", {"meta": _meta(sensor), "results": samples})
         (folder / "maps").mkdir()
-        (folder / "maps" / "placeholder.png").write_bytes(black_pixel())
+        (folder / "maps" / "placeholder.png").write_bytes(BLACK_PIXEL)
 
 
-def _detections(scene: Scene, sensor: str) -> dict[str, list[dict[str, Any]]]:
+def _detections(scene: Scene, sensor: str) -> dict[str, list[Record]]:
     """The detections of one sensor at the samples of a scene; samples far from any frame of the sensor are left out."""
     frames = [frame for frame in scene.frames if frame.sensor == sensor]
     times = scene.timestamps[keyframes(scene)]
@@ -73,31 +82,25 @@ def _detections(scene: Scene, sensor: str) -> dict[str, list[dict[str, Any]]]:
     return {sample: _boxes(sample, time, frame) for sample, time, frame in nearest if frame is not None}
 
 
-def _boxes(sample: str, time: float, frame: Frame) -> list[dict[str, Any]]:
-    boxes = frame.detections.boxes
+def _boxes(sample: str, time: float, frame: Frame) -> list[Record]:
+    known = np.isin(frame.detections.boxes.label, DETECTION_CLASSES)  # nuScenes has no traffic lights
+    detections = frame.detections.select(known)
+    boxes = detections.boxes
     position = boxes.position.copy()
     position[:, :2] += (time - frame.timestamp) * np.nan_to_num(boxes.velocity)
-    columns = zip(
-        position.round(4).tolist(),
-        boxes.size[:, [1, 0, 2]].round(4).tolist(),
-        yaw_quaternion(boxes.yaw).tolist(),
-        boxes.velocity.round(4).tolist(),
-        boxes.label.tolist(),
-        frame.detections.score.round(6).tolist(),
-        strict=True,
-    )
+    columns = (boxes.velocity.round(4), boxes.label, detections.score.round(6))
     return [
         {
             "sample_token": sample,
-            "translation": translation,
-            "size": size,
-            "rotation": rotation,
+            **box,
             "velocity": velocity,
             "detection_name": label,
             "detection_score": score,
-            "attribute_name": ATTRIBUTE_OF_DETECTIONS,
+            "attribute_name": "",
         }
-        for translation, size, rotation, velocity, label, score in columns
+        for box, velocity, label, score in zip(
+            box_fields(replace(boxes, position=position), 4), *(column.tolist() for column in columns), strict=True
+        )
     ]
 
 
@@ -110,15 +113,3 @@ def _meta(sensor: str) -> dict[str, bool]:
 def _write_json(path: Path, content: object) -> None:
     with path.open("w", encoding="utf-8") as file:
         json.dump(content, file)
-
-
-def black_pixel() -> bytes:
-    """A PNG image of one black pixel (W3C recommendation, https://www.w3.org/TR/png/)."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        checksum = zlib.crc32(kind + content)
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
-
-    header = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)  # 1 x 1, 8 bits, grey
-    pixel = zlib.compress(b"\x00\x00")
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixel) + chunk(b"IEND", b"")

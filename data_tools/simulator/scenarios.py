@@ -1,9 +1,10 @@
-"""Kinds of scenes in which more than cars matters, as settings of the simulator.
+"""Named scenarios, as settings of the simulator.
 
-red-light    a queue before a traffic light; frames bring a map along, the camera sees the colours
-road-works   cones close the right lane, whose traffic is pushed into the lane beside; the map has the lanes of before
+traffic      the default settings
+red-light    a queue before a traffic light; frames have a map, the camera reports colours
+road-works   cones close the right lane and move its traffic into the adjacent lane; the map does not have the cones
 towing       many trucks, most of them with a trailer
-cycling      riders on bicycles beside slow traffic
+cycling      cyclists beside slow traffic
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ SCENARIOS: tuple[ScenarioName, ...] = get_args(ScenarioName)
 
 
 def scenario_settings(name: ScenarioName) -> SimulatorSettings:
-    """The settings of a kind of scene; `traffic` is what the simulator does by default."""
+    """The settings of a scenario."""
     return _SETTINGS[name]()
 
 
@@ -44,7 +45,7 @@ def _red_light() -> SimulatorSettings:
 def _road_works() -> SimulatorSettings:
     return SimulatorSettings(
         road=RoadSettings(lanes=(1, 1), merge_probability=1.0),
-        traffic=TrafficSettings(platoon_size=(2, 5), platoon_gap=(15.0, 60.0)),  # a lane less is no jam yet
+        traffic=TrafficSettings(platoon_size=(2, 5), platoon_gap=(15.0, 60.0)),  # light: one lane less makes no jam
         roadworks=RoadworkSettings(probability=1.0),
         lights=LightSettings(mapped=True),
     )

@@ -1,4 +1,4 @@
-"""Settings of the traffic simulator. A pair (low, high) is a range from which each scene draws uniformly."""
+"""Settings of the traffic simulator. A pair (low, high) is a range sampled uniformly for each scene."""
 
 from __future__ import annotations
 
@@ -32,38 +32,40 @@ class RoadSettings(Settings):
 
 @dataclass(frozen=True)
 class DriverSettings(Settings):
-    """Means of the Intelligent Driver Model's parameters over the drivers of cars, and how much drivers differ."""
+    """Intelligent Driver Model: means over the drivers of cars, and the spread between drivers."""
 
     desired_speed: PositiveSpan = setting((10.0, 16.0), "mean desired speed of a scene's drivers, m/s")
     time_headway: Positive = setting(1.2, "desired time headway T, s")
     minimum_gap: Positive = setting(2.0, "gap s0 kept at standstill, m")
     max_acceleration: Positive = setting(1.5, "maximum acceleration a, m/s^2")
     comfortable_deceleration: Positive = setting(2.0, "comfortable deceleration b, m/s^2")
-    spread: NonNegative = setting(0.15, "relative standard deviation of all these over drivers (log-normal)")
-    reaction_time: NonNegative = setting(0.3, "delay between what a driver sees and what his car does, s")
+    spread: NonNegative = setting(0.15, "relative standard deviation of these parameters over drivers (log-normal)")
+    reaction_time: NonNegative = setting(0.3, "delay between a change in traffic and the driver's response, s")
     acceleration_noise: NonNegative = setting(0.2, "standard deviation of random acceleration, m/s^2")
     noise_time: Positive = setting(3.0, "correlation time of the random acceleration, s")
     politeness: NonNegative = setting(0.3, "weight of the new follower's loss in the decision to change lanes")
-    change_threshold: NonNegative = setting(0.3, "gain in acceleration that is worth a change of lanes, m/s^2")
+    change_threshold: NonNegative = setting(0.3, "lowest gain in acceleration for which a driver changes lanes, m/s^2")
     safe_deceleration: NonNegative = setting(3.0, "hardest braking a lane change may cause, m/s^2")
 
 
 @dataclass(frozen=True)
 class TrafficSettings(Settings):
-    """How many vehicles there are, of which kinds, and what disturbs their flow."""
+    """Vehicles: kinds, platoons, and disturbances of the traffic flow."""
 
-    van_share: Fraction = setting(0.25, "share of vans and the like, labelled car, that one cannot look over")
+    van_share: Fraction = setting(0.25, "share of vans, which are labelled car and high enough to hide cars")
     truck_share: Fraction = setting(0.18, "share of trucks")
     bus_share: Fraction = setting(0.08, "share of buses")
     trailer_share: Fraction = setting(0.0, "share of the trucks that tow a trailer")
     platoon_size: PositiveCount = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: NonNegativeSpan = setting((10.0, 60.0), "extra distance between platoons, m")
-    signal_probability: Fraction = setting(0.7, "share of scenes with a traffic light ahead; the rest have a slow zone")
+    signal_probability: Fraction = setting(0.7, "share of scenes with a traffic light; the others have a slow zone")
     red_duration: PositiveSpan = setting((8.0, 18.0), "duration of a red phase, s")
     green_duration: PositiveSpan = setting((8.0, 16.0), "duration of a green phase, s")
-    lane_wise_probability: Fraction = setting(0.5, "share of scenes where lanes have lights or slow zones of their own")
+    lane_wise_probability: Fraction = setting(0.5, "share of scenes with separate lights or slow zones for each lane")
     slow_speed: PositiveSpan = setting((1.0, 4.0), "speed in a slow zone while it is active, m/s")
-    slow_duration: PositiveSpan = setting((5.0, 12.0), "how long a slow zone is active, and inactive, s")
+    slow_duration: PositiveSpan = setting(
+        (5.0, 12.0), "duration of the active and of the inactive phases of a slow zone, s"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,56 +75,58 @@ class TrafficSettings(Settings):
 
 @dataclass(frozen=True)
 class PedestrianSettings(Settings):
-    """People on the pavements, alone and in groups."""
+    """Pedestrians on the pavements, alone and in groups."""
 
     groups: Count = setting((3, 8), "fewest and most groups within reach of the ego vehicle")
     group_size: Count = setting((1, 4), "fewest and most people in a group")
-    walking_speed: PositiveSpan = setting((1.0, 1.7), "speed at which a group likes to walk, m/s")
-    pause_interval: Positive = setting(20.0, "mean time between a group's stops, s")
-    pause_duration: Positive = setting(4.0, "mean duration of a stop, s")
-    jitter: NonNegative = setting(0.25, "standard deviation of a person's place around that in the group, m")
+    walking_speed: PositiveSpan = setting((1.0, 1.7), "preferred speed of a group, m/s")
+    pause_interval: Positive = setting(20.0, "mean time between pauses of a group, s")
+    pause_duration: Positive = setting(4.0, "mean duration of a pause, s")
+    jitter: NonNegative = setting(0.25, "standard deviation of a person's position within the group, m")
 
 
 @dataclass(frozen=True)
 class CyclistSettings(Settings):
-    """Riders on bicycles at the edges of the road."""
+    """Cyclists at the outer borders of the road."""
 
-    count: Count = setting((0, 0), "fewest and most riders in each direction")
-    speed: PositiveSpan = setting((3.5, 6.5), "speed that a rider likes, m/s")
-    spread: NonNegative = setting(1.0, "standard deviation of a rider's speed about that, m/s")
-    change_time: Positive = setting(2.5, "correlation time of a rider's speed, s")
+    count: Count = setting((0, 0), "fewest and most cyclists in each direction")
+    speed: PositiveSpan = setting((3.5, 6.5), "preferred speed of a cyclist, m/s")
+    spread: NonNegative = setting(1.0, "standard deviation of a cyclist's speed about the preferred one, m/s")
+    change_time: Positive = setting(2.5, "correlation time of a cyclist's speed, s")
 
 
 @dataclass(frozen=True)
 class RoadworkSettings(Settings):
-    """A right lane closed by cones: a taper that pushes its traffic into the lane beside, then a row along that."""
+    """A right lane closed by cones: a taper that moves its traffic into the adjacent lane, then a row along it."""
 
     probability: Fraction = setting(0.0, "share of the scenes with a lane that ends whose lane is closed by cones")
     taper: PositiveSpan = setting((30.0, 45.0), "length of the taper, m")
     row: PositiveSpan = setting((25.0, 50.0), "length of the row of cones behind it, m")
     spacing: Positive = setting(4.0, "distance between cones, m")
-    notice: PositiveSpan = setting((60.0, 110.0), "how far before the taper drivers begin to fit themselves in, m")
-    early: NonNegative = setting(10.0, "the earliest drivers leave the lane so long before the latest, m")
+    notice: PositiveSpan = setting((60.0, 110.0), "distance before the taper at which drivers begin to merge, m")
+    early: NonNegative = setting(
+        10.0, "distance between the earliest and the latest positions at which drivers leave the lane, m"
+    )
 
 
 @dataclass(frozen=True)
 class LightSettings(Settings):
-    """What is known, and seen, of the traffic lights."""
+    """Traffic lights: phases, map, and visibility."""
 
-    amber_duration: NonNegative = setting(3.0, "so long a light is amber before it is red, as part of its red phase, s")
-    mapped: bool = setting(False, "whether frames bring a map along, of lights, stop lines and lanes")
-    map_noise: NonNegative = setting(0.2, "standard deviation of the places in the map, m")
-    visible_range: NonNegative = setting(80.0, "the colour of a light can be seen from this far, m")
+    amber_duration: NonNegative = setting(3.0, "duration of amber, as the first part of the red phase, s")
+    mapped: bool = setting(False, "give frames a map of lights, stop lines and lanes")
+    map_noise: NonNegative = setting(0.2, "standard deviation of positions in the map, m")
+    visible_range: NonNegative = setting(80.0, "largest distance at which the colour of a light is visible, m")
 
 
 @dataclass(frozen=True)
 class SurroundingSettings(Settings):
-    """What stands beside the road and hides what moves on it."""
+    """Static objects beside the road, which hide moving ones."""
 
     parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
     parking_occupancy: Fraction = setting(0.5, "share of parking places taken")
-    hedge_length: PositiveSpan = setting((4.0, 14.0), "length of an unbroken piece of hedge, m")
-    hedge_gap: PositiveSpan = setting((5.0, 18.0), "gap between pieces of hedge, m")
+    hedge_length: PositiveSpan = setting((4.0, 14.0), "length of a hedge, m")
+    hedge_gap: PositiveSpan = setting((5.0, 18.0), "gap between hedges, m")
     hedge_height: Positive = setting(2.2, "height of a hedge, m")
     building_length: PositiveSpan = setting((10.0, 30.0), "length of a building, m")
     building_gap: PositiveSpan = setting((2.0, 25.0), "gap between buildings, m")
@@ -130,9 +134,9 @@ class SurroundingSettings(Settings):
 
 @dataclass(frozen=True)
 class SensorSettings(Settings):
-    """One sensor with its detector. Noise is drawn along the range and bearing axes, independently each time.
+    """One sensor with its detector. Noise is independent between frames and between the range and bearing axes.
 
-    The chance to detect an object is detection_probability * ramp(visible share) / (1 + exp((range - reach) / fading)),
+    The probability of detection is detection_probability * ramp(visible share) / (1 + exp((range - reach) / fading)),
     the ramp rising from 0 at `hidden_share` to 1 at `clear_share`.
     """
 
@@ -141,13 +145,13 @@ class SensorSettings(Settings):
     field_of_view: Annotated[float, Range(0, 2 * math.pi + 1e-9, above=True)] = setting(
         2 * math.pi, "horizontal field of view, centred straight ahead, rad"
     )
-    position: tuple[float, float, float] = setting((0.94, 0.0, 1.84), "mounting place on the vehicle (x, y, z), m")
-    max_range: Positive = setting(60.0, "nothing is detected beyond, m")
+    position: tuple[float, float, float] = setting((0.94, 0.0, 1.84), "mounting position on the vehicle (x, y, z), m")
+    max_range: Positive = setting(60.0, "largest range of a detection, m")
     range_noise: Annotated[tuple[float, float], Range(0)] = setting(
         (0.10, 0.002), "range error: standard deviation at 0 m, and per m"
     )
     bearing_noise: Annotated[tuple[float, float], Range(0)] = setting(
-        (0.08, 0.002), "sideways error: deviation at 0 m, m, and per m (rad)"
+        (0.08, 0.002), "error across the line of sight: standard deviation at 0 m, m, and per m, rad"
     )
     height_noise: NonNegative = setting(0.08, "standard deviation of the elevation, m")
     size_noise: NonNegative = setting(0.05, "relative standard deviation of length, width, height")
@@ -158,18 +162,20 @@ class SensorSettings(Settings):
     range_rate_noise: Positive | None = setting(
         None, "standard deviation of the range rate over ground, m/s; null: no range rate"
     )
-    boxes: bool = setting(True, "whether it measures sizes and headings")
-    class_accuracy: Fraction = setting(1.0, "chance that it tells cars, trucks and buses rightly, else for another")
-    colour_accuracy: Fraction | None = setting(
-        None, "chance that it tells the colour of a traffic light rightly; null: it sees no colours"
+    boxes: bool = setting(True, "measure sizes and headings")
+    class_accuracy: Fraction = setting(
+        1.0, "probability that a car, truck or bus is reported as such; otherwise as one of the others"
     )
-    detection_probability: Fraction = setting(0.97, "chance to detect a clearly visible object close by")
+    colour_accuracy: Fraction | None = setting(
+        None, "probability that the colour of a traffic light is reported correctly; null: lights are not detected"
+    )
+    detection_probability: Fraction = setting(0.97, "probability of detection of a fully visible object at close range")
     hidden_share: Finite = setting(0.15, "visible share up to which an object is never detected")
-    clear_share: Finite = setting(0.35, "visible share from which occlusion does not matter")
-    reach: Positive = setting(60.0, "range at which the chance to detect an object has halved, m")
-    fading: Positive = setting(6.0, "how gradually it falls there, m")
+    clear_share: Finite = setting(0.35, "visible share from which occlusion has no effect")
+    reach: Positive = setting(60.0, "range at which the probability of detection has halved, m")
+    fading: Positive = setting(6.0, "width of the fall of the probability of detection around `reach`, m")
     clutter_rate: NonNegative = setting(2.0, "mean number of false detections a frame")
-    true_logit: Finite = setting(2.0, "mean logit of the score of a clearly visible object close by")
+    true_logit: Finite = setting(2.0, "mean logit of the score of a fully visible object at close range")
     clutter_logit: Finite = setting(-1.5, "mean logit of the score of a false detection")
     logit_noise: NonNegative = setting(0.8, "standard deviation of the logit of the score")
 
@@ -182,12 +188,12 @@ class SensorSettings(Settings):
 
 
 def lidar() -> SensorSettings:
-    """A LiDAR on the roof that looks all around."""
+    """A LiDAR on the roof with a full horizontal field of view."""
     return SensorSettings()
 
 
 def camera() -> SensorSettings:
-    """A front camera: good bearings, poor ranges, noisy velocities, its own clock."""
+    """A front camera: good bearings, poor ranges, noisy velocities, an own frame rate."""
     return SensorSettings(
         rate=12.0,
         offset=0.031,
@@ -233,24 +239,26 @@ def radar() -> SensorSettings:
 
 @dataclass(frozen=True)
 class SimulatorSettings(Settings):
-    """Everything that shapes simulated scenes."""
+    """All settings of simulated scenes."""
 
     duration: Positive = setting(20.0, "length of a scene, s")
-    keyframe_rate: Positive = setting(
-        10.0, "moments a second at which ground truth is given and tracks are wanted, 1/s"
-    )
+    keyframe_rate: Positive = setting(10.0, "rate of ground truth and of track output, 1/s")
     step: Positive = setting(0.05, "integration step, s")
     warm_up: NonNegative = setting(15.0, "time simulated before the scene starts, s")
     annotation_range: Positive = setting(60.0, "distance from the ego vehicle within which objects are annotated, m")
-    visible_share: Fraction = setting(0.25, "an object counts as visible when a sensor sees at least this share of it")
-    shortest_view: NonNegative = setting(1.0, "and for at least this long; a mere glimpse does not count, s")
-    memory: NonNegative = setting(4.0, "a hidden object is annotated for this long after it was last visible, s")
+    visible_share: Fraction = setting(
+        0.25, "least share of an object that a sensor must see for it to count as visible"
+    )
+    shortest_view: NonNegative = setting(1.0, "shortest view that counts as visible, s")
+    memory: NonNegative = setting(
+        4.0, "duration for which a hidden object stays annotated after it was last visible, s"
+    )
     road: RoadSettings = settings_group(RoadSettings, "the road")
-    drivers: DriverSettings = settings_group(DriverSettings, "how people drive")
-    traffic: TrafficSettings = settings_group(TrafficSettings, "what is on the road")
-    pedestrians: PedestrianSettings = settings_group(PedestrianSettings, "people on foot")
-    surroundings: SurroundingSettings = settings_group(SurroundingSettings, "what stands beside the road")
-    cyclists: CyclistSettings = settings_group(CyclistSettings, "riders on bicycles")
+    drivers: DriverSettings = settings_group(DriverSettings, "drivers")
+    traffic: TrafficSettings = settings_group(TrafficSettings, "vehicles")
+    pedestrians: PedestrianSettings = settings_group(PedestrianSettings, "pedestrians")
+    surroundings: SurroundingSettings = settings_group(SurroundingSettings, "static objects beside the road")
+    cyclists: CyclistSettings = settings_group(CyclistSettings, "cyclists")
     roadworks: RoadworkSettings = settings_group(RoadworkSettings, "lanes closed by cones")
     lights: LightSettings = settings_group(LightSettings, "traffic lights")
     sensors: dict[str, SensorSettings] = settings_group(

@@ -1,7 +1,7 @@
-"""Simulated scenes as plain tables (columns as in `detection_files`): detections, colours of lights too, and the truth.
+"""Simulated scenes as plain tables (columns as in `detection_files`): detections, with colours of lights, and truth.
 
 detections.csv   a row per detection of every sensor, world coordinates, with the pose of the vehicle
-truth.csv        a row per annotated object and keyframe; `id` is its name, `visible` whether a sensor sees it
+truth.csv        a row per annotated object and keyframe; `id` is its name, `visible` is 1 while a sensor sees it
 """
 
 from __future__ import annotations
@@ -19,17 +19,8 @@ from saga_fg.types.frame import Frame
 
 BOX = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
 DETECTIONS = (
-    "scene",
-    "timestamp",
-    "sensor",
-    "label",
-    *BOX,
-    "range_rate",
-    "score",
-    "ego_x",
-    "ego_y",
-    "ego_z",
-    "ego_yaw",
+    *("scene", "timestamp", "sensor", "label", *BOX, "range_rate", "score"),
+    *("ego_x", "ego_y", "ego_z", "ego_yaw"),
 )
 TRUTH = ("scene", "timestamp", "id", "label", *BOX, "visible")
 

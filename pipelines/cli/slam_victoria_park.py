@@ -14,7 +14,7 @@ from saga_fg.errors import InputError
 
 
 def victoria_park(
-    file: Annotated[Path, typer.Argument(help="Odometry and sightings of trees, as distributed with GTSAM.")],
+    file: Annotated[Path, typer.Argument(help="Odometry and observations of trees, as distributed with GTSAM.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     odometry_scale: Annotated[
         float | None,
@@ -36,7 +36,7 @@ def victoria_park(
 
     from data_tools.datasets.victoria_park import read_victoria_park
     from data_tools.files.atomic_files import check_writable_folder
-    from data_tools.metrics.grouping import pairwise_agreement
+    from data_tools.metrics.pairwise_agreement import pairwise_agreement
     from pipelines.slam.results import landmark_rows, planar_trajectory, write_landmark_map
     from pipelines.slam.victoria_park import ParkSettings, map_park
 
@@ -47,11 +47,11 @@ def victoria_park(
     drive = read_victoria_park(file)
     with progress_bar(unit="poses") as progress:
         park = map_park(drive, settings, progress)
-    agreement = pairwise_agreement([s.landmark for s in park.map.sightings], drive.tree)
+    agreement = pairwise_agreement([s.landmark for s in park.map.observations], drive.tree)
     named = len(np.unique(drive.tree))
     figures = {
         "poses": len(park.map.world_T_pose),
-        "sightings": len(drive.tree),
+        "observations": len(drive.tree),
         "landmarks": len(park.map.landmarks),
         "landmarks named in the file": named,
         "pairwise precision": agreement.precision,
@@ -63,7 +63,7 @@ def victoria_park(
     poses = planar_trajectory(np.arange(len(park.map.world_T_pose), dtype=np.float64), park.map.world_T_pose)
     write_landmark_map(output, poses, landmark_rows(park.map.landmarks), figures)
     typer.echo(
-        f"{output}: {counted(len(poses), 'pose')}, {counted(len(drive.tree), 'sighting')}, "
+        f"{output}: {counted(len(poses), 'pose')}, {counted(len(drive.tree), 'observation')}, "
         f"{counted(len(park.map.landmarks), 'landmark')} ({named} in the file)"
     )
     typer.echo(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_directory
-from data_tools.plots import Panel, birds_eye_view, png, trails
+from data_tools.plots import Panel, birds_eye_view, png
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.comparison import COLUMNS, Comparison, compare, table_rows
 from pipelines.config import Method, TrackConfig
@@ -108,7 +108,7 @@ def _picture(comparison: Comparison, scene_row: int, moment: int) -> Any:
     runs = {method: comparison.runs[method][scene_row] for method in shown}
     scene = runs["saga"].scene
     assert scene.ground_truth is not None
-    panels = [Panel(TITLES[m], run.tracks[moment], trails(run.tracks[: moment + 1])) for m, run in runs.items()]
+    panels = [Panel(TITLES[m], run.tracks[: moment + 1]) for m, run in runs.items()]
     return birds_eye_view(
         panels, scene.world_T_ego[moment], scene.ground_truth[moment], latest_detections(scene, moment)
     )

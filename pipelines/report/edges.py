@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.node import ConstantVelocity, NodeType
@@ -23,7 +23,7 @@ Edges = tuple[IntArray, IntArray, FloatArray]
 """Targets and sources (E,), rows of the table, and rates (E,), 1/s."""
 
 
-def edges_of_moments(table: TrackTable, moments: int, rules: Sequence[EdgeRule]) -> Iterator[Edges]:
+def edges_of_moments(table: SceneBoxes, moments: int, rules: Sequence[EdgeRule]) -> Iterator[Edges]:
     """The edges of each moment."""
     node_type = NodeType("track", ConstantVelocity())
     moved: set[str] = set()

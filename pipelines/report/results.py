@@ -11,7 +11,7 @@ import numpy as np
 from data_tools.datasets.detection_files import TrackRows, read_detections, read_tracks
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence
 from data_tools.datasets.nuscenes import ScoredScene
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from pipelines.config import Family, load_config
 from pipelines.report.run_record import RunRecord, read_run_record
 from pipelines.report.scenes import ReportScene
@@ -58,7 +58,7 @@ def table_results(result: Path, detections: Path | None) -> Results:
     return _results(result, "file", shown)
 
 
-def _results(result: Path, family: Family, shown: Iterable[tuple[Scene, TrackTable, FloatArray | None]]) -> Results:
+def _results(result: Path, family: Family, shown: Iterable[tuple[Scene, SceneBoxes, FloatArray | None]]) -> Results:
     record, config = read_run_record(result), load_config(family)
     method = record.method if record is not None else "tracks"
     scenes = [
@@ -77,7 +77,7 @@ def _amid(rows: TrackRows, mine: IntArray, count: int) -> FloatArray:
     return poses
 
 
-def _placed(scene: Scene, rows: TrackRows, mine: IntArray, path: Path) -> tuple[Scene, TrackTable, FloatArray]:
+def _placed(scene: Scene, rows: TrackRows, mine: IntArray, path: Path) -> tuple[Scene, SceneBoxes, FloatArray]:
     moment = np.searchsorted(scene.timestamps, rows.timestamp[mine] - 1e-6)
     strange = (moment >= len(scene)) | (np.abs(scene.timestamps[moment % len(scene)] - rows.timestamp[mine]) > 1e-6)
     if strange.any():
@@ -87,7 +87,7 @@ def _placed(scene: Scene, rows: TrackRows, mine: IntArray, path: Path) -> tuple[
         )
     order = np.argsort(moment, kind="stable")
     chosen = mine[order]
-    table = TrackTable(
+    table = SceneBoxes(
         moment[order], rows.id[chosen], rows.boxes.select(chosen), rows.score[chosen], rows.position_covariance[chosen]
     )
     return scene, table, rows.coasting[chosen]

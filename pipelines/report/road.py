@@ -19,7 +19,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import Lane, StopLine, TrafficLight
-from saga_fg.types.signal import SIGHTINGS, SignalSettings
+from saga_fg.types.signal import COLOUR_LABELS, SignalSettings
 
 Colours = list[list[int | None]]
 
@@ -59,14 +59,14 @@ def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
     now: list[int | None] = [None] * len(lights)
     colours = []
     for boxes in detections:
-        sightings = boxes.select(np.flatnonzero(np.isin(boxes.label, SIGHTINGS)))
+        sightings = boxes.select(np.flatnonzero(np.isin(boxes.label, COLOUR_LABELS)))
         if len(lights) and len(sightings):
             now = now.copy()
             apart = np.linalg.norm(sightings.position[:, None, :2] - lights, axis=2)
             nearest = apart.argmin(axis=1)
             for label, light, far in zip(sightings.label, nearest.tolist(), apart.min(axis=1), strict=True):
                 if far < reach:
-                    now[light] = SIGHTINGS.index(str(label))
+                    now[light] = COLOUR_LABELS.index(str(label))
         colours.append(now)
     return colours
 

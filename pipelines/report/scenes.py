@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from pipelines.report.edges import edges_of_moments
 from pipelines.report.road import road_data
 from pipelines.tracking import TrackedScene
@@ -48,7 +48,7 @@ class ReportScene:
     """
 
     scene: Scene
-    tracks: Mapping[str, TrackTable]
+    tracks: Mapping[str, SceneBoxes]
     coasting: Mapping[str, FloatArray]
     rules: Sequence[EdgeRule] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
@@ -60,7 +60,7 @@ def scene_of_run(
     """A scene that has just been tracked, by the trackers' names."""
     return ReportScene(
         next(iter(runs.values())).scene,
-        {name: TrackTable.of_tracks(run.tracks) for name, run in runs.items()},
+        {name: SceneBoxes.of_tracks(run.tracks) for name, run in runs.items()},
         {name: np.concatenate([np.empty(0), *(t.coasting for t in run.tracks)]) for name, run in runs.items()},
         rules,
         sensors,
@@ -100,7 +100,7 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
 
 
 def _method(
-    table: TrackTable,
+    table: SceneBoxes,
     coasting: FloatArray | None,
     labels: StrArray,
     origin: FloatArray,

@@ -2,15 +2,14 @@
 
     line -> message -> numbering -> reordering -> tracker -> answer
 
-`StreamTracker` is the whole of it for one line; `serve_pipe` reads standard input, `SocketServer` a TCP or Unix
-socket; `StateKeeper` keeps the state in a file.
+`StreamTracker` answers lines; `serve_pipe` takes them from standard input, `SocketServer` from a TCP or Unix socket;
+`StateKeeper` keeps the state in a file.
 """
 
-from pipelines.serving.address import Address, parse_address
 from pipelines.serving.client import StreamClient
 from pipelines.serving.pipe import serve_pipe
 from pipelines.serving.server import SocketServer
-from pipelines.serving.settings import StreamSettings
+from pipelines.serving.settings import Address, StreamSettings, parse_address
 from pipelines.serving.state_keeper import StateKeeper
 from pipelines.serving.stopping import StopRequest
 from pipelines.serving.stream import StreamTracker

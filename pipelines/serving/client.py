@@ -8,15 +8,15 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
-from pipelines.serving.address import Address
 from pipelines.serving.messages import encode
+from pipelines.serving.settings import Address
 from saga_fg.errors import InputError
 
 
 class StreamClient:
     """A connection to a service; a context manager.
 
-    Raises `InputError` where nobody listens, and `ConnectionError` when the service goes away.
+    Raises `InputError` where no service listens, and `ConnectionError` when the service goes away.
     """
 
     def __init__(self, address: Address, timeout: float | None = 30.0) -> None:
@@ -34,11 +34,11 @@ class StreamClient:
         self._lines = self._socket.makefile("rb")
 
     def send(self, message: Mapping[str, Any] | bytes) -> None:
-        """Send one message, or a line as it is."""
+        """Send one message, or a raw line."""
         self._socket.sendall(message if isinstance(message, bytes) else encode(message))
 
     def receive(self) -> dict[str, Any]:
-        """The next answer. Raises `InputError` for what is none."""
+        """Return the next answer. Raises `InputError` for a line that is no JSON object."""
         line = self._lines.readline()
         if not line:
             raise ConnectionError("the service has closed the connection")
@@ -51,12 +51,12 @@ class StreamClient:
         return answer
 
     def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        """Send one message and wait for the next answer."""
+        """Send one message; return the next answer."""
         self.send(message)
         return self.receive()
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._lines.close()
         self._socket.close()
 

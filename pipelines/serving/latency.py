@@ -18,7 +18,7 @@ class Latencies:
         self._counts = np.zeros(BINS, dtype=np.int64)
 
     def add(self, seconds: float) -> None:
-        """Count one."""
+        """Count a duration."""
         bin_ = int(math.log(max(seconds, SHORTEST) / SHORTEST) / math.log(GROWTH))
         self._counts[min(bin_, BINS - 1)] += 1
 
@@ -26,7 +26,7 @@ class Latencies:
         return int(self._counts.sum())
 
     def percentile(self, percent: float) -> float:
-        """Seconds that `percent` of the durations stay below; NaN if there is none."""
+        """Return the percentile of the durations, s; NaN if there is none."""
         total = len(self)
         if total == 0:
             return math.nan

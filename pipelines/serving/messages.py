@@ -54,13 +54,13 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class SensorReset:
-    """Asks to forget the number of one sensor, whose next frame may have any."""
+    """Request to forget the number of one sensor, whose next frame may have any."""
 
     sensor: str
 
 
 def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | SensorReset | Request:
-    """What a line says. Raises `InputError` naming the field and what was expected."""
+    """Read a line. Raises `InputError` naming the field and what was expected."""
     if len(line) > settings.max_message:
         raise InputError(f"message: expected at most {settings.max_message} bytes")
     try:
@@ -84,7 +84,7 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Senso
 
 
 def tracks_message(tracks: Tracks) -> dict[str, Any]:
-    """The answer to a frame: its tracks in world coordinates, with the columns of track files."""
+    """Return the answer to a frame: the tracks in world coordinates, with the columns of track files."""
     boxes, covariance = tracks.boxes, tracks.position_covariance
     numbers = np.column_stack(
         [
@@ -101,24 +101,24 @@ def tracks_message(tracks: Tracks) -> dict[str, Any]:
 
 
 def late_message(newest: float) -> dict[str, Any]:
-    """The answer to a frame that came too late; `newest`: time of the tracks, s."""
+    """Return the answer to a frame that came too late; `newest`: time of the tracks, s."""
     return {"type": "late", "timestamp": newest}
 
 
 def unconfirmed_message(timestamp: float) -> dict[str, Any]:
-    """The answer to a frame whose time, s, is far from all before."""
+    """Return the answer to a frame whose time, s, is far from all before."""
     text = f"timestamp: {timestamp:.3f} s is far from the newest frame; left out, unless the next one agrees"
     return {"type": "unconfirmed", "message": text}
 
 
 def about(message: FrameMessage) -> dict[str, Any]:
-    """The fields by which a client knows its frame again."""
+    """Return the fields that identify a frame for its client."""
     known = {"sensor": message.frame.sensor, "frame_timestamp": message.frame.timestamp}
     return known if message.seq is None else {"seq": message.seq, **known}
 
 
 def encode(message: Mapping[str, Any]) -> bytes:
-    """One line."""
+    """Return the line of a message."""
     return json.dumps(message, allow_nan=False, separators=(",", ":")).encode() + b"\n"
 
 
@@ -135,7 +135,7 @@ class LineSplitter:
         return len(self._unfinished)
 
     def feed(self, piece: bytes) -> Iterator[bytes | None]:
-        """Take in the next piece; the lines that end in it, without empty ones."""
+        """Take in the next piece; yield the lines that end in it, without empty ones."""
         *ends, rest = piece.split(b"\n")
         for end in ends:
             self._add(end)
@@ -143,7 +143,7 @@ class LineSplitter:
         self._add(rest)
 
     def finish(self) -> Iterator[bytes | None]:
-        """The unfinished line, if there is one: at the end of all pieces."""
+        """Yield the unfinished line, if there is one, at the end of all pieces."""
         line = None if self._too_long else bytes(self._unfinished)
         self._unfinished, self._too_long = bytearray(), False
         if line is None or line.strip():

@@ -1,4 +1,4 @@
-"""The numbers of frames: which were taken in, which wait, and which are safe in a state file.
+"""Numbers of frames: taken in, held, and covered by a state file.
 
 A client may send a frame again whenever it is unsure; each is taken in once. Numbers of a sensor grow, with gaps where
 the client left some out. Frames that are held back for reordering may go in after higher numbers of their sensor; those
@@ -30,31 +30,31 @@ class Numbering:
         self._unconfirmed: dict[str, int] = {}  # the latest frame left out until the next one agrees
 
     def known(self, sensor: str, number: int) -> Known | None:
-        """Whether this frame was judged before, None for a new one."""
-        if self._unconfirmed.get(sensor) == number:  # or it would bear witness to itself
+        """Return how this frame was judged before, None for a new one."""
+        if self._unconfirmed.get(sensor) == number:  # else it would confirm itself
             return "unconfirmed"
         if number in self._held.get(sensor, ()):
             return "taken"
         return "taken" if number <= self.last.get(sensor, -1) and number not in self._open.get(sensor, ()) else None
 
     def hold(self, sensor: str, number: int) -> None:
-        """A frame waits for its turn."""
+        """Note a frame that waits for its turn."""
         self._held.setdefault(sensor, set()).add(number)
 
     def release(self, sensor: str, number: int) -> None:
-        """Its turn has come."""
+        """Note that its turn has come."""
         held = self._held.get(sensor, set())
         held.discard(number)
         if not held:
             self._held.pop(sensor, None)
 
     def take(self, sensor: str, number: int) -> list[str]:
-        """A frame was taken in, or left out for good; the sensors that are forgotten for it."""
+        """Note a frame that was taken in, or left out for good; return the sensors that are forgotten for it."""
         self.taken[sensor] += 1
         still = self._open.get(sensor, set())
         if number in still:
             still.discard(number)
-        elif number > self.last.get(sensor, -1):  # the client goes on: what it has not sent again it won't
+        elif number > self.last.get(sensor, -1):  # the client goes on, and will not send the others again
             still.clear()
         if not still:
             self._open.pop(sensor, None)
@@ -66,26 +66,26 @@ class Numbering:
         return forgotten
 
     def leave_out(self, sensor: str, number: int) -> None:
-        """A frame was left out unless the next one agrees."""
+        """Note a frame that was left out unless the next one agrees."""
         self._unconfirmed.pop(sensor, None)
         self._unconfirmed[sensor] = number
         if len(self._unconfirmed) > self._max_sensors:
             del self._unconfirmed[next(iter(self._unconfirmed))]
 
     def forget(self, sensor: str) -> None:
-        """A sensor begins anew, with any number."""
+        """Forget the numbers of a sensor, whose next frame may have any."""
         for numbers in (self.last, self.taken, self._held, self._open, self._unconfirmed):
             numbers.pop(sensor, None)
 
     def durable(self) -> dict[str, int]:
-        """By sensor, the number up to which all is settled: a client goes on after it from the present state."""
+        """Return by sensor the number up to which all frames are settled: after it a client goes on from the state."""
         return {
             sensor: min([last, *(n - 1 for n in self._held.get(sensor, set()) | self._open.get(sensor, set()))])
             for sensor, last in self.last.items()
         }
 
     def state(self) -> dict[str, Any]:
-        """As plain values; frames that are held are open in it."""
+        """Return the state as plain values; held frames are open in it."""
         unsettled = {
             sensor: sorted(n for n in self._held.get(sensor, set()) | self._open.get(sensor, set()) if n < last)
             for sensor, last in self.last.items()
@@ -98,7 +98,7 @@ class Numbering:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a state; nothing is held."""
+        """Go on from a state, without held frames."""
         self.last, self.taken = dict(state["last"]), Counter(state["taken"])
         self._open = {sensor: set(numbers) for sensor, numbers in state["open"].items()}
         self._unconfirmed = dict(state["unconfirmed"])

@@ -1,4 +1,4 @@
-"""Frames of several sensors, that arrive as they please, in order of time."""
+"""Puts the frames of several sensors in order of time."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ T = TypeVar("T")
 class Reordering(Generic[T]):
     """Holds frames back until the newest one is `hold` s younger, and at most `max_held` of them.
 
-    So no frame waits longer than it takes the stream to advance by `hold`, and memory is bounded; a frame that comes
-    later still is passed on at once, and left to the tracker. So is a frame further than `max_jump` s from the newest
-    one, after all that is held: the newest time stays until `set_clock` says that the clock was set.
+    No frame waits longer than the stream takes to advance by `hold`. A frame that comes later still is passed on at
+    once. So is a frame further than `max_jump` s from the newest one, after all held frames; the newest time then stays
+    until `set_clock`.
     """
 
     def __init__(self, hold: float, max_held: int, max_jump: float = math.inf) -> None:
@@ -28,11 +28,11 @@ class Reordering(Generic[T]):
         return len(self._heap)
 
     def jumps(self, timestamp: float) -> bool:
-        """Whether a time is too far from the newest one, s, to be believed at once."""
+        """Return True for a time, s, further than `max_jump` from the newest one."""
         return self.newest > -math.inf and abs(timestamp - self.newest) > self._max_jump
 
     def push(self, timestamp: float, item: T) -> list[T]:
-        """Take in one; those whose turn has come, in order of time and, at one time, of arrival."""
+        """Take in an item; return those whose turn has come, in order of time and, at one time, of arrival."""
         if self.jumps(timestamp):
             return [*self.flush(), item]
         self.newest = max(self.newest, timestamp)
@@ -43,9 +43,9 @@ class Reordering(Generic[T]):
         return due
 
     def flush(self) -> list[T]:
-        """All that are held, in order of time."""
+        """Release all items, in order of time."""
         return [heapq.heappop(self._heap)[2] for _ in range(len(self._heap))]
 
     def set_clock(self, timestamp: float) -> None:
-        """Count as the newest time from now on, s; minus infinity for none."""
+        """Set the newest time, s; minus infinity for none."""
         self.newest = timestamp

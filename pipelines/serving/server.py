@@ -26,9 +26,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from pipelines.serving.address import Address
 from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.messages import LineSplitter, encode
+from pipelines.serving.settings import Address
 from pipelines.serving.stopping import StopRequest
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError

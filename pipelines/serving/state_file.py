@@ -2,11 +2,11 @@
 
     saga-fg state 1                  the format and its version
     9f86d0...                        SHA-256 of all that follows, in hexadecimal
-    {"version": ...}                 the header: plain JSON, which says what the state is of
+    {"version": ...}                 the header: version, method and configuration, plain JSON
     [null, 1.5, ...]                 the nodes of the tree of values, JSON (see `pipelines.serving.value_tree`)
     ...                              the bytes of its arrays
 
-The sum finds damage, not forgery: whoever can write the file decides what the service believes.
+The sum finds damage, not forgery: who can write the file decides the state of the service.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def write_state(path: Path, header: Mapping[str, str], state: Any) -> None:
 
 
 def read_state(path: Path, header: Mapping[str, str]) -> Any:
-    """The state that was written with the same header.
+    """Return the state that was written with the same header.
 
     Raises `InputError` for a file that cannot be read, is damaged, or holds the state of something else.
     """
@@ -71,7 +71,7 @@ def read_state(path: Path, header: Mapping[str, str]) -> Any:
         return read_tree(json.loads(nodes), arrays)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except Exception as error:  # what constructors say of values that another program has put together
+    except Exception as error:  # of constructors, for values of another program
         raise InputError(f"{path}: expected a state of this version: {type(error).__name__}: {error}") from error
 
 

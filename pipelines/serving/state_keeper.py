@@ -23,13 +23,13 @@ log = logging.getLogger(__name__)
 class StateKeeper:
     """Writes the state of `stream` to `path` every `every` s in which something happened, and at the end.
 
-    header: what the state is of; a file with another one is refused
+    header: version, method and configuration; a file with another header is refused
 
-    No other keeper may have the file meanwhile: a lock beside it, `.NAME.lock`, is held from `restore` to `stop`,
-    and by the system no longer than the process lives.
+    A lock beside the file, `.NAME.lock`, keeps other keepers away from `restore` to `stop`, and no longer than the
+    process lives.
 
-    The stream waits while its state is collected, not while it is written. A disk that is full is a warning, and seen
-    in the stream's status; the state is kept again once there is room.
+    The stream waits while its state is collected, not while it is written. A full disk is a warning, and shown in the
+    stream's status; writing is tried again.
     """
 
     def __init__(self, stream: StreamTracker[Any], path: Path, every: float, header: Mapping[str, str]) -> None:
@@ -47,21 +47,29 @@ class StateKeeper:
         self._lock: int | None = None
 
     def restore(self) -> bool:
-        """Let the stream go on from the file; False if there is none yet.
+        """Let the stream go on from the file; return False if there is none yet.
 
-        Raises `InputError` for a file that is no state of this configuration, damaged, or that of a service which runs,
-        and for a place that one may not write to.
+        Raises `InputError` for a damaged file, one of another configuration or of a service that runs, and for a place
+        that is not writable.
         """
         check_writable(self._path)
         self._lock = _locked(self._path)
-        try:
-            return self._restore()
-        except InputError:
-            self.release()
-            raise
+        there = self._path.exists()
+        if there:
+            try:
+                self._stream.restore(read_state(self._path, self._header))
+            except Exception as error:  # whatever values bring about that do not fit each other
+                self.release()
+                if isinstance(error, InputError):
+                    raise
+                text = f"{self._path}: expected a state that fits: {type(error).__name__}: {error}"
+                raise InputError(text) from error
+            self._version = self._stream.version
+        self._stream.keeper = self
+        return there
 
     def start(self) -> None:
-        """Begin to write; nobody else may write this file."""
+        """Begin to write."""
         self.clear_leftovers()
         self._thread.start()
 
@@ -73,17 +81,17 @@ class StateKeeper:
         self.release()
 
     def release(self) -> None:
-        """Let go of the file, as it is."""
+        """Release the lock."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
     def clear_leftovers(self) -> None:
-        """Remove what a killed process has left half-written."""
+        """Remove half-written files of a killed process."""
         remove_leftovers(self._path.parent, of=self._path.name)
 
     def save(self) -> bool:
-        """Write the state unless it is on the disk already; whether it is there now."""
+        """Write the state unless it is on the disk already; return True if it is there now."""
         with self._writing:
             try:
                 if self._stream.version == self._version:
@@ -98,23 +106,9 @@ class StateKeeper:
             return True
 
     def status(self) -> dict[str, Any]:
-        """Age of the file in s (None: not written by this process) and what went wrong with the latest one."""
+        """Return the age of the file in s (None: not written by this process) and the error of the latest attempt."""
         age = None if self._written_at is None else round(time.monotonic() - self._written_at, 3)
         return {"age": age, "error": self._error}
-
-    def _restore(self) -> bool:
-        there = self._path.exists()
-        if there:
-            state = read_state(self._path, self._header)
-            try:
-                self._stream.restore(state)
-            except Exception as error:  # the values fit each other no more than their checksum shows
-                raise InputError(
-                    f"{self._path}: expected a state that fits: {type(error).__name__}: {error}"
-                ) from error
-            self._version = self._stream.version
-        self._stream.keeper = self
-        return there
 
     def _run(self) -> None:
         while not self._stopping.wait(self._every):
@@ -129,7 +123,7 @@ class StateKeeper:
 
 
 def _locked(path: Path) -> int:
-    """A descriptor that holds the lock of a state file. Raises `InputError` if somebody else does."""
+    """Lock a state file; return the descriptor that holds the lock. Raises `InputError` if another process does."""
     final = path.resolve()
     try:
         lock = os.open(final.with_name(f".{final.name}.lock"), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as a request to finish, with a bound on how long that may take."""
+"""SIGINT and SIGTERM as a request to finish within a bounded time."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ SAVING = 1.0  # s
 
 
 class StopRequest:
-    """A context in which SIGINT and SIGTERM do not interrupt but ask to stop; `number` is the first one's.
+    """A context in which SIGINT and SIGTERM do not interrupt but request to stop; `number`: of the first signal.
 
-    timeout  time to finish in, s; then the process ends, whatever its other threads are doing
-    save     keeps what can be kept before that; `SAVING` s later the process ends all the same
-    clear    removes what must not be left behind by that
+    timeout  time to finish, s; then the process ends, whatever its other threads are doing
+    save     called before that end, for at most `SAVING` s
+    clear    called last, to remove unfinished files
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class StopRequest:
         self._before: dict[int, object] = {}
 
     def notify(self, callback: Callable[[], object]) -> None:
-        """Call this when asked to stop, in a signal handler; at once if that has happened."""
+        """Call `callback` on a request to stop, in a signal handler; at once if there was one."""
         self._callbacks.append(callback)
         if self.number is not None:
             callback()
@@ -43,7 +43,7 @@ class StopRequest:
     def __enter__(self) -> Self:
         threading.Thread(target=self._watch, name="stop", daemon=True).start()
         for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._asked)
+            self._before[number] = signal.signal(number, self._request)
         return self
 
     def __exit__(
@@ -54,7 +54,7 @@ class StopRequest:
         for number, before in self._before.items():
             signal.signal(number, before)  # type: ignore[arg-type]
 
-    def _asked(self, number: int, frame: FrameType | None) -> None:
+    def _request(self, number: int, frame: FrameType | None) -> None:
         if self.number is None:
             self.number = number
             self._requests.put(number)

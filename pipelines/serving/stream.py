@@ -1,4 +1,4 @@
-"""One stream of messages into one tracker: what is done with a line, whatever it came through."""
+"""One stream of messages into one tracker, and the answers to each line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from pipelines.process import resident_memory
 from pipelines.serving.latency import Latencies
@@ -25,9 +25,10 @@ from pipelines.serving.messages import (
 )
 from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
-from pipelines.serving.session_tracker import SessionTracker
 from pipelines.serving.settings import StreamSettings
+from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
+from saga_fg.tracking import TimeVerdict
 
 if TYPE_CHECKING:
     from pipelines.serving.state_keeper import StateKeeper
@@ -43,6 +44,28 @@ COUNTED = (
 )
 
 
+class StreamedTracker(OnlineTracker, Protocol):
+    """A tracker that judges the times of frames, and whose state can be kept: `Tracker` and `GreedyTracker`."""
+
+    @property
+    def time_verdict(self) -> TimeVerdict:
+        """Judgement of the latest frame's time."""
+        ...
+
+    @property
+    def max_jump(self) -> float:
+        """Distance from the newest time, s, beyond which a frame has to be confirmed by another."""
+        ...
+
+    def snapshot(self) -> Any:
+        """Return the state as a tree of values."""
+        ...
+
+    def restore(self, snapshot: Any) -> None:
+        """Go on from a snapshot of a tracker of the same settings."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class _Held(Generic[Client]):
     message: FrameMessage
@@ -51,7 +74,7 @@ class _Held(Generic[Client]):
 
 
 class StreamTracker(Generic[Client]):
-    """Takes lines of any number of clients and says who is to be answered what.
+    """Takes lines of any number of clients and returns the answers with the clients they are for.
 
     new_tracker  makes a tracker; called at the start, on a reset, and after repeated internal errors
     settings     limits of the stream
@@ -62,7 +85,7 @@ class StreamTracker(Generic[Client]):
     connection, or a killed service that kept its state, a client sends again what may be lost. One thread at a time.
     """
 
-    def __init__(self, new_tracker: Callable[[], SessionTracker], settings: StreamSettings | None = None) -> None:
+    def __init__(self, new_tracker: Callable[[], StreamedTracker], settings: StreamSettings | None = None) -> None:
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
         self.latencies = Latencies()
@@ -81,9 +104,9 @@ class StreamTracker(Generic[Client]):
         self._lock = threading.Lock()
 
     def handle(self, line: bytes | None, client: Client, received: float | None = None) -> list[tuple[Client, Answer]]:
-        """The answers to one line of a client, and to held frames whose turn has come with it.
+        """Return the answers to one line of a client, and to held frames whose turn has come with it.
 
-        line: None stands for one that was too long; received: when it was read, by `time.monotonic()`
+        line: None for one that was too long; received: time of reading, by `time.monotonic()`
         """
         if line is not None and not line.strip():
             return []
@@ -100,12 +123,12 @@ class StreamTracker(Generic[Client]):
         return answers
 
     def flush(self) -> list[tuple[Client, Answer]]:
-        """Take in all frames that are held back, at the end of a stream."""
+        """Take in all frames that are held back, at the end of a stream; return their answers."""
         with self._lock:
             return self._flush()
 
     def status(self) -> Answer:
-        """Counts since the start, latencies of frames in ms, memory in MB."""
+        """Return the counts since the start, latencies of frames in ms, memory in MB."""
         milliseconds = {
             f"p{percent:g}": round(1e3 * self.latencies.percentile(percent), 3)
             for percent in (50, 90, 99, 99.9)
@@ -125,10 +148,7 @@ class StreamTracker(Generic[Client]):
         }
 
     def state(self) -> tuple[dict[str, Any], dict[str, int], int]:
-        """All that is to be kept, as a tree of values; the number of each sensor that it is good for; its version.
-
-        Frames that are held are not in it.
-        """
+        """Return the state (without held frames) as a tree of values, the last number of each sensor, the version."""
         with self._lock:
             state = {
                 "tracker": self._tracker.snapshot(),
@@ -148,7 +168,7 @@ class StreamTracker(Generic[Client]):
             self._durable = self._numbering.durable()
 
     def made_durable(self, durable: dict[str, int]) -> None:
-        """A state with these numbers is on the disk: answers say so from now on."""
+        """Note that a state with these numbers is on the disk, for the answers from now on."""
         self._durable = durable
 
     def _handle(self, line: bytes | None, client: Client, received: float) -> list[tuple[Client, Answer]]:
@@ -213,7 +233,7 @@ class StreamTracker(Generic[Client]):
         return held.client, answer
 
     def _tracked(self, message: FrameMessage) -> Answer:
-        """Take in one frame. Raises what the tracker raises."""
+        """Take in one frame. Raises the errors of the tracker."""
         frame, number = message.frame, message.seq
         tracks = self._tracker.step(frame)
         verdict = self._tracker.time_verdict
@@ -242,7 +262,7 @@ class StreamTracker(Generic[Client]):
         return tracks_message(tracks) | clock | self._about(message)
 
     def _about(self, message: FrameMessage) -> Answer:
-        """By what a client knows its frame again, and how far its frames are safe."""
+        """Return the fields that identify a frame for its client, and the last number of its sensor on the disk."""
         known = about(message)
         if self.keeper is not None and message.seq is not None:
             known["durable_seq"] = self._durable.get(message.frame.sensor, -1)
@@ -253,7 +273,7 @@ class StreamTracker(Generic[Client]):
         return {"type": "error", "message": str(error), "number": self.counts["messages"]}
 
     def _failed(self, error: Exception) -> Answer:
-        """Count an error that is no fault of the message, and answer it; after some in a row, begin anew."""
+        """Count and answer an error that is no fault of the message; after several in a row, begin anew."""
         if self._log_limit.due(_origin(error)):
             log.error("message %d: internal error, the service goes on", self.counts["messages"], exc_info=error)
         self.counts["failures"] += 1
@@ -267,12 +287,12 @@ class StreamTracker(Generic[Client]):
         return {"type": "error", "message": text, "number": self.counts["messages"]}
 
     def _forget(self, sensor: str) -> None:
-        """The number of a sensor, and how far its frames were safe."""
+        """Forget the numbers of a sensor."""
         self._numbering.forget(sensor)
         self._durable.pop(sensor, None)
 
     def _begin_anew(self) -> None:
-        """A fresh tracker; `seq` goes on."""
+        """Begin with a fresh tracker; `seq` goes on."""
         self._tracker = self._new_tracker()
         self._held.set_clock(-math.inf)
         self._failed_in_a_row = 0
@@ -280,7 +300,7 @@ class StreamTracker(Generic[Client]):
 
 
 def _origin(error: Exception) -> tuple[str, int]:
-    """Kind of an error, and the line it comes from."""
+    """Return the type of an error, and the line it comes from."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

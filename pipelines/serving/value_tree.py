@@ -1,12 +1,11 @@
 """Trees of plain values as JSON and raw arrays, and back, without pickle: nothing in them can run code.
 
 A tree is made of None, bool, int, float (infinite and NaN too), str, tuple, list, dict, NumPy arrays and scalars of
-numbers, truth values and texts, and objects of `saga_fg` and `factors`. As JSON it is a list of nodes in
-which a node names its parts by their places, all of them before its own; the last node is the root. A value that is
-referred to twice is one node.
+numbers, truth values and texts, and objects of `saga_fg` and `factors`. As JSON it is a list of nodes;
+a node refers to its parts by their places before its own, and the last node is the root. A shared value is one node.
 
-Objects are dataclasses and named tuples; those whose class is loaded already are made again, by its constructor, which
-checks what it is given.
+Objects are dataclasses and named tuples. They are made again by the constructors of their classes, which check their
+arguments; classes that are not loaded are refused.
 """
 
 from __future__ import annotations
@@ -82,7 +81,7 @@ class TreeWriter:
 
 
 def read_tree(nodes: list[Any], arrays: bytes) -> Any:
-    """The value that was written. Raises what its constructors raise, and `InputError` for nodes of no kind."""
+    """Return the value that was written. Raises `InputError` for unknown nodes, and the errors of constructors."""
     values: list[Any] = []
     for node in nodes:
         values.append(_value(node, values, arrays))
@@ -135,7 +134,7 @@ def _read_array(
 
 
 def _class(module: str, name: str) -> type:
-    """A class of ours that is loaded."""
+    """Return a record class of `PACKAGES` that is loaded."""
     cls = getattr(sys.modules.get(module), name, None) if module.split(".")[0] in PACKAGES else None
     if not isinstance(cls, type) or cls.__module__ != module or not _is_record(cls):
         raise InputError(f"state: expected a dataclass of {' or '.join(PACKAGES)}, got {module}.{name}"[:200])
@@ -143,12 +142,12 @@ def _class(module: str, name: str) -> type:
 
 
 def _is_record(cls: type) -> bool:
-    """Whether objects of a class are made of named fields: of a dataclass or a named tuple."""
+    """Return True for dataclasses and named tuples."""
     return is_dataclass(cls) or (issubclass(cls, tuple) and hasattr(cls, "_fields"))
 
 
 def _attributes(value: Any) -> dict[str, Any]:
-    """What an object is made again from."""
+    """Return the arguments of the constructor that makes an object again."""
     if isinstance(value, tuple):
         return dict(zip(type(value)._fields, value, strict=True))  # type: ignore[attr-defined]
     return {field.name: getattr(value, field.name) for field in fields(value) if field.init}

@@ -36,7 +36,14 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
-from saga_fg.slam.mapping import LandmarkMapper, MapperSettings, MeasuredMotion, Sighting, Sightings, pose_key
+from saga_fg.slam.mapping import (
+    AssociatedObservation,
+    LandmarkMapper,
+    LandmarkObservations,
+    MapperSettings,
+    MeasuredMotion,
+    pose_key,
+)
 from saga_fg.types.landmark import Landmark, Observation
 
 OdometrySource = Literal["lidar", "oxts"]
@@ -92,7 +99,7 @@ class LidarSlam:
     online: Trajectory
     covariances: FloatArray
     landmarks: Sequence[Landmark]
-    observations: Sequence[Sighting]
+    observations: Sequence[AssociatedObservation]
     extents: Sequence[FloatArray]
     loops: Sequence[LoopClosure]
     clouds: Sequence[FloatArray]
@@ -131,7 +138,7 @@ def lidar_slam(
         if s.landmarks:
             seen.append(observe_landmarks(points, s.observations, detectors))
             mapper.observe([each.observation for each in seen[-1]])
-        online.append(mapper.estimate.pose.matrix())
+        online.append(mapper.ekf.pose.matrix())
         if progress is not None:
             progress("landmarks", k + 1, len(drive.points))
     landmark_map = mapper.map()
@@ -139,11 +146,11 @@ def lidar_slam(
     loops = find_loops(clouds, landmark_map.world_T_pose, s.loops) if s.loop_closures else []
     count = len(drive.keyframes)
     certain = [mark for mark in landmark_map.landmarks if mark.confirmed]
-    sightings, closed = known_providers(certain, landmark_map.sightings, loops, range(count), s.robust_scale)
+    observations, closed = known_providers(certain, landmark_map.observations, loops, range(count), s.robust_scale)
     solver = BatchSolver()
     for k, (time, place) in enumerate(zip(scans.timestamps[drive.keyframes], landmark_map.world_T_pose, strict=True)):
         motion, covariance = motions[k - 1] if k else (place, _START)
-        solver.step(time, [MeasuredMotion(motion, covariance, place), sightings, closed, *providers])
+        solver.step(time, [MeasuredMotion(motion, covariance, place), observations, closed, *providers])
     solution = solver.solve()
     world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
     return LidarSlam(
@@ -152,8 +159,8 @@ def lidar_slam(
         _trajectory(scans, drive.carried(world_T_lidar)),
         _trajectory(scans, drive.carried(np.array(online))),
         np.array([solution.marginal(pose_key(k)) for k in range(count)]),
-        sightings.landmarks(solution, s.mapper.confirm),
-        landmark_map.sightings,
+        observations.landmarks(solution, s.mapper.confirm),
+        landmark_map.observations,
         [each.extent for scan in seen for each in scan],
         loops,
         clouds,
@@ -183,18 +190,18 @@ class Loops:
 
 def known_providers(
     landmarks: Sequence[Landmark],
-    sightings: Sequence[Sighting],
+    observations: Sequence[AssociatedObservation],
     loops: Sequence[LoopClosure],
     epochs: Sequence[int],
     robust_scale: float,
-) -> tuple[Sightings, Loops]:
+) -> tuple[LandmarkObservations, Loops]:
     """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
     robust, start = Robust("geman-mcclure", robust_scale), {mark.number: mark.state for mark in landmarks}
     seen: dict[int, list[tuple[int, Observation]]] = {}
-    for sighting in sightings:
-        if sighting.landmark in start:
-            seen.setdefault(epochs[sighting.pose], []).append((sighting.landmark, sighting.observation))
-    return Sightings(seen, start, robust), Loops(loops, epochs, robust)
+    for one in observations:
+        if one.landmark in start:
+            seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
+    return LandmarkObservations(seen, start, robust), Loops(loops, epochs, robust)
 
 
 def _trajectory(scans: ScanSequence, world_T_lidar: FloatArray) -> Trajectory:

@@ -45,7 +45,7 @@ def landmark_row(
 def landmark_rows(landmarks: Iterable[Landmark]) -> list[dict[str, Any]]:
     """Return the content of landmarks.json for a map."""
     return [
-        landmark_row(mark.number, mark.kind.name, mark.kind.coordinates(mark.state), mark.covariance, mark.sightings)
+        landmark_row(mark.number, mark.kind.name, mark.kind.coordinates(mark.state), mark.covariance, mark.observations)
         for mark in landmarks
     ]
 

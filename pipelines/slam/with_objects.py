@@ -87,8 +87,8 @@ def with_objects(
     )
     if lag is not None:
         observed: list[list[Observation]] = [[] for _ in rows]
-        for sighting in result.observations:
-            observed[at[sighting.pose]].append(sighting.observation)
+        for one in result.observations:
+            observed[at[one.pose]].append(one.observation)
         online = estimate_online(
             seen, odometry, new_tracker(), lag, s.objects, start, observed, s.mapper, new_providers()
         )

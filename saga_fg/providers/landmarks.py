@@ -11,8 +11,8 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import EGO_POSE, LANDMARK
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import Positive, Settings, setting
@@ -21,15 +21,15 @@ from saga_fg.types.landmark import Observation
 
 @dataclass(frozen=True)
 class Landmarks(Settings):
-    """Adds sightings of landmarks (`frame.ego.landmarks`), and each landmark when it is first seen.
+    """Add observations of landmarks (`frame.ego.landmarks`), and each landmark when it is first seen.
 
     Which one is seen is known; its kind is the observation's (`saga_fg.slam.mapping`).
     """
 
     labels: tuple[str, ...] = setting(
-        (), "detections in the vehicle's frame with one of these labels are sightings of a point, one point a label"
+        (), "detections in the vehicle's frame with one of these labels are observations of a point, one point a label"
     )
-    deviation: Positive = setting(0.3, "standard deviation of such a sighting, m")
+    deviation: Positive = setting(0.3, "standard deviation of such an observation, m")
     name: str = setting("landmarks", "what it is called in messages")
 
     def factors(self, view: GraphView) -> Additions:
@@ -41,7 +41,7 @@ class Landmarks(Settings):
         known, world_T_pose = view.static(LANDMARK), view.state(pose.key).matrix()
         new: dict[int, NewVariable] = {}
         factors: list[Factor] = []
-        for name, seen in self._sightings(view, planar=pose.dim == 3):
+        for name, seen in self._observations(view, planar=pose.dim == 3):
             kind = seen.kind
             if name not in known and name not in new:
                 start = kind.initialise(world_T_pose, seen.value)
@@ -51,7 +51,7 @@ class Landmarks(Settings):
             factors += [given] if isinstance(given, gtsam.NonlinearFactorGraph) else given
         return Additions(list(new.values()), factors)
 
-    def _sightings(self, view: GraphView, planar: bool) -> Iterator[tuple[int, Observation]]:
+    def _observations(self, view: GraphView, planar: bool) -> Iterator[tuple[int, Observation]]:
         frame = view.frame
         assert frame is not None
         if frame.ego is not None:

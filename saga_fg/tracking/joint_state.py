@@ -214,14 +214,14 @@ class JointTrackState:
         """What providers are told from now on; positions are from `origin` (2,)."""
         estimator = self._estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.hear(frame, origin)
+            estimator.set_frame(frame, origin)
             self._changed()
 
     def ask_providers(self) -> None:
         """Let users' providers add their factors."""
         estimator = self._estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.ask()
+            estimator.ask_providers()
             self._changed()
 
     @property
@@ -235,7 +235,7 @@ class JointTrackState:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
         estimator = self._estimator
         if isinstance(estimator, JointKalmanFilter):
-            return local_pose(estimator.beside)
+            return local_pose(estimator.auxiliary)
         return local_pose(estimator.graph()) if isinstance(estimator, GraphFilter) else None
 
     def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:

@@ -14,7 +14,7 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 from saga_fg.types.sensor import Sensor
-from saga_fg.types.signal import SIGHTINGS
+from saga_fg.types.signal import COLOUR_LABELS
 
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 
@@ -47,7 +47,7 @@ def observe(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) 
     detections = sensor.in_world(frame)
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
-    objects = ~of_classes(label, SIGHTINGS)  # the colours of lights are not objects of their own
+    objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
     keep = np.flatnonzero(objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0]))
     names = ("nms_distance", "weak_nms_distance", "weak_nms_ratio", "cross_class_nms_iou")
     *limits, overlap = class_values(classes, ClassSettings, label[keep], *names)

@@ -2,7 +2,7 @@
 
 Nodes of the roadside stand still; their places start where the map has them, as uncertain as the map, and are corrected
 by whatever is seen: of a light itself, and through the interactions of the vehicles that heed a line or keep a lane.
-Ids count down from -1, so that they are never those of tracks. Detections labelled `saga_fg.model.road.SIGHTINGS`
+Ids count down from -1, so that they are never those of tracks. Detections labelled `saga_fg.model.road.COLOUR_LABELS`
 report the colour of a light, of the nearest known one within reach.
 """
 
@@ -23,7 +23,7 @@ from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, WALL, RoadMap
 from saga_fg.types.sensor import Sensor
-from saga_fg.types.signal import COLOURS, SIGHTINGS, SignalSettings, colour_updated
+from saga_fg.types.signal import COLOUR_LABELS, COLOURS, SignalSettings, colour_updated
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
@@ -98,10 +98,10 @@ class Roadside:
     def heed(self, frame: Frame, sensor: Sensor, origin: FloatArray, state: JointTrackState, delay: float) -> None:
         """Take in the lights that a frame shows, as it was `delay` s ago: their colours, and where they are."""
         lights = np.flatnonzero(self.label == LIGHT)
-        if len(lights) == 0 or not of_classes(frame.detections.boxes.label, SIGHTINGS).any():
+        if len(lights) == 0 or not of_classes(frame.detections.boxes.label, COLOUR_LABELS).any():
             return
         seen = sensor.in_world(frame)
-        seen = seen.select(of_classes(seen.boxes.label, SIGHTINGS))
+        seen = seen.select(of_classes(seen.boxes.label, COLOUR_LABELS))
         R = sensor.detection_covariance(seen, sensor.origin(frame))
         position, _, P, _ = state.node(self.id[lights], self.label[lights])
         z = seen.boxes.position[:, :2] - origin
@@ -112,7 +112,7 @@ class Roadside:
         row, column = assign(cost, possible, cost.max(initial=0.0) + 1.0)
         belief = dict(self.beliefs)
         for light, sighting in zip(lights[row].tolist(), column.tolist(), strict=True):
-            colour = SIGHTINGS.index(str(seen.boxes.label[sighting]))
+            colour = COLOUR_LABELS.index(str(seen.boxes.label[sighting]))
             name = self.name[light]
             belief[name] = colour_updated(belief[name], colour, sensor.colour_accuracy)
         self.beliefs = belief

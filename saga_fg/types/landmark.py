@@ -77,11 +77,11 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Landmark:
-    """A landmark of the map: its state, the covariance (d, d) of that, and how often it was seen."""
+    """A landmark of the map: its state, the covariance (d, d) of that, and the number of its observations."""
 
     number: int
     kind: LandmarkType
     state: Any
     covariance: FloatArray
-    sightings: int
+    observations: int
     confirmed: bool

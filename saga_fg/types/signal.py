@@ -25,7 +25,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Positive, Settings, setting
 
 COLOURS = ("red", "amber", "green")
-SIGHTINGS = tuple(f"traffic_light_{colour}" for colour in COLOURS)  # labels of detections that report a colour
+COLOUR_LABELS = tuple(f"traffic_light_{colour}" for colour in COLOURS)  # labels of detections that report a colour
 LEAST_BELIEF = 1e-6  # no colour is ever ruled out
 
 

@@ -1,31 +1,37 @@
 """Labels as tables of nuScenes: a version of the dataset whose annotations are the labels.
 
     DIRECTORY/VERSION/sample_annotation.json, instance.json   made from the labels
-    DIRECTORY/VERSION/category.json                           the dataset's, with what labels need besides
-    DIRECTORY/VERSION/*.json                                  the dataset's other tables, as they are
-    DIRECTORY/maps/*                                          its map masks, which the development kit loads
+    DIRECTORY/VERSION/category.json                           the dataset's, and the categories of the labels
+    DIRECTORY/VERSION/*.json                                  copies of the dataset's other tables
+    DIRECTORY/maps/*                                          copies of its map masks, which the development kit loads
 
-so that whatever reads nuScenes reads the labels. An annotation has five fields more, which readers of the format leave
-alone: `label_score`, `label_source`, `label_quality`, `position_covariance` (xx, xy, yy, m^2) and `yaw_variance`
-(rad^2). Nobody counted points: `num_lidar_pts` is 1 where the object was detected and 0 in filled boxes.
-`visibility_token` is empty, `attribute_tokens` too. Objects of unknown size or heading are left out.
+Readers of nuScenes read them as annotations. An annotation has five additional fields: `label_score`, `label_source`,
+`label_quality`, `position_covariance` (xx, xy, yy, m^2) and `yaw_variance` (rad^2). Points are not counted:
+`num_lidar_pts` is 1 in detected boxes and 0 in filled ones. `visibility_token` and `attribute_tokens` are empty.
+Objects of unknown size or heading are left out.
 
 Schema: https://www.nuscenes.org/nuscenes#data-format.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.nuscenes.records import (
+    CATEGORY_OF_CLASS,
+    Record,
+    box_fields,
+    instance_record,
+    linked,
+    token,
+)
 from data_tools.datasets.nuscenes.tables import read_table, table_folder
 from data_tools.files.atomic_files import atomic_directory, atomic_file, write_text
 from data_tools.files.input_files import open_bytes
@@ -33,27 +39,11 @@ from data_tools.files.json_stream import open_json, parsed_json
 from data_tools.files.located import located
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle
-from saga_fg.numerics.geometry import yaw_quaternion
 from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Scene
 
-Record = dict[str, Any]
-
 LabelledObject = tuple[str, list[Record]]
 """The class of an object, and its annotations in order of time."""
-
-CATEGORY_OF_CLASS = {
-    "barrier": "movable_object.barrier",
-    "bicycle": "vehicle.bicycle",
-    "bus": "vehicle.bus.rigid",
-    "car": "vehicle.car",
-    "construction_vehicle": "vehicle.construction",
-    "motorcycle": "vehicle.motorcycle",
-    "pedestrian": "human.pedestrian.adult",
-    "traffic_cone": "movable_object.trafficcone",
-    "trailer": "vehicle.trailer",
-    "truck": "vehicle.truck",
-}
 
 
 def write_nuscenes_labels(
@@ -71,7 +61,7 @@ def write_nuscenes_labels(
 
 
 def write_label_part(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> None:
-    """Write what `merge_label_parts` needs of some scenes: a line `[class, [annotation, ...]]` an object.
+    """Write some scenes as input of `merge_label_parts`: one line `[class, [annotation, ...]]` for each object.
 
     Raises `InputError` as `write_nuscenes_labels` does.
     """
@@ -81,7 +71,7 @@ def write_label_part(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[La
 
 
 def merge_label_parts(directory: str | Path, dataroot: str | Path, version: str, parts: Iterable[str | Path]) -> None:
-    """The same as `write_nuscenes_labels`, of files that `write_label_part` has written."""
+    """Write the tables of `write_nuscenes_labels` from files that `write_label_part` has written."""
     _write_tables(directory, dataroot, version, (one for part in parts for one in _read_part(Path(part))))
 
 
@@ -94,11 +84,11 @@ def _read_part(path: Path) -> Iterator[LabelledObject]:
 
 def _objects(where: str, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> Iterator[LabelledObject]:
     """The objects of some scenes; a class that nuScenes does not have is an `InputError`."""
-    for scene, moments in scenes:
+    for scene, frames in scenes:
         with located(f"{where}: scene {scene.name}"):
-            if len(moments) != len(scene):
-                raise InputError(f"expected labels for {len(scene)} samples, got {len(moments)}")
-            for label, records in _annotations(scene, moments):
+            if len(frames) != len(scene):
+                raise InputError(f"expected labels for {len(scene)} samples, got {len(frames)}")
+            for label, records in _annotations(scene, frames):
                 if label not in CATEGORY_OF_CLASS:
                     raise InputError(f"class {label}: expected one of {', '.join(CATEGORY_OF_CLASS)}")
                 yield label, records
@@ -124,14 +114,15 @@ def _write_tables(directory: str | Path, dataroot: str | Path, version: str, obj
                 name = CATEGORY_OF_CLASS[label]
                 for record in records:
                     annotation(record)
-                instance(_instance(records, categories.setdefault(name, _token("category", name))))
+                category = categories.setdefault(name, token("label", "category", name))
+                instance(instance_record(records[0]["instance_token"], category, records))
         with open_json(source / "category.json") as file:
             known: list[Record] = parsed_json(file.read(), str(source / "category.json"))
         there = {record["token"] for record in known}
         known += [
-            {"token": token, "name": name, "description": ""}
-            for name, token in categories.items()
-            if token not in there
+            {"token": category, "name": name, "description": ""}
+            for name, category in categories.items()
+            if category not in there
         ]
         write_text(tables / "category.json", json.dumps(known) + "\n")
 
@@ -156,65 +147,43 @@ def _array(path: Path) -> Iterator[Callable[[Record], None]]:
         file.write("[]\n" if first else "\n]\n")
 
 
-def _annotations(scene: Scene, moments: Sequence[Labels]) -> list[LabelledObject]:
+def _annotations(scene: Scene, frames: Sequence[Labels]) -> list[LabelledObject]:
     """The class of each object, and its annotations in order of time, linked."""
-    of_object: dict[int, list[Record]] = defaultdict(list)
+    records: dict[int, list[Record]] = defaultdict(list)
     class_of: dict[int, str] = {}
-    for sample, moment in zip(scene.tokens, moments, strict=True):
-        tracks, boxes = moment.tracks, moment.tracks.boxes
-        whole = np.flatnonzero(np.isfinite(boxes.size).all(axis=1) & np.isfinite(boxes.yaw))
+    for sample, labels in zip(scene.tokens, frames, strict=True):
+        boxes = labels.tracks.boxes
+        rows = np.flatnonzero(np.isfinite(boxes.size).all(axis=1) & np.isfinite(boxes.yaw))
+        tracks = labels.tracks.select(rows)
         columns = zip(
-            tracks.id[whole].tolist(),
-            boxes.label[whole].tolist(),
-            boxes.position[whole].round(6).tolist(),
-            boxes.size[whole][:, [1, 0, 2]].round(6).tolist(),
-            yaw_quaternion(boxes.yaw[whole]).tolist(),
-            tracks.score[whole].tolist(),
-            moment.source[whole].tolist(),
-            moment.quality[whole].tolist(),
-            upper_triangle(tracks.position_covariance[whole]).tolist(),
-            moment.yaw_variance[whole].tolist(),
+            tracks.id.tolist(),
+            tracks.boxes.label.tolist(),
+            box_fields(tracks.boxes, 6),
+            tracks.score.tolist(),
+            labels.source[rows].tolist(),
+            labels.quality[rows].tolist(),
+            upper_triangle(tracks.position_covariance).tolist(),
+            labels.yaw_variance[rows].tolist(),
             strict=True,
         )
-        for id_, label, position, size, rotation, score, origin, quality, covariance, variance in columns:
+        for id_, label, box, score, source, quality, covariance, variance in columns:
             if class_of.setdefault(id_, label) != label:
                 raise InputError(f"sample {sample}: object {id_}: expected one class, got {class_of[id_]} and {label}")
-            of_object[id_].append(
+            records[id_].append(
                 {
-                    "token": _token("sample_annotation", sample, id_),
+                    "token": token("label", "sample_annotation", sample, id_),
                     "sample_token": sample,
-                    "instance_token": _token("instance", scene.name, id_),
+                    "instance_token": token("label", "instance", scene.name, id_),
                     "visibility_token": "",
                     "attribute_tokens": [],
-                    "translation": position,
-                    "size": size,
-                    "rotation": rotation,
-                    "num_lidar_pts": int(origin != "filled"),
+                    **box,
+                    "num_lidar_pts": int(source != "filled"),
                     "num_radar_pts": 0,
                     "label_score": score,
-                    "label_source": origin,
+                    "label_source": source,
                     "label_quality": quality,
                     "position_covariance": covariance,
                     "yaw_variance": None if variance != variance else variance,
                 }
             )
-    for records in of_object.values():
-        tokens = ["", *(record["token"] for record in records), ""]
-        for record, before, after in zip(records, tokens[:-2], tokens[2:], strict=True):
-            record |= {"prev": before, "next": after}
-    return [(class_of[id_], records) for id_, records in sorted(of_object.items())]
-
-
-def _instance(records: list[Record], category: str) -> Record:
-    return {
-        "token": records[0]["instance_token"],
-        "category_token": category,
-        "nbr_annotations": len(records),
-        "first_annotation_token": records[0]["token"],
-        "last_annotation_token": records[-1]["token"],
-    }
-
-
-def _token(*parts: object) -> str:
-    """The token of a record: a hash of what it names."""
-    return hashlib.md5("/".join(("label", *map(str, parts))).encode(), usedforsecurity=False).hexdigest()
+    return [(class_of[id_], linked(records[id_])) for id_ in sorted(records)]

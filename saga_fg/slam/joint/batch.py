@@ -44,8 +44,8 @@ def estimate_jointly(
 
     odometry: between the frames' times; new_tracker: gives a fresh tracker, which registers detections; start: first
     pose (4, 4), by default the identity; landmarks: what is observed of them at each of the n moments; new_providers:
-    gives fresh providers of other factors, asked moment by moment (`saga_fg.slam.mapping.Sightings`, where somebody
-    knows which observation is of which). Detections are in ego or sensor coordinates, or in those of the world with the
+    gives new providers of other factors, asked moment by moment (`saga_fg.slam.mapping.LandmarkObservations` for
+    landmarks of known identity). Detections are in ego or sensor coordinates, or in those of the world with the
     pose they were transformed by. Raises `InputError` where frames, odometry and landmarks do not fit together.
     """
     settings = settings or JointSettings()
@@ -64,7 +64,7 @@ def estimate_jointly(
         first = [None] if estimate is None else []
         record = list(enumerate(moments))
         estimate = _solved(record, path, [*first, standing], lanes, [seen, *new_providers()], settings)
-        estimate = replace(estimate, sightings=seen)
+        estimate = replace(estimate, observations=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate

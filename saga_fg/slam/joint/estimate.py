@@ -15,7 +15,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.joint.graph import Keyed, error_key, object_key
 from saga_fg.slam.joint.record import EgoMoment
 from saga_fg.slam.joint.standing import SlowErrors
-from saga_fg.slam.mapping import Sightings, pose_key
+from saga_fg.slam.mapping import LandmarkObservations, pose_key
 from saga_fg.types.landmark import Landmark
 
 
@@ -39,7 +39,7 @@ class JointEstimate:
     objects       n tables
     converged     whether the last step was short enough
     solution      of the graph, with the keys of `saga_fg.slam.joint.graph`
-    sightings     of landmarks, told apart by nobody else
+    observations     of landmarks, told apart by nobody else
     """
 
     timestamps: FloatArray
@@ -49,7 +49,7 @@ class JointEstimate:
     converged: bool
     solution: Solution | GraphSolution
     _record: Keyed
-    sightings: Sightings | None = None
+    observations: LandmarkObservations | None = None
 
     @cached_property
     def pose_covariances(self) -> FloatArray:
@@ -68,7 +68,7 @@ class JointEstimate:
     @cached_property
     def landmarks(self) -> list[Landmark]:
         """Those that were told apart along the path."""
-        return [] if self.sightings is None else self.sightings.landmarks(self.solution)
+        return [] if self.observations is None else self.observations.landmarks(self.solution)
 
     @cached_property
     def slow_errors(self) -> SlowErrors:

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import Sightings
+from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.types.landmark import LandmarkType, Observation
 
 Observations = Sequence[Sequence[Observation]]
 
 
-def nearest_landmarks(observations: Observations, path: FloatArray, reach: float) -> Sightings:
+def nearest_landmarks(observations: Observations, path: FloatArray, reach: float) -> LandmarkObservations:
     """Tell apart what is observed at n moments along a path (n, 4, 4); reach in m."""
     start: dict[int, Any] = {}
     places: dict[LandmarkType, dict[int, FloatArray]] = {}
@@ -36,4 +36,4 @@ def nearest_landmarks(observations: Observations, path: FloatArray, reach: float
                 start[number] = state
             known[number] = place
             seen.setdefault(moment, []).append((number, observation))
-    return Sightings(seen, start)
+    return LandmarkObservations(seen, start)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import gtsam
 
 from saga_fg.estimators.graph_solution import GraphSolution
-from saga_fg.slam.mapping import JointEstimate as LandmarkEstimate
-from saga_fg.slam.mapping import MapperSettings, Sightings, associate, landmark_key, pose_key
+from saga_fg.slam.mapping import EkfSlam, LandmarkObservations, MapperSettings, associate, landmark_key, pose_key
 from saga_fg.types.landmark import Landmark, LandmarkType, Observation
 
 
@@ -22,13 +21,13 @@ class WindowLandmarks:
         self._count: dict[int, int] = {}
         self._gone: dict[int, Landmark] = {}
 
-    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> Sightings:
+    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> LandmarkObservations:
         """Tell which landmark each observation from the moment k is of; what is of none begins one."""
         numbers = sorted(self._kinds)
         P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
         states = {n: (self._kinds[n], self._state(n, solution.values)) for n in numbers}
         pose = solution.values.atPose3(pose_key(k)).matrix()
-        pairs = associate(LandmarkEstimate(pose, P, states), observations, self._settings.gate)
+        pairs = associate(EkfSlam(pose, P, states), observations, self._settings.gate)
         start: dict[int, object] = {}
         seen: list[tuple[int, Observation]] = []
         for row, observation in enumerate(observations):
@@ -41,7 +40,7 @@ class WindowLandmarks:
             self._count[number] = self._count.get(number, 0) + 1
             self._last_seen[number] = k
             seen.append((number, observation))
-        return Sightings({k: seen}, start)
+        return LandmarkObservations({k: seen}, start)
 
     def leave(self, first: int, solution: GraphSolution) -> list[int]:
         """Forget what was seen before the moment `first`; returns the keys of the landmarks that are seen no more."""

@@ -1,4 +1,4 @@
-"""Maps of landmarks: which observation is of which, and their joint estimate with the poses."""
+"""Maps of landmarks of unknown identity, estimated jointly with the poses."""
 
 import lazy_loader
 

@@ -1,18 +1,18 @@
 from .association import associate, log_odds
-from .joint_estimate import Innovation, JointEstimate
-from .mapper import LandmarkMap, LandmarkMapper, MapperSettings, Sighting
+from .ekf_slam import EkfSlam, Innovation
+from .mapper import AssociatedObservation, LandmarkMap, LandmarkMapper, MapperSettings
 from .merging import duplicates
-from .providers import MeasuredMotion, Sightings, landmark_key, pose_key
+from .providers import LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 
 __all__ = [
+    "AssociatedObservation",
+    "EkfSlam",
     "Innovation",
-    "JointEstimate",
     "LandmarkMap",
     "LandmarkMapper",
+    "LandmarkObservations",
     "MapperSettings",
     "MeasuredMotion",
-    "Sighting",
-    "Sightings",
     "associate",
     "duplicates",
     "landmark_key",

@@ -1,18 +1,18 @@
-"""Which observation is of which landmark: gates, mutual exclusion, joint compatibility.
+"""Association of observations with landmarks: gates, mutual exclusion, joint compatibility.
 
     d^2 = r^T S^-1 r,      S = A P A^T + R      (innovation of one observation against one landmark)
 
-A pair is possible inside the gate, and where it is likelier than that a landmark not yet in the map is seen, of which
-there are `density` to expect per unit of volume:
+A pair is possible inside the gate, and where it is likelier than an observation of a landmark not yet in the map, of
+which `density` are expected per unit of volume:
 
     d^2 + log det(2 pi S)  <  -2 log density
 
-so that where the pose is badly known neighbours are not taken for each other: the observation then begins a landmark of
-its own, which is merged when more is known. Among the possible pairs the likeliest assignment is taken, each landmark
-once. Then all pairs are tested together, with the correlations that a common pose gives them: while the joint d^2 is
-outside the gate of its dimension, the pair without which it falls most is taken out (after J. Neira and J. D. Tardos,
-"Data association in stochastic mapping using the joint compatibility test", IEEE Transactions on Robotics and
-Automation 17, 2001; theirs searches all combinations).
+so that neighbours are not confused while the pose is poorly known: the observation then initiates a new landmark, which
+is merged later. The likeliest assignment among the possible pairs is chosen, each landmark once. Then all pairs are
+tested together, with the correlations that their common pose causes: while the joint d^2 is outside the gate of its
+dimension, the pair whose removal lowers it most is removed (after J. Neira and J. D. Tardos, "Data association in
+stochastic mapping using the joint compatibility test", IEEE Transactions on Robotics and Automation 17, 2001, who
+search all combinations).
 """
 
 from __future__ import annotations
@@ -23,27 +23,25 @@ import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign, gate
-from saga_fg.slam.mapping.joint_estimate import Innovation, JointEstimate
+from saga_fg.slam.mapping.ekf_slam import EkfSlam, Innovation
 from saga_fg.types.landmark import Observation
 
 
-def associate(
-    estimate: JointEstimate, observations: Sequence[Observation], probability: float
-) -> dict[int, Innovation]:
-    """Assign the observations made from the present pose to the landmarks of an estimate.
+def associate(ekf: EkfSlam, observations: Sequence[Observation], probability: float) -> dict[int, Innovation]:
+    """Assign the observations made from the present pose to the landmarks.
 
     probability: of the gates. Returns the innovation of each matched observation, by its row.
     """
-    landmarks = sorted(estimate.kinds)
+    landmarks = sorted(ekf.kinds)
     column = {landmark: j for j, landmark in enumerate(landmarks)}
     gain = np.zeros((len(observations), len(landmarks)))
     candidates: dict[tuple[int, int], Innovation] = {}
     for row, observation in enumerate(observations):
         kind = observation.kind
-        innovations = estimate.innovations(observation, (j for j in landmarks if estimate.kinds[j] == kind))
+        innovations = ekf.innovations(observation, (j for j in landmarks if ekf.kinds[j] == kind))
         if not innovations:
             continue
-        squared, spread = estimate.squared_distances(innovations)
+        squared, spread = ekf.squared_distances(innovations)
         dim = kind.variable.dim
         spread += np.linalg.slogdet(observation.covariance)[1]
         won = log_odds(squared, spread, dim, kind.density)
@@ -53,20 +51,20 @@ def associate(
             gain[row, j] = won[k]
     rows, columns = assign(-gain, gain > 0, 0.0)
     pairs = {int(i): candidates[int(i), int(j)] for i, j in zip(rows, columns, strict=True)}
-    return _compatible(estimate, pairs, probability)
+    return _compatible(ekf, pairs, probability)
 
 
 def log_odds(squared: FloatArray, log_det: FloatArray, dim: int, density: float) -> FloatArray:
-    """Twice the log odds of two being one, against their being two; squared: d^2, log_det: of S (dim, dim)."""
+    """Twice the log odds of one landmark against two different ones; squared: d^2, log_det: of S (dim, dim)."""
     return np.asarray(-2 * np.log(density) - squared - log_det - dim * np.log(2 * np.pi))
 
 
-def _compatible(estimate: JointEstimate, pairs: dict[int, Innovation], probability: float) -> dict[int, Innovation]:
+def _compatible(ekf: EkfSlam, pairs: dict[int, Innovation], probability: float) -> dict[int, Innovation]:
     """The pairs without those that contradict the others."""
     while len(pairs) > 1:
         rows = list(pairs)
         innovations = list(pairs.values())
-        S = estimate.innovation_covariance(innovations)
+        S = ekf.innovation_covariance(innovations)
         r = np.concatenate([i.r for i in innovations])
         if _squared(r, S) < gate(probability, len(r)):
             break

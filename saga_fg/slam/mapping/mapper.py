@@ -1,13 +1,12 @@
-"""SLAM with landmarks whose identities nobody tells: online, with everything smoothed again from time to time.
+"""Online SLAM with landmarks of unknown identity, smoothed from time to time.
 
-Between two smoothings the pose and the landmarks are one Gaussian (`JointEstimate`), which is what gates need: the
-innovation of an observation takes the correlation of pose and landmark into account. Every `smooth_every` observations
-all that came goes into a running graph (`saga_fg.graph`), which iSAM2 keeps smoothed, so that linearisation errors do
-not add up; the joint marginal of the newest pose and all landmarks then replaces the Gaussian. At the same time
-landmarks that turn out to be one are merged (see `merging`).
+Between two smoothings the pose and the landmarks are one Gaussian (`EkfSlam`), whose correlations the gates of
+association need. Every `smooth_every` observations all measurements since then go into a running graph
+(`saga_fg.graph`), which iSAM2 keeps smoothed, so that linearisation errors do not add up; the joint marginal of the
+newest pose and all landmarks then replaces the Gaussian, and duplicate landmarks are merged (see `merging`).
 
-How far odometry and sensor are to be believed is itself a hypothesis, and the probability of all that was measured says
-which is the better one, without any truth (Laplace's approximation at the solution x* with information matrix H):
+The evidence of the measurements compares noise models of odometry and sensor without ground truth (Laplace's
+approximation at the solution x* with information matrix H):
 
     log p(z) = -E(x*) - 1/2 log det H + D/2 log 2 pi - 1/2 sum_i log det 2 pi R_i + sum_landmarks log density
 """
@@ -22,16 +21,22 @@ from typing import Annotated, Any
 import numpy as np
 
 from factors import ResidualFactor, SolverSettings, Variable
-from saga_fg.estimators.batch_graph import BatchSolver
-from saga_fg.estimators.graph_engine import RelinearisationSettings
-from saga_fg.estimators.incremental_graph import IncrementalSmoother
+from saga_fg.estimators.batch_solver import BatchSolver
+from saga_fg.estimators.incremental_smoother import IncrementalSmoother
+from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Range, Settings, setting
 from saga_fg.slam.mapping.association import associate
-from saga_fg.slam.mapping.joint_estimate import JointEstimate
+from saga_fg.slam.mapping.ekf_slam import EkfSlam
 from saga_fg.slam.mapping.merging import duplicates
-from saga_fg.slam.mapping.providers import MeasuredMotion, Sightings, landmark_key, pose_key, sighting_factors
+from saga_fg.slam.mapping.providers import (
+    LandmarkObservations,
+    MeasuredMotion,
+    landmark_key,
+    observation_factors,
+    pose_key,
+)
 from saga_fg.types.landmark import Landmark, Observation
 
 _THRESHOLD = 1.0  # standard deviations that a variable moves before its factors are linearised anew
@@ -40,7 +45,7 @@ _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 @dataclass(frozen=True)
 class MapperSettings(Settings):
-    """How landmarks are told apart."""
+    """Association, merging and confirmation of landmarks."""
 
     gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
         0.999, "share of the true pairs that the gate of association lets through"
@@ -55,8 +60,8 @@ class MapperSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """What was observed from which pose, and the number of the landmark it was taken for."""
+class AssociatedObservation:
+    """An observation with the row of its pose and the number of the landmark that it was associated with."""
 
     pose: int
     observation: Observation
@@ -65,15 +70,15 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
-    """world_T_pose: (N, d + 1, d + 1); landmarks in the order of their numbers; sightings in the order they came."""
+    """world_T_pose: (N, d + 1, d + 1); landmarks in the order of their numbers; observations in the order they came."""
 
     world_T_pose: FloatArray
     landmarks: list[Landmark]
-    sightings: list[Sighting]
+    observations: list[AssociatedObservation]
 
 
 class LandmarkMapper:
-    """Builds a map from odometry and observations, one pose after the other.
+    """Build a map from odometry and observations, one pose after the other.
 
     mapper = LandmarkMapper(np.eye(3), 1e-6 * np.eye(3))
     mapper.observe([Observation(PointLandmark(), [9.0, 2.0], R)])
@@ -87,7 +92,7 @@ class LandmarkMapper:
     ) -> None:
         """world_T_pose: the first pose, (3, 3) in the plane or (4, 4); covariance: of its tangent."""
         self.settings = settings or MapperSettings()
-        self.estimate = JointEstimate(world_T_pose, covariance)
+        self.ekf = EkfSlam(world_T_pose, covariance)
         self._smoother = IncrementalSmoother(lag=None, settings=RelinearisationSettings(_THRESHOLD))
         self._poses = 1
         self._waiting = [MeasuredMotion(world_T_pose, covariance)]
@@ -99,26 +104,26 @@ class LandmarkMapper:
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on to the next pose by odometry: a_T_b (d + 1, d + 1), covariance of its tangent."""
-        self.estimate.move(a_T_b, covariance)
-        self._waiting.append(MeasuredMotion(a_T_b, covariance, self.estimate.pose.matrix()))
+        self.ekf.predict(a_T_b, covariance)
+        self._waiting.append(MeasuredMotion(a_T_b, covariance, self.ekf.pose.matrix()))
         self._normaliser += _log_det(covariance)
         self._poses += 1
 
     def observe(self, observations: Sequence[Observation]) -> list[int]:
-        """Take in what is seen from the present pose.
+        """Add observations from the present pose.
 
-        Returns the number of the landmark of each; what is not surely a known one begins a new one.
+        Returns the number of the landmark of each; an observation without a clear match initiates a new landmark.
         """
-        pairs = associate(self.estimate, observations, self.settings.gate)
+        pairs = associate(self.ekf, observations, self.settings.gate)
         if pairs:
-            self.estimate.update(list(pairs.values()))
+            self.ekf.update(list(pairs.values()))
         taken: list[int] = []
         for row, observation in enumerate(observations):
             if row in pairs:
                 taken.append(pairs[row].landmark)
                 continue
             self._numbers += 1
-            self.estimate.append(self._numbers, observation)
+            self.ekf.augment(self._numbers, observation)
             taken.append(self._numbers)
         self._seen.setdefault(self._poses - 1, []).extend(zip(taken, observations, strict=True))
         self._normaliser += sum(_log_det(observation.covariance) for observation in observations)
@@ -128,63 +133,67 @@ class LandmarkMapper:
         return taken
 
     def smooth(self) -> None:
-        """Smooth all poses and landmarks, and merge what turns out to be one."""
+        """Smooth all poses and landmarks, and merge duplicates."""
         self._since = 0
         if self._waiting or self._seen:
             last = self._poses - 1
             chunk = {row: list(now) for row, now in self._smoothed.get(last, {}).items()}
             for row, now in [*self._seen.items(), (last, [])]:
                 chunk.setdefault(row, []).extend(now)
-            sightings = Sightings(chunk, {n: self.estimate.state(n) for now in chunk.values() for n, _ in now})
+            observations = LandmarkObservations(chunk, {n: self.ekf.state(n) for now in chunk.values() for n, _ in now})
             first = self._poses - len(self._waiting)
             if self._waiting:
-                self._smoother.steps([(float(first + k), [one, sightings]) for k, one in enumerate(self._waiting)])
+                self._smoother.steps([(float(first + k), [one, observations]) for k, one in enumerate(self._waiting)])
             else:
-                self._smoother.extend([sightings])
+                self._smoother.extend([observations])
             self._smoothed[last] = chunk
             self._waiting, self._seen = [], {}
             self._read()
-        while merged := duplicates(self.estimate, self.settings.merge, self._apart()):
+        while merged := duplicates(self.ekf, self.settings.merge, self._seen_together()):
             changed = {
                 last: {row: [(merged.get(n, n), z) for n, z in now] for row, now in chunk.items()}
                 for last, chunk in self._smoothed.items()
                 if any(n in merged for now in chunk.values() for n, _ in now)
             }
             self._smoothed |= changed
-            self._smoother.extend([_Merged(changed, {n: self.estimate.kinds[n].variable for n in merged})])
+            self._smoother.extend([_Merged(changed, {n: self.ekf.kinds[n].variable for n in merged})])
             self._smoother.marginalise(map(landmark_key, merged))
             for number in merged:
-                del self.estimate.kinds[number]
+                del self.ekf.kinds[number]
             self._read()
 
     def log_evidence(self) -> float:
-        """log p(z) of everything measured so far, smoothed."""
+        """log p(z) of all measurements so far, smoothed."""
         self.smooth()
         solution = self._smoother.snapshot().solve(_SOLVER)
         half_log_det = float(solution.linear.eliminateMultifrontal().logDeterminant())
         free = sum(solution.values.dims().values())
-        expected = sum(float(np.log(kind.density)) for kind in self.estimate.kinds.values())
+        expected = sum(float(np.log(kind.density)) for kind in self.ekf.kinds.values())
         volume = 0.5 * free * float(np.log(2 * np.pi))
         return -solution.error - half_log_det + volume - 0.5 * self._normaliser + expected
 
     def map(self) -> LandmarkMap:
-        """Everything, smoothed."""
+        """All poses and landmarks, smoothed."""
         self.smooth()
         solver = BatchSolver(graph=self._smoother.snapshot(), settings=_SOLVER)
         seen = {row: now for chunk in self._smoothed.values() for row, now in chunk.items()}
-        sightings = [Sighting(row, observation, number) for row, now in seen.items() for number, observation in now]
+        observations = [
+            AssociatedObservation(row, observation, number) for row, now in seen.items() for number, observation in now
+        ]
         poses = np.stack([_pose(solver, row) for row in range(self._poses)])
-        return LandmarkMap(poses, Sightings(seen, {}).landmarks(solver.solve(), self.settings.confirm), sightings)
+        return LandmarkMap(
+            poses, LandmarkObservations(seen, {}).landmarks(solver.solve(), self.settings.confirm), observations
+        )
 
     def _read(self) -> None:
-        """Make the Gaussian that of the graph."""
-        numbers = sorted(self.estimate.kinds)
+        """Replace the Gaussian by the joint marginal of the graph."""
+        numbers = sorted(self.ekf.kinds)
         keys = [pose_key(self._poses - 1), *map(landmark_key, numbers)]
-        landmarks = {n: (self.estimate.kinds[n], self._smoother.state(landmark_key(n))) for n in numbers}
+        landmarks = {n: (self.ekf.kinds[n], self._smoother.state(landmark_key(n))) for n in numbers}
         P = self._smoother.joint_covariance(keys, rough=True)
-        self.estimate = JointEstimate(_pose(self._smoother, self._poses - 1), P, landmarks)
+        self.ekf = EkfSlam(_pose(self._smoother, self._poses - 1), P, landmarks)
 
-    def _apart(self) -> set[tuple[int, int]]:
+    def _seen_together(self) -> set[tuple[int, int]]:
         """Pairs of landmarks that were seen from one pose."""
         together = ({n for n, _ in now} for chunk in self._smoothed.values() for now in chunk.values())
         return {(i, j) for numbers in together for i in numbers for j in numbers if i < j}
@@ -192,11 +201,11 @@ class LandmarkMapper:
 
 @dataclass(frozen=True, eq=False)
 class _Merged:
-    """Sightings as `LandmarkMapper` keeps them, under new numbers; the old landmarks are held until they leave."""
+    """Observations under the numbers of merged landmarks; the old landmarks are held until they are marginalised."""
 
     changed: Mapping[int, Mapping[int, Sequence[tuple[int, Observation]]]]
     old: Mapping[int, Variable]
-    name: str = Sightings.name
+    name: str = LandmarkObservations.name
 
     def factors(self, view: GraphView) -> Additions:
         held = []
@@ -204,7 +213,7 @@ class _Merged:
             key = landmark_key(number)
             off = partial(variable.local, view.state(key))
             held.append(ResidualFactor((key,), (variable,), off, np.eye(variable.dim), name="held"))
-        return Additions(factors=held, named={last: sighting_factors(chunk) for last, chunk in self.changed.items()})
+        return Additions(factors=held, named={last: observation_factors(chunk) for last, chunk in self.changed.items()})
 
 
 def _pose(solver: IncrementalSmoother | BatchSolver, row: int) -> FloatArray:

@@ -1,16 +1,16 @@
-"""Landmarks that turn out to be one, begun twice while the pose was badly known.
+"""Merging of landmarks that were initiated twice while the pose was poorly known.
 
     delta_ij = l_j - l_i in the tangent,        S_ij = P_ii + P_jj - P_ij - P_ji
 
-Two of a kind may be one where d^2 = delta^T S^-1 delta is inside the gate, unless they were seen side by side from one
-pose. Alone that says little where S is large. But differences are correlated: if one pair is one landmark, the others
-are known much better. For a set of pairs the odds of being one against being two multiply, each pair given those before
-it (chain rule),
+Two of a kind may be one where d^2 = delta^T S^-1 delta is inside the gate, unless they were seen together from one
+pose. A single pair says little where S is large. But differences are correlated: if one pair is one landmark, the
+others are known much better. For a set of pairs the odds of being one against being two multiply, each pair given those
+before it (chain rule),
 
     log odds(set) = sum_k log odds( delta_k | delta_1 = 0, ..., delta_{k-1} = 0 )
 
 so that a constellation is recognised where no single landmark is. From each pair as a seed the set grows by the
-likeliest pair as long as that raises the odds; the likeliest set of all is taken, if its odds are better than even.
+likeliest pair as long as that raises the odds; the likeliest set of all is merged, if its odds are better than even.
 The idea of judging pairs jointly is that of J. Neira and J. D. Tardos (IEEE Transactions on Robotics and Automation 17,
 2001).
 """
@@ -25,38 +25,38 @@ import numpy as np
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping.association import log_odds
-from saga_fg.slam.mapping.joint_estimate import JointEstimate
+from saga_fg.slam.mapping.ekf_slam import EkfSlam
 
 _SEEDS = 40  # pairs that sets are grown from, the likeliest
 
 
-def duplicates(estimate: JointEstimate, probability: float, apart: Set[tuple[int, int]]) -> dict[int, int]:
-    """Which landmark is to become which, the one of the lower number; each occurs once.
+def duplicates(ekf: EkfSlam, probability: float, seen_together: Set[tuple[int, int]]) -> dict[int, int]:
+    """Find landmarks to merge: number -> the lower number of the same landmark; each occurs once.
 
-    probability: of the gate; apart: pairs (lower, higher) that were seen side by side.
+    probability: of the gate; seen_together: pairs (lower, higher) of different landmarks, seen from one pose.
     """
     merged: dict[int, int] = {}
-    for kind in dict.fromkeys(estimate.kinds.values()):
-        numbers = sorted(number for number, other in estimate.kinds.items() if other == kind)
-        pairs = _possible(estimate, list(combinations(numbers, 2)), probability, apart)
+    for kind in dict.fromkeys(ekf.kinds.values()):
+        numbers = sorted(number for number, other in ekf.kinds.items() if other == kind)
+        pairs = _possible(ekf, list(combinations(numbers, 2)), probability, seen_together)
         if not pairs:
             continue
-        delta, J_i, J_j = estimate.differences(pairs)
-        covariance = estimate.joint_difference_covariance(pairs, J_i, J_j)
+        delta, J_i, J_j = ekf.differences(pairs)
+        covariance = ekf.joint_difference_covariance(pairs, J_i, J_j)
         chosen = _likeliest_set(pairs, delta, covariance, kind.density, probability)
         merged |= {pairs[k][1]: pairs[k][0] for k in chosen}
     return merged
 
 
 def _possible(
-    estimate: JointEstimate, every: list[tuple[int, int]], probability: float, apart: Set[tuple[int, int]]
+    ekf: EkfSlam, every: list[tuple[int, int]], probability: float, seen_together: Set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Pairs inside the gate, each for itself."""
-    pairs = [pair for pair in every if pair not in apart]
+    """Pairs inside the gate."""
+    pairs = [pair for pair in every if pair not in seen_together]
     if not pairs:
         return []
-    delta, J_i, J_j = estimate.differences(pairs)
-    S = estimate.difference_covariances(pairs, J_i, J_j)
+    delta, J_i, J_j = ekf.differences(pairs)
+    S = ekf.difference_covariances(pairs, J_i, J_j)
     squared = (delta * np.linalg.solve(S, delta[:, :, None])[:, :, 0]).sum(axis=1)
     return [pairs[k] for k in np.flatnonzero(squared < gate(probability, delta.shape[1])).tolist()]
 
@@ -93,7 +93,7 @@ def _likeliest_set(
 
 
 def _odds(delta: FloatArray, covariance: FloatArray, rows: IntArray, density: float, probability: float) -> FloatArray:
-    """Log odds of each of these pairs for itself; minus infinity outside the gate."""
+    """Log odds of each of some pairs; minus infinity outside the gate."""
     S = covariance[rows, :, rows]
     squared = (delta[rows] * np.linalg.solve(S, delta[rows, :, None])[:, :, 0]).sum(axis=1)
     odds = log_odds(squared, np.linalg.slogdet(S)[1], delta.shape[1], density)

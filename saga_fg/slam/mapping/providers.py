@@ -1,4 +1,4 @@
-"""Factor providers of a drive among landmarks: the pose by measured motions, and what is seen from it."""
+"""Factor providers of a drive among landmarks: poses by measured motions, and observations from them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def landmark_key(number: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """The next pose by its motion since the one before, a_T_b; the first one by a prior, world_T_pose.
+    """Add the next pose by its measured motion since the one before, a_T_b; the first one by a prior, world_T_pose.
 
     measured: (d + 1, d + 1); covariance (k, k) of its tangent; start: the pose to begin with, by default as measured
     """
@@ -52,11 +52,12 @@ class MeasuredMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """Observations whose landmarks are known: by epoch, each with the number of its landmark.
+class LandmarkObservations:
+    """Add associated observations: by epoch, each with the number of its landmark.
 
-    A landmark begins when it is first seen, at its state in `start`; all factors come with the last of these epochs and
-    under its number, so that those of a kind are linearised together. robust: a loss for those that are not GTSAM's.
+    A landmark is added with its first observation, at its state in `start`; all factors come with the last of these
+    epochs and under its number, so that those of a kind are linearised together. robust: a loss, not for GTSAM's own
+    factors.
     """
 
     seen: Mapping[int, Sequence[tuple[int, Observation]]]
@@ -72,7 +73,7 @@ class Sightings:
             if landmark_key(n) not in view.variables
         ]
         last = max(self.seen, default=None)
-        return Additions(new, named={last: sighting_factors(self.seen, self.robust)} if last == view.epoch else {})
+        return Additions(new, named={last: observation_factors(self.seen, self.robust)} if last == view.epoch else {})
 
     def landmarks(self, solution: Solution | GraphSolution, confirm: int = 1) -> list[Landmark]:
         """The landmarks by number, where a solution has them; confirm: observations that make one certain."""
@@ -87,10 +88,10 @@ class Sightings:
         return found
 
 
-def sighting_factors(
+def observation_factors(
     seen: Mapping[int, Sequence[tuple[int, Observation]]], robust: Robust | None = None
 ) -> list[Factor]:
-    """The factors of observations as in `Sightings`, those of a kind together."""
+    """The factors of observations as in `LandmarkObservations`, those of a kind together."""
     by_kind: dict[LandmarkType, list[tuple[list[int], Observation]]] = {}
     for epoch, now in seen.items():
         for number, observation in now:

@@ -12,7 +12,8 @@ import pytest
 
 from data_tools.datasets.nuscenes import NuScenes
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar, write_nuscenes
-from data_tools.simulator.nuscenes_export import black_pixel
+from data_tools.simulator.nuscenes_export import BLACK_PIXEL
+from data_tools.simulator.settings import TrafficSettings
 from saga_fg.errors import InputError
 
 SHORT = SimulatorSettings(duration=4.0, warm_up=5.0)
@@ -173,8 +174,18 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         write_nuscenes(tmp_path / "out", SimulatedTraffic(SHORT, scenes=1), version="../v1.0-mini")
 
 
+def test_classes_beyond_vehicles_and_pedestrians_have_their_categories(tmp_path: Path) -> None:
+    traffic = TrafficSettings(truck_share=0.7, bus_share=0.0, trailer_share=1.0)
+    settings = SimulatorSettings(duration=2.0, warm_up=5.0, traffic=traffic)
+    write_nuscenes(tmp_path / "out", SimulatedTraffic(settings, scenes=1))
+    folder = tmp_path / "out" / "v1.0-mini"
+    categories = {record["token"]: record["name"] for record in json.loads((folder / "category.json").read_text())}
+    instances = json.loads((folder / "instance.json").read_text())
+    assert "vehicle.trailer" in {categories[record["category_token"]] for record in instances}
+
+
 def test_the_placeholder_map_is_a_png_image() -> None:
-    content = black_pixel()
+    content = BLACK_PIXEL
     assert content.startswith(b"\x89PNG\r\n\x1a\n")
     assert content[12:16] == b"IHDR"
     assert content.endswith(b"IEND\xae\x42\x60\x82")

@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.affected import affected
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.scenarios import SCENARIOS, ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_from_world
@@ -21,7 +20,7 @@ from data_tools.simulator.settings import (
 )
 from data_tools.simulator.world import World, build_world
 from saga_fg.errors import InputError
-from saga_fg.types.signal import SIGHTINGS
+from saga_fg.types.signal import COLOUR_LABELS
 
 SHORT = 6.0  # s
 
@@ -51,7 +50,7 @@ def test_colours_are_reported_as_often_rightly_as_the_camera_can() -> None:
     for frame in scene.frames:
         assert frame.road_map is here.road_map
         labels = frame.detections.boxes.label
-        for row in np.flatnonzero(np.isin(labels, SIGHTINGS)).tolist():
+        for row in np.flatnonzero(np.isin(labels, COLOUR_LABELS)).tolist():
             assert frame.sensor == "camera"
             distance = [np.hypot(*(s.position - frame.detections.boxes.position[row, :2])) for s in here.signals]
             nearest = here.signals[int(np.argmin(distance))]
@@ -140,20 +139,6 @@ def test_riders_sit_on_their_bicycles() -> None:
     assert np.linalg.norm(bicycles.position - riders.position, axis=-1).max() < 0.1
     moved = np.diff(bicycles.position, axis=0) / 0.05
     assert np.abs(moved - bicycles.velocity[:-1]).max() < 0.6
-
-
-def test_who_is_affected() -> None:
-    """Nobody while all lights are open; somebody while one is closed."""
-    counts = []
-    for seed in (3, 4, 5):
-        here = world("red-light", seed)
-        for time in here.history.time[::20].tolist():
-            closed = any(line.closed(time) for line in here.layout.stop_lines if len(line.lanes))
-            counts.append(len(affected(here, time)))
-            assert closed or counts[-1] == 0
-    assert max(counts) > 3
-    names = affected(world("towing"), world("towing").start + 1.0).tolist()
-    assert any(name.startswith("trailer") for name in names)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

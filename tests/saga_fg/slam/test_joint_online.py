@@ -70,7 +70,7 @@ def test_landmarks_are_told_apart_and_kept_when_they_leave() -> None:
     online = estimate_online(frames, reported, new_tracker(), 1.0, SETTINGS, poses[0], seen)
     certain = [mark for mark in online.landmarks if mark.confirmed]
     assert len(certain) == len(poles)
-    assert sum(mark.sightings for mark in online.landmarks) == sum(map(len, seen))
+    assert sum(mark.observations for mark in online.landmarks) == sum(map(len, seen))
     for mark in certain:
         off = (poles - mark.state)[np.argmin(np.linalg.norm(poles - mark.state, axis=1))]
         assert off @ np.linalg.solve(mark.covariance, off) < chi2.ppf(0.9999, 2)

@@ -64,16 +64,14 @@ def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
     truth = {"pole": list(poles), "plane": planes, "road line": list(lines)}
     found = {}
     for name, things in truth.items():
-        numbers = sorted(n for n, kind in mapper.estimate.kinds.items() if kind.name == name)
+        numbers = sorted(n for n, kind in mapper.ekf.kinds.items() if kind.name == name)
         assert len(numbers) == len(things), f"{name}: {len(numbers)} landmarks of {len(things)}"
-        variable = mapper.estimate.kinds[numbers[0]].variable
-        errors = np.concatenate(
-            [variable.local(mapper.estimate.state(n), t) for n, t in zip(numbers, things, strict=True)]
-        )
-        squared = float(errors @ np.linalg.solve(mapper.estimate.covariance(numbers), errors))
+        variable = mapper.ekf.kinds[numbers[0]].variable
+        errors = np.concatenate([variable.local(mapper.ekf.state(n), t) for n, t in zip(numbers, things, strict=True)])
+        squared = float(errors @ np.linalg.solve(mapper.ekf.covariance(numbers), errors))
         found[name] = (squared, len(errors))
-    error = mapper.estimate.pose.localCoordinates(pose)
-    return found, float(error @ np.linalg.solve(mapper.estimate.covariance([0]), error))
+    error = mapper.ekf.pose.localCoordinates(pose)
+    return found, float(error @ np.linalg.solve(mapper.ekf.covariance([0]), error))
 
 
 @pytest.fixture(scope="module")

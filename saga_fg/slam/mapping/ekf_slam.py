@@ -1,0 +1,239 @@
+"""EKF-SLAM: the pose and all landmarks as one Gaussian, kept by an error-state Kalman filter between two smoothings.
+
+State x = (pose, l_1, ..., l_n) with covariance P of its tangents. With factors linearised and whitened at the state,
+r + A_p dp + A_l dl + w, w ~ N(0, 1):
+
+    predict   P_pp <- Ad P_pp Ad^T + Q,  P_pl <- Ad P_pl              Ad of the inverse increment
+    update    S = A P A^T + 1,  K = P A^T S^-1,  x <- x + (-K r),  P <- P - K A P
+    augment   dl = -A_l^-1 (A_p dp + w)                                 a landmark starts at its first observation
+
+Source: R. Smith, M. Self, P. Cheeseman, "Estimating uncertain spatial relationships in robotics", 1990.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import ResidualFactors, Variable, Vector, linearised, pose
+from factors.differences import central_differences
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.landmark import LandmarkType, Observation
+
+_SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics
+POSE = 0  # key of the pose; landmarks have positive ones
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """One observation against one landmark, whitened: r (d,), A_p (d, k), A_l (d, d)."""
+
+    landmark: int
+    r: FloatArray
+    by_pose: FloatArray
+    by_landmark: FloatArray
+
+
+class EkfSlam:
+    """Pose and landmarks; a landmark's key is its number."""
+
+    def __init__(
+        self,
+        world_T_pose: FloatArray,
+        covariance: FloatArray,
+        landmarks: Mapping[int, tuple[LandmarkType, Any]] | None = None,
+    ) -> None:
+        """covariance: of the pose and of landmarks, type and state by number, in this order."""
+        self.values = gtsam.Values()
+        self.values.insert(POSE, pose("world_T_pose", world_T_pose))
+        self.planar = world_T_pose.shape == (3, 3)
+        self.kinds: dict[int, LandmarkType] = {}
+        self.P = np.array(covariance, dtype=np.float64)
+        self._columns = {POSE: slice(0, 3 if self.planar else 6)}
+        for number, (kind, state) in (landmarks or {}).items():
+            self._insert(number, kind, state)
+
+    @property
+    def pose(self) -> Any:
+        """The pose as GTSAM's."""
+        return self.values.atPose2(POSE) if self.planar else self.values.atPose3(POSE)
+
+    def state(self, landmark: int) -> Any:
+        """The state of a landmark."""
+        return self.kinds[landmark].variable.read(self.values, landmark)
+
+    def covariance(self, keys: Sequence[int]) -> FloatArray:
+        """The joint covariance of some variables."""
+        columns = self._columns_of(keys)
+        return np.asarray(self.P[np.ix_(columns, columns)])
+
+    def predict(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
+        """Predict the pose after a measured increment; covariance (k, k) of its tangent."""
+        increment = pose("a_T_b", a_T_b)
+        k = increment.dim()
+        self.values.update(POSE, self.pose.compose(increment))
+        Ad = increment.inverse().AdjointMap()
+        self.P[:k] = Ad @ self.P[:k]
+        self.P[:, :k] = self.P[:, :k] @ Ad.T
+        self.P[:k, :k] += covariance
+
+    def innovations(self, observation: Observation, landmarks: Iterable[int]) -> list[Innovation]:
+        """The observation against each of these landmarks, which are of its kind."""
+        keys = list(landmarks)
+        if not keys:
+            return []
+        n = len(keys)
+        rows = np.stack([np.full(n, POSE), keys], axis=1)
+        observed = np.broadcast_to(observation.value, (n, len(observation.value)))
+        covariances = np.broadcast_to(observation.covariance, (n, *observation.covariance.shape))
+        factors = observation.kind.factors(rows, observed, covariances)
+        if not isinstance(factors, gtsam.NonlinearFactorGraph) and isinstance(factors[0], ResidualFactors):
+            W, (by_pose, by_landmark), r = factors[0].linearisation(self.values)
+            whitened = zip(keys, (W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark, strict=True)
+            return [Innovation(*one) for one in whitened]
+        if isinstance(factors, gtsam.NonlinearFactorGraph):
+            linear = factors.linearize(self.values)
+        else:
+            linear = linearised(gtsam.NonlinearFactorGraph(), factors, self.values)
+        k = self._columns[POSE].stop
+        found = []
+        for row, key in enumerate(keys):
+            A, b = linear.at(row).jacobian()
+            found.append(Innovation(key, -b, A[:, :k], A[:, k:]))
+        return found
+
+    def innovation_covariance(self, innovations: Sequence[Innovation]) -> FloatArray:
+        """S (D, D) of innovations together, whitened: the identity is the noise alone."""
+        A, columns = self._stacked(innovations)
+        return np.asarray(A @ self.P[np.ix_(columns, columns)] @ A.T + np.eye(len(A)))
+
+    def squared_distances(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, FloatArray]:
+        """d^2 (n,) and log det S (n,) of each of several innovations of one kind."""
+        k = self._columns[POSE].stop
+        A_p = np.stack([i.by_pose for i in innovations])
+        A_l = np.stack([i.by_landmark for i in innovations])
+        r = np.stack([i.r for i in innovations])
+        columns = np.stack([np.arange(len(self.P))[self._columns[i.landmark]] for i in innovations])
+        P_ll = self.P[columns[:, :, None], columns[:, None, :]]
+        P_pl = self.P[:k][:, columns].swapaxes(0, 1)
+        cross = A_p @ P_pl @ A_l.swapaxes(1, 2)
+        S = A_p @ self.P[:k, :k] @ A_p.swapaxes(1, 2) + cross + cross.swapaxes(1, 2)
+        S += A_l @ P_ll @ A_l.swapaxes(1, 2) + np.eye(r.shape[1])
+        squared = (r * np.linalg.solve(S, r[:, :, None])[:, :, 0]).sum(axis=1)
+        return squared, np.linalg.slogdet(S)[1]
+
+    def update(self, innovations: Sequence[Innovation]) -> None:
+        """Update with observations of different landmarks made from the present pose."""
+        A, columns = self._stacked(innovations)
+        r = np.concatenate([i.r for i in innovations])
+        PA = self.P[:, columns] @ A.T
+        S = A @ PA[columns] + np.eye(len(A))
+        K = np.linalg.solve(S, PA.T).T
+        self.P -= K @ PA.T
+        self.P = (self.P + self.P.T) / 2
+        self._retract(-K @ r)
+
+    def differences(self, pairs: Sequence[tuple[int, int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Differences of K pairs of one kind: l_j in the tangent of l_i, (K, d), to first order delta + J dl.
+
+        Returns the differences, and their derivatives J_i and J_j (K, d, d).
+        """
+        variable = self.kinds[pairs[0][0]].variable
+        states = [(self.state(i), self.state(j)) for i, j in pairs]
+        delta = np.stack([variable.local(first, second) for first, second in states])
+        if isinstance(variable, Vector):
+            one = np.broadcast_to(np.eye(variable.dim), (len(pairs), variable.dim, variable.dim))
+            return delta, -one, one
+        J = [central_differences(variable.local, pair, (variable, variable)) for pair in states]
+        return delta, np.stack([first for first, _ in J]), np.stack([second for _, second in J])
+
+    def difference_covariances(self, pairs: Sequence[tuple[int, int]], J_i: FloatArray, J_j: FloatArray) -> FloatArray:
+        """The covariance (K, d, d) of each difference."""
+        i = np.stack([self._columns_of([pair[0]]) for pair in pairs])
+        j = np.stack([self._columns_of([pair[1]]) for pair in pairs])
+        both = np.concatenate([i, j], axis=1)
+        J = np.concatenate([J_i, J_j], axis=2)
+        return np.asarray(
+            J @ self.P[both[:, :, None], both[:, None, :]] @ J.swapaxes(1, 2) + _SAME * np.eye(J.shape[1])
+        )
+
+    def joint_difference_covariance(
+        self, pairs: Sequence[tuple[int, int]], J_i: FloatArray, J_j: FloatArray
+    ) -> FloatArray:
+        """The covariance (K, d, K, d) of all differences together."""
+        K, d, _ = J_i.shape
+        i, j = (self._columns_of([pair[side] for pair in pairs]) for side in (0, 1))
+        rows = J_i @ self.P[i].reshape(K, d, -1) + J_j @ self.P[j].reshape(K, d, -1)
+        flat = rows.reshape(K * d, -1)
+        C = np.einsum("rkd,ked->rke", flat[:, i].reshape(-1, K, d), J_i)
+        C += np.einsum("rkd,ked->rke", flat[:, j].reshape(-1, K, d), J_j)
+        C = C.reshape(K * d, K * d) + _SAME * np.eye(K * d)
+        return np.asarray(C.reshape(K, d, K, d))
+
+    def augment(self, landmark: int, observation: Observation) -> None:
+        """Add a landmark at its first observation, from the present pose."""
+        kind = observation.kind
+        self._insert(landmark, kind, kind.initialise(self.pose.matrix(), observation.value))
+        n, d, k = len(self.P), kind.variable.dim, self._columns[POSE].stop
+        (first,) = self.innovations(observation, [landmark])
+        G = -np.linalg.solve(first.by_landmark, first.by_pose)
+        noise = np.linalg.inv(first.by_landmark)
+        P = np.zeros((n + d, n + d))
+        P[:n, :n] = self.P
+        P[n:, :n] = G @ self.P[:k]
+        P[:n, n:] = P[n:, :n].T
+        P[n:, n:] = G @ self.P[:k, :k] @ G.T + noise @ noise.T
+        self.P = P
+
+    def _insert(self, landmark: int, kind: LandmarkType, state: Any) -> None:
+        """Its columns of P are the next ones."""
+        end = max(columns.stop for columns in self._columns.values())
+        self.kinds[landmark] = kind
+        self.values.insert(landmark, state)
+        self._columns[landmark] = slice(end, end + kind.variable.dim)
+
+    def _columns_of(self, keys: Sequence[int]) -> IntArray:
+        """The columns of P of some variables, one after the other."""
+        return np.concatenate([np.arange(len(self.P))[self._columns[key]] for key in keys])
+
+    def _stacked(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, FloatArray]:
+        """The Jacobian (D, C) of innovations by the columns (C,) of P that it touches."""
+        k = self._columns[POSE].stop
+        rows = sum(len(i.r) for i in innovations)
+        A = np.zeros((rows, k + sum(i.by_landmark.shape[1] for i in innovations)))
+        columns, row, column = [np.arange(k)], 0, k
+        for i in innovations:
+            m, d = i.by_landmark.shape
+            A[row : row + m, :k] = i.by_pose
+            A[row : row + m, column : column + d] = i.by_landmark
+            columns.append(np.arange(len(self.P))[self._columns[i.landmark]])
+            row, column = row + m, column + d
+        return A, np.concatenate(columns)
+
+    def _retract(self, delta: FloatArray) -> None:
+        self.values.update(POSE, self.pose.retract(delta[self._columns[POSE]]))
+        for key, kind in self.kinds.items():
+            columns = self._columns[key]
+            state = self.state(key)
+            moved = kind.variable.retract(state, delta[columns])
+            self.values.update(key, moved)
+            if not isinstance(kind.variable, Vector):
+                self._transport(columns, _turned(kind.variable, state, delta[columns], moved))
+
+    def _transport(self, columns: slice, turned: FloatArray) -> None:
+        """Express the covariance of a state in the tangent of where it moved to, whose axes may be others."""
+        self.P[columns] = turned @ self.P[columns]
+        self.P[:, columns] = self.P[:, columns] @ turned.T
+
+
+def _turned(variable: Variable, state: Any, delta: FloatArray, moved: Any) -> FloatArray:
+    """d local(moved, retract(state, delta + e)) / de (d, d)."""
+
+    def seen(step: FloatArray) -> FloatArray:
+        return variable.local(moved, variable.retract(state, delta + step))
+
+    return central_differences(seen, [np.zeros(variable.dim)], [Vector(variable.dim)])[0]
