@@ -92,7 +92,7 @@ class ClassSettings(Settings):
 
 @dataclass(frozen=True)
 class AssociationSettings(Settings):
-    """Association of detections to tracks, see `saga_fg.tracking.matching`; gates are settings of the classes."""
+    """Association of detections to tracks, see `saga_fg.tracking.association`; gates are settings of the classes."""
 
     method: AssociationName = setting(
         "hungarian", "hungarian: least total cost; greedy: cheapest pair first; graph: distances of pairs count too"
@@ -170,7 +170,7 @@ class TrafficFlowSettings(Settings):
 
 @dataclass(frozen=True)
 class StationaritySettings(Settings):
-    """Probability that an object is stationary, see `saga_fg.tracking.standing`."""
+    """Probability that an object is stationary, see `saga_fg.tracking.stationarity`."""
 
     prior: Fraction = setting(
         0.0, "share of new objects that are stationary; 0: off; usual 0.5 where many cars are parked"
