@@ -1,6 +1,6 @@
 r"""Stationary or moving: a discrete state of every track beside its Gaussian one, and its use.
 
-    s <- b + (s - b) exp(-(depart + halt) dt),   b = halt / (depart + halt)     prediction over dt
+    s <- b + (s - b) exp(-(start + stop) dt),   b = stop / (start + stop)     prediction over dt
     s / (1 - s) <- s / (1 - s)  N(z; a, D + R) / N(z; H m, H P H^T + R)         update with a detection z
 
 s is the probability that the object is stationary. If it moves, its state is that of the joint filter, N(m, P). If it
