@@ -1,4 +1,4 @@
-"""How honest covariances are: the share of errors within the tracks' ellipses over the probability they should hold.
+"""Consistency of covariances: share of errors within the tracks' ellipses over the probability of the ellipses.
 
 A class on the diagonal is right; above it the covariances are too large, below it too small. The grey bands are
 those a class is judged by (`data_tools.metrics.error_summary`).
@@ -27,7 +27,7 @@ def calibration_plot(errors: LabelErrors) -> Any:
         values = of_class.nees[np.isfinite(of_class.nees)]
         if len(values):
             share = np.searchsorted(np.sort(values), ellipses, side="right") / len(values)
-            style = "-" if calibration(of_class).judged else ":"
+            style = "-" if calibration(of_class).enough_data else ":"
             ax.plot(probability, share, style, label=f"{label} ({len(values)})", linewidth=1.4)
     ax.plot([0, 1], [0, 1], color="black", linewidth=0.8)
     for p, (low, high) in BANDS.items():

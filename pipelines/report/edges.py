@@ -28,7 +28,7 @@ def edges_of_moments(table: SceneBoxes, moments: int, rules: Sequence[EdgeRule])
     node_type = NodeType("track", ConstantVelocity())
     moved: set[str] = set()
     for k in range(moments):
-        rows = np.flatnonzero(table.moment == k)
+        rows = np.flatnonzero(table.frame == k)
         boxes = table.boxes.select(rows)
         velocity = np.nan_to_num(boxes.velocity)
         ids = table.id[rows]

@@ -118,7 +118,7 @@ def _method(
         1000 * (np.full(len(table), np.nan) if coasting is None else coasting),
     ]
     rows = _whole(np.column_stack(columns))
-    starts = np.searchsorted(table.moment, np.arange(moments + 1)).tolist()
+    starts = np.searchsorted(table.frame, np.arange(moments + 1)).tolist()
     return {
         "ids": ids.tolist(),
         "moments": [rows[a:b] for a, b in pairwise(starts)],
