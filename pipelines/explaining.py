@@ -137,9 +137,9 @@ def story(events: Sequence[Event]) -> list[str]:
 
 def _story(events: Sequence[Event]) -> list[str]:
     first, last = events[0], events[-1]
-    end = "" if last["event"] == "ended" else ", then the recording ends"
+    end = "" if last["event"] == "deleted" else ", then the recording ends"
     head = f"track {first['track']} of {first['scene']}, {first['label']}: {last['time'] - first['time']:.1f} s{end}"
-    describe = {"born": _born, "matched": _matched, "missed": _missed, "ended": _ended}
+    describe = {"initiated": _initiated, "matched": _matched, "missed": _missed, "deleted": _deleted}
     lines = [head]
     for event in events:
         text, *more = describe[event["event"]](event)
@@ -148,11 +148,11 @@ def _story(events: Sequence[Event]) -> list[str]:
     return lines
 
 
-def _born(event: Event) -> list[str]:
+def _initiated(event: Event) -> list[str]:
     near = event["nearest_tracks"]
     text = (
-        f"born from detection {event['detection']}, probability {event['probability']:.2f} "
-        f"(births need {event['least_probability']:.2f}), which no track took"
+        f"initiated by detection {event['detection']}, probability {event['probability']:.2f} "
+        f"(new tracks need {event['least_probability']:.2f}), which no track took"
     )
     if not near:
         return [text, f"there was no track of class {event['label']}"]
@@ -173,12 +173,13 @@ def _matched(event: Event) -> list[str]:
 def _missed(event: Event) -> list[str]:
     _, others = _split(event["candidates"])
     nothing = [] if others else ["no detection of its class was near"]
-    text = f"missed, unseen for {event['unseen']:.2f} s; {_existence(event)}"
+    text = f"missed, not detected for {event['coasting']:.2f} s; {_existence(event)}"
     return [text, *nothing, *_others(others), *_edges(event)]
 
 
-def _ended(event: Event) -> list[str]:
-    return [f"ended: {event['reason']} (unseen for {event['unseen']:.2f} s, existence {event['existence']:.2f})"]
+def _deleted(event: Event) -> list[str]:
+    state = f"not detected for {event['coasting']:.2f} s, existence {event['existence']:.2f}"
+    return [f"deleted: {event['reason']} ({state})"]
 
 
 def _split(candidates: Sequence[Event]) -> tuple[Event, list[Event]]:

@@ -41,7 +41,7 @@ class Innovations:
             return
         now = view()
         assert now.matching is not None
-        labels = now.columns.label[now.matching.track]
+        labels = now.table.label[now.matching.track]
         for label in np.unique(labels).tolist():
             self._parts.setdefault(label, []).append(now.matching.distance[labels == label])
 
