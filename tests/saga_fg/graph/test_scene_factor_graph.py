@@ -100,9 +100,9 @@ def test_the_graph_is_the_one_that_runs():
     _, smoother = driven()
     graph = smoother.graph()
     assert sum(1 for _ in graph.factors()) == sum((slots >= 0).sum() for slots in smoother._engine.slots.values())
-    said = [str(factor) for factor in graph.factors()]
-    assert "PriorFactorPose2 on vehicle 0 at 0.00 s (provider odometry)" in said
-    assert any(text.startswith("SmoothDriver interactions on car 1 at ") for text in said)
+    text = [str(factor) for factor in graph.factors()]
+    assert "PriorFactorPose2 on vehicle 0 at 0.00 s (provider odometry)" in text
+    assert any(text.startswith("SmoothDriver interactions on car 1 at ") for text in text)
     before = graph.values
     solution = graph.copy().solve(SolverSettings(tolerance=1e-8))
     for key, variable in graph.variables.items():
