@@ -30,8 +30,7 @@ import numpy as np
 
 from data_tools.lidar import voxel_downsample
 from data_tools.metrics import SceneBoxes
-from pipelines.report.edges import Edges, edges_of_moments
-from pipelines.report.scenes import UNMEASURED, ReportScene, latest_detections
+from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections
 from pipelines.scan_sequence import ScanSequence
 from pipelines.view.drawing import (
     VEHICLE,
