@@ -168,7 +168,7 @@ class _Method:
     def at(self, moment: int, edges: Edges) -> Iterator[tuple[str, Shape]]:
         """Yield the layers of a moment with their shapes."""
         table, place = self._table, self._place
-        rows = np.flatnonzero(table.moment == moment)
+        rows = np.flatnonzero(table.frame == moment)
         colour = self._colour[self._number[rows]]
         boxes = table.boxes.select(rows)
         facts = {
@@ -189,7 +189,7 @@ class _Method:
     def _trajectories(self, moment: int, rows: IntArray) -> list[FloatArray]:
         """Return the places (n, 3) of the tracks of `rows` in the last seconds."""
         first = np.searchsorted(self._time, self._time[moment] - HISTORY)
-        window = np.arange(*np.searchsorted(self._table.moment, [first, moment + 1]))
+        window = np.arange(*np.searchsorted(self._table.frame, [first, moment + 1]))
         window = window[np.argsort(self._number[window], kind="stable")]
         numbers = self._number[window]
         bounds = [np.searchsorted(numbers, self._number[rows], side) for side in ("left", "right")]
