@@ -1,4 +1,4 @@
-"""Results as they are on disk, as scenes to look at: nuScenes, KITTI, and tables of one's own."""
+"""Results on disk as scenes to view: nuScenes, KITTI, and tables of tracks."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from saga_fg.types.dataset import Scene
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The scenes of a result, and the record of the run that made it, if there is one beside it.
+    """The scenes of a result, and the record of its run if there is one beside it.
 
-    The edges are those of the rules that are configured for such recordings.
+    Edges are by the rules of the default configuration of such recordings.
     """
 
     name: str
@@ -33,17 +33,17 @@ class Results:
 
 
 def nuscenes_results(result: Path, scored: Mapping[str, ScoredScene]) -> Results:
-    """Those of a tracking-result JSON, of any tracker. Raises `InputError` for a broken record of the run."""
+    """Read a tracking-result JSON, of any tracker. Raises `InputError` for a broken record of the run."""
     return _results(result, "nuscenes", ((each.scene, each.tracking.found, None) for each in scored.values()))
 
 
 def kitti_results(result: Path, scored: Mapping[str, ScoredSequence]) -> Results:
-    """Those of a folder of results NNNN.txt. Raises `InputError` as above."""
+    """Read a folder of results NNNN.txt. Raises `InputError` as above."""
     return _results(result, "kitti", ((each.scene, each.found, None) for each in scored.values()))
 
 
 def table_results(result: Path, detections: Path | None) -> Results:
-    """Those of a table of tracks, with the table of their detections. Raises `InputError` for broken tables."""
+    """Read a table of tracks, with the table of their detections. Raises `InputError` for broken tables."""
     rows = read_tracks(result)
     dataset = read_detections(detections) if detections is not None else None
     shown = []
@@ -71,7 +71,7 @@ def _results(result: Path, family: Family, shown: Iterable[tuple[Scene, SceneBox
 
 
 def _amid(rows: TrackRows, mine: IntArray, count: int) -> FloatArray:
-    """Where nobody says where the vehicle is: poses (count, 4, 4) in the middle of all tracks."""
+    """Return poses (count, 4, 4) in the middle of all tracks, in place of unknown poses of the vehicle."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :2, 3] = np.median(rows.boxes.position[mine, :2], axis=0)
     return poses

@@ -1,9 +1,9 @@
-"""What `saga-fg slam kitti`, `victoria-park` or `plaza` wrote, as drawings: paths, the map, landmarks with their names.
+"""Results of `saga-fg slam kitti`, `victoria-park` or `plaza` as drawings: paths, the map, landmarks with their names.
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
     ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
     ROOT/map, ROOT/landmarks                      points of map.ply and landmarks.ply
-    ROOT/names                                    kind and number of the landmarks that are at a place (planes are not)
+    ROOT/names                                    kind and number of landmarks with a place (planes have none)
 
 Metres, about `origin`.
 """
@@ -20,7 +20,7 @@ from data_tools.files.input_files import read_bytes
 from data_tools.files.json_stream import parsed_json
 from data_tools.lidar import read_scan
 from data_tools.trajectories import Trajectory, read_tum_poses
-from pipelines.view.drawing import VEHICLE, Cubes, Drawing, Lines, Marks, Points, Pose, one_colour
+from pipelines.view.drawing import VEHICLE, Drawing, Lines, Points, Pose, Solids, one_colour
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 
@@ -58,7 +58,7 @@ def read_slam_view(folder: Path) -> SlamView:
 
 
 def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> Iterator[Drawing]:
-    """All of it in the frame `root`; origin (3,) in its coordinates, the first pose if None.
+    """Draw a run in the frame `root`; origin (3,) in its coordinates, the first pose if None.
 
     Times count from the first pose.
     """
@@ -70,8 +70,8 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
         radius, colour = (0.03, MAP) if name == "map" else (0.08, LANDMARK)
         yield Drawing(root, name, Points(points - origin, colour, radius))
     if view.names:
-        yield Drawing(root, "names", Marks(view.places - origin, view.names, LANDMARK, 0.15))
-    body = Cubes(np.zeros((1, 3)), np.array([VEHICLE]), np.zeros(1), PATHS["trajectory"])
+        yield Drawing(root, "names", Points(view.places - origin, LANDMARK, 0.15, view.names))
+    body = Solids(np.zeros((1, 3)), np.array([VEHICLE]), np.zeros(1), PATHS["trajectory"])
     yield Drawing(f"{root}/pose", "body", body)
     times = trajectory.timestamps - trajectory.timestamps[0]
     for time, world_T_ego in zip(times.tolist(), trajectory.world_T_ego, strict=True):
@@ -81,7 +81,7 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
 
 
 def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:
-    """Kind and number of each landmark that is at a place, and the places (M, 3)."""
+    """Return kind and number of each landmark with a place, and the places (M, 3)."""
     if not path.is_file():
         return (), np.empty((0, 3))
     rows = parsed_json(read_bytes(path), str(path))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from data_tools.metrics import ErrorSample, Interval, LabelErrors
 from data_tools.simulator import SimulatorSettings, simulate_scene
-from pipelines.bench import learned_folds
+from pipelines.bench import tracking
 from pipelines.bench.coasting import HIDDEN, NEVER_GIVEN_UP, coasting_errors, kept_alive
 from pipelines.bench.recordings import NuScenesSet, Score, SimulatedSet
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
@@ -110,10 +110,10 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
     def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
         return LearnedInteractions(learned_from=" ".join(recordings))
 
-    monkeypatch.setattr(learned_folds, "learn_interactions", learn)
+    monkeypatch.setattr(tracking, "learn_interactions", learn)
     recordings = SimulatedSet(3, settings=replace(SHORT, duration=1.0))
     first, second, third = recordings.dataset.scenes
-    learned = learned_folds.learn_by_folds(recordings.dataset)
+    learned = tracking.learn_by_folds(recordings.dataset)
     assert {name: found.learned_from for name, found in learned.items()} == {
         first: second,
         second: f"{first} {third}",
@@ -124,7 +124,7 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
     assert list(result.variants) == ["saga", "kf", "centerpoint", "graph matching", "learned interactions"]
     assert result.variants["learned interactions"].figures == pytest.approx(result.variants["kf"].figures, nan_ok=True)
     with pytest.raises(InputError, match="scenes to learn from beside it"):
-        learned_folds.learn_by_folds(SimulatedSet(1, settings=SHORT).dataset)
+        tracking.learn_by_folds(SimulatedSet(1, settings=SHORT).dataset)
 
 
 def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:

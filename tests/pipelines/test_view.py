@@ -78,9 +78,9 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
         [str(id_), label] for id_, label in zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
     ]
     assert len(at("saga/ellipses", "Ellipsoids3D:half_sizes")) == len(tracks)
-    trails = at("saga/trails", "LineStrips3D:strips")
-    np.testing.assert_allclose([trail[-1] for trail in trails], tracks.boxes.position - origin, atol=1e-3)
-    assert max(map(len, trails)) == k + 1
+    paths = at("saga/trajectories", "LineStrips3D:strips")
+    np.testing.assert_allclose([path[-1] for path in paths], tracks.boxes.position - origin, atol=1e-3)
+    assert max(map(len, paths)) == k + 1
     strips = np.array(at("saga/edges", "LineStrips3D:strips"))
     assert strips.shape[1:] == (2, 3)  # from the place of one track to that of another
     places = tracks.boxes.position - origin
@@ -106,7 +106,8 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
 
 def test_the_ellipse_holds_ninety_percent() -> None:
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
-    half, (angle,) = ellipses(covariance[None])
+    size, (angle,) = ellipses(covariance[None])
+    half = size[:, :2] / 2
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     np.testing.assert_allclose(turn @ np.diag(half[0] ** 2) @ turn.T, HELD * covariance)
     points = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 20000) @ turn / half[0]

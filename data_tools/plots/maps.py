@@ -1,4 +1,4 @@
-"""A LiDAR map from above: points coloured by height, the paths driven, poles and walls."""
+"""Pictures from above, in world coordinates: paths, and a LiDAR map with landmarks."""
 
 from __future__ import annotations
 
@@ -7,10 +7,32 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.plots.birds_eye import COLOURS
 from saga_fg.numerics.arrays import FloatArray
 
-MOST_POINTS = 60_000  # that are drawn, evenly chosen
+MOST_POINTS = 60_000  # of a map that are drawn, evenly chosen
 MARGIN = 30.0  # m around the paths
+
+
+def paths_from_above(paths: Mapping[str, FloatArray], points: Mapping[str, FloatArray] | None = None) -> Any:
+    """Return a matplotlib `Figure` of paths (N, 2 or 3) and sets of points (K, 2 or 3), m, each under its name.
+
+    The first path is grey, for comparison with the others.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 8.0), layout="constrained")
+    ax = figure.subplots()
+    colours = ("#b0b0b0", *COLOURS)
+    for (name, path), colour in zip(paths.items(), colours, strict=False):
+        ax.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.0, label=name)
+    for (name, set_), colour, marker in zip((points or {}).items(), COLOURS[1:], "^x+os", strict=False):
+        ax.plot(set_[:, 0], set_[:, 1], marker, color=colour, markersize=5, label=name)
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    ax.grid(color="#e6e6e6", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.legend(frameon=False, fontsize=9)
+    return figure
 
 
 def scan_map_from_above(
@@ -20,10 +42,13 @@ def scan_map_from_above(
     lines: Mapping[str, FloatArray],
     tracks: Sequence[FloatArray] = (),
 ) -> Any:
-    """A matplotlib `Figure`; everything in world coordinates, m.
+    """Return a matplotlib `Figure`; all in world coordinates, m.
 
-    points  (N, 3); paths (K, 3), each under its name; poles (P, 2); lines (W, 2, 2) of walls and edges,
-    their two ends, under the name of their kind; tracks (n, 2) of objects
+    points  (N, 3) of the map, coloured by height
+    paths   (K, 3) by name
+    poles   (P, 2)
+    lines   (W, 2, 2) the two ends of walls and road lines, by kind
+    tracks  (n, 2) of objects
     """
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure

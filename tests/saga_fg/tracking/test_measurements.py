@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Boxes
-from saga_fg.tracking.suppression import of_one_class, strongest
+from saga_fg.tracking.measurements import suppress_duplicates, suppress_other_classes
 
 
 def kept(x, probability, distance=1.0, label="car", shadow=0.0, ratio=0.5):
     n = len(x)
     boxes = Boxes.of(np.broadcast_to(label, n), np.stack([x, np.zeros(n), np.zeros(n)], axis=-1))
     distances = (np.broadcast_to(d, n).astype(float) for d in (distance, shadow, ratio))
-    return strongest(boxes, np.asarray(probability), *distances).tolist()
+    return suppress_duplicates(boxes, np.asarray(probability), *distances).tolist()
 
 
 def test_the_weaker_of_two_goes():
@@ -54,7 +54,7 @@ def test_what_stays_is_apart_and_what_goes_was_beaten(seed, n):
     probability = rng.permutation(n) / n
     label = rng.choice(["car", "bus"], n)
     distance = np.where(label == "car", 1.0, 1.5)
-    stays = strongest(Boxes.of(label, position), probability, distance, np.zeros(n), np.ones(n))
+    stays = suppress_duplicates(Boxes.of(label, position), probability, distance, np.zeros(n), np.ones(n))
     apart = np.hypot(*np.moveaxis(position[:, None, :2] - position[None, :, :2], -1, 0))
     rival = (label[:, None] == label) & (apart < distance[:, None]) & ~np.eye(n, dtype=bool)
     assert (np.diff(stays) > 0).all()
@@ -66,7 +66,7 @@ def test_what_stays_is_apart_and_what_goes_was_beaten(seed, n):
 def of_one_class_kept(x, probability, label, overlap):
     n = len(x)
     boxes = Boxes.of(label, np.stack([x, np.zeros(n), np.zeros(n)], axis=-1), [[4.0, 2.0, 1.5]] * n, np.zeros(n))
-    return of_one_class(boxes, np.asarray(probability), np.full(n, overlap)).tolist()
+    return suppress_other_classes(boxes, np.asarray(probability), np.full(n, overlap)).tolist()
 
 
 def test_of_two_classes_in_one_place_the_less_probable_goes():
@@ -86,4 +86,4 @@ def test_one_that_was_driven_out_drives_out_nothing():
 
 def test_a_box_of_unknown_size_stays():
     boxes = Boxes.of(["car", "truck"], np.zeros((2, 3)))
-    assert of_one_class(boxes, np.array([0.9, 0.1]), np.full(2, 0.1)).tolist() == [0, 1]
+    assert suppress_other_classes(boxes, np.array([0.9, 0.1]), np.full(2, 0.1)).tolist() == [0, 1]

@@ -1,9 +1,9 @@
-"""The road in the tracker: lights, stop lines and lanes as nodes of the joint state, with the colours of the lights.
+"""Lights, stop lines, lanes and walls of a map as nodes of the joint state, with the colours of the lights.
 
-Nodes of the roadside stand still; their places start where the map has them, as uncertain as the map, and are corrected
-by whatever is seen: of a light itself, and through the interactions of the vehicles that heed a line or keep a lane.
-Ids count down from -1, so that they are never those of tracks. Detections labelled `saga_fg.model.road.COLOUR_LABELS`
-report the colour of a light, of the nearest known one within reach.
+Nodes of the map are stationary; their positions start at those of the map, as uncertain as the map, and are corrected
+by detections of lights and through the interactions of vehicles that stop at a line or keep a lane. Ids count down from
+-1, so that they are never those of tracks. Detections labelled `saga_fg.types.signal.COLOUR_LABELS` report the
+colour of the nearest known light within reach.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.node import Motion, RandomWalk
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, of_classes
 from saga_fg.numerics.assignment import assign, gate, mahalanobis
-from saga_fg.tracking.joint_state import JointTrackState, Kinematics
+from saga_fg.tracking.joint_state import JointTrackState
+from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
@@ -27,7 +28,7 @@ from saga_fg.types.signal import COLOUR_LABELS, COLOURS, SignalSettings, colour_
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
-    """Own motion of a class: nodes of the roadside stand still unless the settings name their class."""
+    """Own motion of a class: nodes of the map are stationary unless the settings name their class."""
     if label in ROADSIDE and label not in settings.classes:
         return RandomWalk()
     return class_settings(settings.classes, ClassSettings, label).motion
@@ -47,8 +48,8 @@ class Place:
 
 
 @dataclass(eq=False)
-class Roadside:
-    """What is known of the road.
+class MapNodes:
+    """Nodes of the map.
 
     settings  how lights change
     id, label, name, place  (n,) of the nodes
@@ -71,7 +72,7 @@ class Roadside:
         """Probabilities of the colours of a light, by colour; raises `KeyError` for one that no map has."""
         return dict(zip(COLOURS, self.beliefs[light].tolist(), strict=True))
 
-    def learn(self, road_map: RoadMap, origin: FloatArray, state: JointTrackState) -> None:
+    def add(self, road_map: RoadMap, origin: FloatArray, joint: JointTrackState) -> None:
         """Add what is new in a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
         new = [(name, *rest) for name, *rest in _elements(road_map) if name not in self.name]
         if not new:
@@ -87,23 +88,23 @@ class Roadside:
         n, P = len(ids), road_map.deviation**2 * np.eye(2)
         middle = np.array([place.middle for place in places]) - origin
         still = np.zeros((n, 2)), np.zeros((n, 2, 2))
-        state.add(ids, np.array(labels), Kinematics(middle, still[0], np.tile(P, (n, 1, 1)), still[1]))
+        joint.add(ids, np.array(labels), Kinematics(middle, still[0], np.tile(P, (n, 1, 1)), still[1]))
 
     def predict(self, dt: float) -> None:
-        """The lights may change within `dt` s."""
+        """Predict the colours of the lights by `dt` s."""
         if self.beliefs and dt > 0:
             later = self.settings.predicted(np.array(list(self.beliefs.values())), dt)
             self.beliefs = dict(zip(self.beliefs, later, strict=True))
 
-    def heed(self, frame: Frame, sensor: Sensor, origin: FloatArray, state: JointTrackState, delay: float) -> None:
-        """Take in the lights that a frame shows, as it was `delay` s ago: their colours, and where they are."""
+    def update(self, frame: Frame, sensor: Sensor, origin: FloatArray, joint: JointTrackState, delay: float) -> None:
+        """Take in the colours and positions of lights in a frame taken `delay` s ago."""
         lights = np.flatnonzero(self.label == LIGHT)
         if len(lights) == 0 or not of_classes(frame.detections.boxes.label, COLOUR_LABELS).any():
             return
         seen = sensor.in_world(frame)
         seen = seen.select(of_classes(seen.boxes.label, COLOUR_LABELS))
         R = sensor.detection_covariance(seen, sensor.origin(frame))
-        position, _, P, _ = state.node(self.id[lights], self.label[lights])
+        position, _, P, _ = joint.kinematics_of(self.id[lights], self.label[lights])
         z = seen.boxes.position[:, :2] - origin
         d2, log_det = mahalanobis(position, P, z, R)
         apart = np.hypot(*np.moveaxis(z[None] - position[:, None], -1, 0))
@@ -111,8 +112,8 @@ class Roadside:
         cost = d2 + log_det
         row, column = assign(cost, possible, cost.max(initial=0.0) + 1.0)
         belief = dict(self.beliefs)
-        for light, sighting in zip(lights[row].tolist(), column.tolist(), strict=True):
-            colour = COLOUR_LABELS.index(str(seen.boxes.label[sighting]))
+        for light, detection in zip(lights[row].tolist(), column.tolist(), strict=True):
+            colour = COLOUR_LABELS.index(str(seen.boxes.label[detection]))
             name = self.name[light]
             belief[name] = colour_updated(belief[name], colour, sensor.colour_accuracy)
         self.beliefs = belief
@@ -122,14 +123,14 @@ class Roadside:
             full[:, :2, :2] = R[column]
             measured = np.concatenate([z[column], np.zeros((k, 2))], axis=1)
             ids, label = self.id[lights[row]], self.label[lights[row]]
-            state.update(ids, label, measured, full, np.zeros(k, dtype=bool), delay)
+            joint.update(ids, label, measured, full, np.zeros(k, dtype=bool), delay)
 
-    def beside(self, tracks: NodeTable, origin: FloatArray, state: JointTrackState) -> NodeTable:
-        """The table of the tracks with the roadside's nodes after them."""
+    def appended_to(self, tracks: NodeTable, origin: FloatArray, joint: JointTrackState) -> NodeTable:
+        """Return the node table of the tracks with the nodes of the map after them."""
         n, m = len(tracks), len(self)
         if m == 0:
             return tracks
-        position = state.node(self.id, self.label).position
+        position = joint.kinematics_of(self.id, self.label).position
         moved = tracks.has_moved
         beliefs = [self.beliefs[light] for light in self.light if light]
         closed = self.settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))
@@ -141,7 +142,7 @@ class Roadside:
         return NodeTable(
             np.concatenate([tracks.id, self.id]),
             np.concatenate([tracks.label, self.label]),
-            tracks.types + state.types_of(self.label),
+            tracks.types + joint.types_of(self.label),
             np.concatenate([tracks.position, position]),
             np.concatenate([tracks.velocity, np.zeros((m, 2))]),
             np.concatenate([tracks.heading, [place.heading for place in self.place]]),

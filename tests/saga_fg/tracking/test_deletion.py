@@ -6,7 +6,7 @@ from traffic_frames import frame, run
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.merging import duplicates
+from saga_fg.tracking.deletion import duplicate_tracks
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ from saga_fg.tracking.merging import duplicates
 )
 def test_a_track_is_a_duplicate_where_it_is_not_seen_and_another_is(second, label, seen, expected):
     position = np.array([(0.0, 0.0), second])
-    found = duplicates(position, np.array(["car", label]), np.array(seen), np.full(2, 1.0))
+    found = duplicate_tracks(position, np.array(["car", label]), np.array(seen), np.full(2, 1.0))
     assert found.tolist() == expected
 
 
