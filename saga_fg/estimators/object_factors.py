@@ -204,7 +204,7 @@ def interval_factors(
 
 
 def _is_regular(Q: FloatArray) -> BoolArray:
-    """(...,) true where covariances (..., d, d), scaled to unit variances of the axes, have variance in all directions."""
+    """(...,) true where covariances (..., d, d), in units of their axes, have variance in all directions."""
     deviation = np.sqrt(np.diagonal(Q, axis1=-2, axis2=-1))
     scale = np.where(deviation > 0, deviation, 1.0)
     return np.asarray(np.linalg.eigvalsh(Q / scale[..., :, None] / scale[..., None, :])[..., 0] > _SINGULAR)
