@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-from benchmarks.commands.association import association
-from benchmarks.commands.bounded import bounded
-from benchmarks.commands.coasting import coasting
-from benchmarks.commands.fusion import fusion
-from benchmarks.commands.heterogeneous import heterogeneous
-from benchmarks.commands.lidar import lidar
-from benchmarks.commands.metrics import metrics
-from benchmarks.commands.occlusion import occlusion
-from benchmarks.commands.paper import paper
-from benchmarks.commands.reading import reading
-from benchmarks.commands.scaling import scaling
-from benchmarks.commands.smoothing import smoothing
-from benchmarks.commands.streaming import streaming
-from benchmarks.commands.synthetic import synthetic
+from benchmarks.gaps import gaps
+from benchmarks.joint import joint
+from benchmarks.metrics import metrics
+from benchmarks.occlusion import occlusion
+from benchmarks.scaling import scaling
+from benchmarks.smoothing import smoothing
+from benchmarks.streaming import streaming
+from benchmarks.synthetic import synthetic
 from pipelines.cli.reporting import new_command
 
 app = new_command()
 
-for command in (
-    association,
-    bounded,
-    coasting,
-    fusion,
-    heterogeneous,
-    lidar,
-    metrics,
-    occlusion,
-    paper,
-    reading,
-    scaling,
-    smoothing,
-    streaming,
-    synthetic,
-):
+for command in (gaps, joint, metrics, occlusion, scaling, smoothing, streaming, synthetic):
     app.command()(command)
 
 

@@ -1,4 +1,4 @@
-"""Print what the official development kit says of a tracking result: run by the interpreter that has nuscenes-devkit.
+"""Print the official development kit's figures of a tracking result; run by the interpreter that has nuscenes-devkit.
 
 python devkit_figures.py RESULT.json DATAROOT VERSION SPLIT
 

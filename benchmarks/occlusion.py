@@ -1,23 +1,29 @@
-"""What the graph is worth where objects hide: `saga` against `kf` on simulated traffic.
+"""`python -m benchmarks occlusion`: `saga` against `kf` on hidden objects in simulated traffic.
 
-The process noise of both is fitted by likelihood, class by class, on scenes of other seeds than those they are compared
-on; they differ in nothing but the edges. The error is that of hidden objects, by the track that followed each when it
-was last seen, lost ones counted at a cap (`data_tools.metrics.scene`). An object is *occluded* while it is hidden
-between two views; one that is never seen again has left, and counts only among the *hidden*. Intervals are paired
-bootstraps over scenes.
+The process noise of both is fitted by likelihood, class by class, on scenes of other seeds; they differ in the edges
+alone. The error is the distance of a hidden object from the track that followed it when it was last seen; a lost object
+counts with a cap (`data_tools.metrics.scene`). An object is *occluded* while it is hidden between two views; one that
+is never seen again has left, and counts only among the *hidden*. Intervals are paired bootstraps over scenes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from data_tools.metrics import Interval, SceneMetrics, paired_bootstrap, scene_metrics
 from data_tools.simulator import SimulatorSettings, simulate_scene
-from pipelines.config import Method, TrackConfig
+from pipelines.cli.options import Config, Verbose
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile, report
+from pipelines.config import Method, TrackConfig, load_config
+from pipelines.figures import FigureTable, cell, percent
 from pipelines.tracking import Progress, track_scene
+from saga_fg.errors import InputError
 from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.types.dataset import Annotations, Scene
 
@@ -40,15 +46,14 @@ class OcclusionResult:
     fit_seeds: tuple[int, ...]
 
 
-def occlusion(
+def bench_occlusion(
     config: TrackConfig,
     seeds: Sequence[int],
     fit_seeds: Sequence[int],
-    simulator: SimulatorSettings | None = None,
     progress: Progress | None = None,
 ) -> OcclusionResult:
     """Fit on `fit_seeds`, compare on `seeds`."""
-    simulator = simulator or SimulatorSettings()
+    simulator = SimulatorSettings()
     total = len(fit_seeds) + len(seeds)
 
     def scenes() -> Iterator[Scene]:
@@ -91,3 +96,45 @@ def until_last_seen(moments: Sequence[Annotations]) -> tuple[Annotations, ...]:
 def _pooled(metrics: dict[Method, list[SceneMetrics]]) -> tuple[dict[Method, SceneMetrics], Interval]:
     kf, saga = ([m.carried.square_sums for m in metrics[method]] for method in METHODS)
     return {method: SceneMetrics.pool(metrics[method]) for method in METHODS}, paired_bootstrap(saga, kf)
+
+
+def occlusion(
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes to compare on.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first of them.")] = 0,
+    fit_scenes: Annotated[int, typer.Option("--fit-scenes", min=1, help="Scenes the process noise is fitted on.")] = 6,
+    fit_seed: Annotated[int, typer.Option("--fit-seed", min=0, help="Seed of the first of those.")] = 1000,
+    json_file: JsonFile = None,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """What the graph is worth where objects are hidden, on simulated traffic.
+
+    \b
+    Examples:
+      python -m benchmarks occlusion
+      python -m benchmarks occlusion --scenes 20 --seed 100 --json figures.json
+    """
+    fit_seeds, seeds = range(fit_seed, fit_seed + fit_scenes), range(seed, seed + scenes)
+    if set(fit_seeds) & set(seeds):
+        raise InputError(f"--fit-seed {fit_seed}: expected other scenes to fit on than to compare on")
+    with progress_bar() as progress:
+        result = bench_occlusion(load_config("simulated", config), seeds, fit_seeds, progress)
+    rows = []
+    for method, m in result.hidden.items():
+        errors = (m.carried.rmse, result.occluded[method].carried.rmse, m.position.rmse, m.carried.median, m.mota)
+        rows.append((method, *(cell(x) for x in errors), str(m.switches)))
+    changes = (percent(result.hidden_change), percent(result.occluded_change))
+    rows.append(("saga / kf - 1, 95 % interval", *changes, "", "", "", ""))
+    noise = ", ".join(f"{label} {q:.3g}" for label, q in result.acceleration_noise.items())
+    title = f"{scenes} simulated scenes; RMSE, m; acceleration noise fitted on {fit_scenes} others, m^2/s^3: {noise}"
+    columns = ("method", "hidden", "occluded", "in view", "hidden: median", "MOTA", "ID switches")
+    figures = {
+        "seeds": result.seeds,
+        "fit_seeds": result.fit_seeds,
+        "acceleration_noise": result.acceleration_noise,
+        "occluded_rmse": {method: m.carried.rmse for method, m in result.occluded.items()},
+        "occluded_change": result.occluded_change,
+        "hidden_rmse": {method: m.carried.rmse for method, m in result.hidden.items()},
+        "hidden_change": result.hidden_change,
+    }
+    report([FigureTable(title, columns, tuple(rows))], figures, json_file)

@@ -1,37 +1,39 @@
-"""What a recording without an end costs: memory and time of `WindowedSmoother` as hours go by.
+"""`python -m benchmarks streaming`: memory and time of smoothing a recording without an end, from a file to labels.
 
-Cars in platoons of five on a road, each listening to the one ahead of it at a rate that falls with their gap. Platoons
-come and go (new objects with new ids), cars are hidden for seconds at a time; data are drawn from the model, frame by
-frame, so that the bench, too, holds nothing but the present.
+Platoons of five cars, each on a road of its own, come and go, and cars are hidden for seconds at a time. They are
+written as a table of detections, which `smooth_stream` reads in parts. A short recording is smoothed in short chunks
+and as a whole, and the labels are compared.
 """
 
 from __future__ import annotations
 
 import resource
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
+import typer
 
+from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
+from pipelines.cli.options import Verbose
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile, report
+from pipelines.figures import FigureTable, cell
 from pipelines.process import one_thread, resident_memory
-from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
-from saga_fg.estimators import BatchSmoother, Measurements, SmoothedState, WindowedSmoother, WindowSettings
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
+from pipelines.tracking import Progress
 from saga_fg.settings import Positive, Range, Settings, setting
+from saga_fg.smoothing import Labels
 
-PLATOON = 5
-CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.0))
-PRIOR = np.diag([0.25, 0.25, 1.0, 1.0])
-NOISE = 0.3  # standard deviation of a measured position, m
-GAP = 15.0  # m between the cars of a platoon
-RATE = 1.0  # at which a car takes over the velocity of the one ahead, 1/s
-STAY = 60.0  # s that a platoon is there, on average
-HIDING, HIDDEN = 0.02, 3.0  # spells a second, and their length in s
+PLATOON, GAP = 5, 15.0  # cars, and m between them
+ROADS, APART = 400, 1000.0  # side by side, m apart: platoons do not meet
+STAY = 60.0  # mean time that a platoon is there, s
+HIDING, HIDDEN = 0.02, 3.0  # hidden spells of a car in a second, and their mean length, s
+NOISE, VELOCITY_NOISE = 0.3, 1.0  # standard deviations of measured positions, m, and velocities, m/s
+PART = 30.0  # s that are read at a time, after which memory is read
 
 
 @dataclass(frozen=True)
@@ -39,193 +41,153 @@ class StreamingBenchSettings(Settings):
     """How much is measured."""
 
     objects: Annotated[int, Range(PLATOON, 10**6)] = setting(200, "objects at any time")
-    seconds: Positive = setting(300.0, "length of the recording")
+    seconds: Positive = setting(300.0, "length of the recording, s")
     rate: Positive = setting(10.0, "frames a second")
-    rows: Annotated[int, Range(1, 1000)] = setting(10, "times at which memory is looked at")
-    compared: Positive = setting(20.0, "s of a recording of its own on which the result is compared with the batch's")
+    compared: Positive = setting(20.0, "length of the recording that is compared with the batch's labels, s")
     seed: int = setting(0, "seed of the traffic")
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return round(self.seconds * self.rate)
 
 
 @dataclass(frozen=True)
 class StreamingRow:
-    """At a time of the recording (s): resident memory (MB), moments held, and CPU time so far (s)."""
+    """When so much was recorded (s): resident memory and the most so far (MB), and CPU time so far (s)."""
 
     recorded: float
     memory: float
-    held: int
+    peak: float
     cpu: float
 
 
 @dataclass(frozen=True)
 class StreamingBench:
-    """What was measured.
+    """Rows over the recording; peak memory of the process (MB); CPU time over recorded time; boxes.
 
-    moments  smoothed; rmse of their positions (m) and anees of their states (1 where covariances are right)
-    peak     most memory of the process, MB; growth: of memory over the second half, MB
-    ratio    CPU time over recorded time
-    largest_difference  of any component of any mean from the batch smoother's, m or m/s
+    growth              peak memory over that after a quarter of the recording
+    largest_difference  of any position from the labels of the whole recording at once, m, on a short one
+    differing           boxes that only one of the two has there, of `compared`
     """
 
     rows: tuple[StreamingRow, ...]
-    moments: int
     peak: float
     growth: float
     ratio: float
-    rmse: float
-    anees: float
+    boxes: int
     largest_difference: float
+    differing: int
+    compared: int
 
 
-@dataclass(frozen=True, eq=False)
-class Instant:
-    """A frame: ids that go before it (g,), ids that come (b,) with prior means (b, 4), how all then present move, what
-    is seen, and the truth (n, 4) in the order of the transition's nodes.
+def bench_streaming(settings: StreamingBenchSettings, progress: Progress | None = None) -> StreamingBench:
+    """Write a recording and smooth it as it is read; then smooth a short one in short chunks and as a whole."""
+    config = load_smooth_config("file")
+    with TemporaryDirectory() as folder, one_thread():
+        table = Path(folder) / "detections.csv"
+        write_traffic(table, settings)
+        rows: list[StreamingRow] = []
+        begin = time.thread_time()
+
+        def look(name: str, done: int, _: int) -> None:
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+            rows.append(StreamingRow(done / settings.rate, resident_memory(), peak, time.thread_time() - begin))
+            if progress is not None:
+                progress(name, done, settings.frames)
+
+        rows_read = round(PART * settings.rate * settings.objects)
+        (done,) = write_streamed_labels(
+            Path(folder) / "labels",
+            lambda spools: smooth_stream(read_scenes_in_parts(table, rows_read), config, spools, progress=look),
+        )
+        look("written", settings.frames, settings.frames)
+        difference, differing, compared = _against_batch(Path(folder), settings)
+    last = rows[-1]
+    growth = last.peak / next(row.peak for row in rows if row.recorded >= settings.seconds / 4)
+    ratio = last.cpu / settings.seconds
+    return StreamingBench(tuple(rows), last.peak, growth, ratio, done.counts.boxes, difference, differing, compared)
+
+
+def write_traffic(path: Path, settings: StreamingBenchSettings) -> None:
+    """Write a table of detections of cars of one size, with headings and measured velocities."""
+    rng, dt = np.random.default_rng(settings.seed), 1 / settings.rate
+    count = settings.objects // PLATOON
+    front, speed = rng.uniform(0, 1000, count), rng.normal(15, 3, count)
+    road, latest, hidden = np.arange(count), count, np.zeros((count, PLATOON))
+    with path.open("w", encoding="utf-8") as file:
+        file.write("timestamp,label,x,y,z,length,width,height,yaw,vx,vy,score\n")
+        for k in range(1, settings.frames + 1):
+            new = np.flatnonzero(rng.random(count) < dt / STAY)
+            front[new], speed[new] = rng.uniform(0, 1000, len(new)), rng.normal(15, 3, len(new))
+            road[new], latest = latest + np.arange(len(new)), latest + len(new)
+            speed += np.sqrt(dt) * rng.normal(size=count)
+            front += dt * speed
+            hides = (hidden <= 0) & (rng.random(hidden.shape) < HIDING * dt)
+            hidden = np.where(hides, rng.exponential(HIDDEN, hidden.shape), hidden - dt)
+            seen = np.nonzero(hidden <= 0)
+            state = np.zeros((len(seen[0]), 4))
+            state[:, 0], state[:, 1] = front[seen[0]] - GAP * seen[1], APART * (road[seen[0]] % ROADS)
+            state[:, 2] = speed[seen[0]]
+            measured = state + rng.normal(size=state.shape) * [NOISE, NOISE, VELOCITY_NOISE, VELOCITY_NOISE]
+            for x, y, vx, vy in measured.tolist():
+                file.write(f"{k * dt:.6f},car,{x:.4f},{y:.4f},0.8,4.5,1.8,1.6,0.0,{vx:.4f},{vy:.4f},0.9\n")
+
+
+def _against_batch(folder: Path, settings: StreamingBenchSettings) -> tuple[float, int, int]:
+    """Largest difference of positions, m; boxes that only one has; boxes in all."""
+    table = folder / "short.csv"
+    write_traffic(table, replace(settings, seconds=settings.compared, objects=min(settings.objects, 10 * PLATOON)))
+    config = load_smooth_config("file")
+    dataset = read_detections(table)
+    whole = smooth_scene(dataset.scene(dataset.scenes[0]), config).labels
+    chunks = StretchSettings(settings.compared / 4, StretchSettings().margin)
+    spools = folder / "spools"
+    spools.mkdir()
+    (run,) = smooth_stream(read_scenes_in_parts(table, 1000), config, spools, stretches=chunks)
+    parts = [moment for _, moments in run.spool.labels() for moment in moments]
+    found = [_apart(mine, theirs) for mine, theirs in zip(parts, whole, strict=True)]
+    return max(apart for apart, _ in found), sum(alone for _, alone in found), sum(map(len, whole))
+
+
+def _apart(mine: Labels, theirs: Labels) -> tuple[float, int]:
+    """The largest difference of positions of the same objects, m, and how many boxes only one has."""
+    both, a, b = np.intersect1d(mine.tracks.id, theirs.tracks.id, return_indices=True)
+    difference = mine.tracks.boxes.position[a] - theirs.tracks.boxes.position[b]
+    return float(np.abs(difference).max(initial=0.0)), len(mine) + len(theirs) - 2 * len(both)
+
+
+def streaming(
+    objects: Annotated[int, typer.Option("--objects", min=PLATOON, help="Objects at any time.")] = 200,
+    seconds: Annotated[float, typer.Option("--seconds", min=1.0, help="Length of the recording.")] = 300.0,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, help="Frames a second.")] = 10.0,
+    compared: Annotated[
+        float, typer.Option("--compared", min=1.0, help="Length of a second one, compared with its smoothing at once.")
+    ] = 20.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the traffic.")] = 0,
+    json_file: JsonFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """Smooth a long file of detections as it is read: memory, time, and the difference from smoothing it at once.
+
+    \b
+    Examples:
+      python -m benchmarks streaming --seconds 60
+      python -m benchmarks streaming --seconds 3600 --json figures.json
     """
-
-    gone: IntArray
-    born: IntArray
-    means: FloatArray
-    transition: Transition
-    measurements: Measurements
-    truth: FloatArray
-
-
-def bench_streaming(
-    settings: StreamingBenchSettings,
-    window: WindowSettings | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> StreamingBench:
-    """Run the traffic through the smoother, then a short part of it through the batch smoother as well."""
-    smoother, score, rows = WindowedSmoother(window), _Score(), list[StreamingRow]()
-    frames = round(settings.seconds * settings.rate)
-    marks = {round(frames * k / settings.rows) for k in range(1, settings.rows + 1)}
-    cpu = 0.0
-    with one_thread():
-        for number, instant in enumerate(traffic(settings, frames), start=1):
-            begin = time.thread_time()
-            _take(smoother, instant)
-            moments = smoother.final()
-            cpu += time.thread_time() - begin
-            score.truth(smoother.time, instant)
-            score.count(moments)
-            if number in marks:
-                rows.append(StreamingRow(smoother.time, resident_memory(), score.waiting, cpu))
-            if progress is not None and number % 10 == 0:
-                progress("streaming", number, frames)
-        score.count(smoother.finish())
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-        difference = _largest_difference(settings, window)
-    half = rows[len(rows) // 2 :]
-    growth = half[-1].memory - half[0].memory
-    recorded = frames / settings.rate
-    return StreamingBench(tuple(rows), score.moments, peak, growth, cpu / recorded, score.rmse, score.anees, difference)
-
-
-def traffic(settings: StreamingBenchSettings, frames: int) -> Iterator[Instant]:
-    """Frames of the platoons."""
-    rng = np.random.default_rng(settings.seed)
-    dt, n = 1 / settings.rate, settings.objects // PLATOON * PLATOON
-    nodes, next_id = np.empty(0, dtype=np.int64), 0
-    truth, hidden = np.empty((0, 4)), np.empty(0)
-    for _ in range(frames):
-        leaving = np.repeat(rng.random(len(nodes) // PLATOON) < dt / STAY, PLATOON)
-        gone, nodes, truth, hidden = nodes[leaving], nodes[~leaving], truth[~leaving], hidden[~leaving]
-        count = n - len(nodes)
-        born = np.arange(next_id, next_id + count)
-        next_id += count
-        fresh = _platoons(rng, count // PLATOON)
-        means = fresh + rng.normal(size=(count, 4)) * np.sqrt(np.diag(PRIOR))
-        nodes, truth = np.concatenate([nodes, born]), np.concatenate([truth, fresh])
-        hidden = np.concatenate([hidden, np.zeros(count)])
-        transition = discretise(_platoon_graph(nodes, truth), dt)
-        truth = (transition.F_matrix @ truth.ravel() + transition.b).reshape(-1, 4)
-        for blocks in transition.Q:
-            root = np.linalg.cholesky(blocks.values)
-            truth[blocks.target] += (root @ rng.normal(size=(len(blocks.target), 4, 1)))[:, :, 0]
-        hides = (hidden <= 0) & (rng.random(n) < HIDING * dt)
-        hidden = np.where(hides, rng.exponential(HIDDEN, n), hidden - dt)
-        seen = np.flatnonzero(hidden <= 0)
-        z = truth[seen, :2] + NOISE * rng.normal(size=(len(seen), 2))
-        measurements = Measurements(nodes[seen], z, np.eye(2, 4), NOISE**2 * np.eye(2))
-        yield Instant(gone, born, means, transition, measurements, truth)
-
-
-def _platoons(rng: np.random.Generator, count: int) -> FloatArray:
-    """States (5 count, 4) of new platoons."""
-    states = np.zeros((count, PLATOON, 4))
-    states[:, :, 0] = rng.uniform(0, 1000, (count, 1)) - GAP * np.arange(PLATOON)
-    states[:, :, 1] = rng.uniform(-100, 100, (count, 1))
-    states[:, :, 2] = rng.normal(15, 3, (count, 1))
-    return states.reshape(-1, 4)
-
-
-def _platoon_graph(nodes: IntArray, truth: FloatArray) -> SceneGraph:
-    """Every car but the first listens to the one ahead."""
-    rows = np.arange(len(nodes))
-    target = rows[rows % PLATOON > 0]
-    gap = np.hypot(*(truth[target - 1, :2] - truth[target, :2]).T)
-    S = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (len(target), 1, 1))
-    rate = RATE * np.exp(-gap / (4 * GAP))
-    edges = Edges("following", target, target - 1, rate, -S, S, np.zeros((len(target), 4)))
-    return SceneGraph.of(nodes, CAR, [edges])
-
-
-def _take(smoother: WindowedSmoother | BatchSmoother, instant: Instant) -> None:
-    smoother.marginalise(instant.gone)
-    smoother.add(instant.born, instant.means, np.tile(PRIOR, (len(instant.born), 1, 1)))
-    smoother.predict(instant.transition)
-    smoother.update(instant.measurements)
-
-
-class _Score:
-    """Errors of the moments that have become final against the truth, which waits for them."""
-
-    def __init__(self) -> None:
-        self._waiting: deque[tuple[float, IntArray, FloatArray]] = deque()
-        self.moments = 0
-        self._squares = self._nees = 0.0
-        self._states = 0
-
-    @property
-    def waiting(self) -> int:
-        """Moments that are not final yet."""
-        return len(self._waiting)
-
-    @property
-    def rmse(self) -> float:
-        """Of positions, m."""
-        return float(np.sqrt(self._squares / max(self._states, 1)))
-
-    @property
-    def anees(self) -> float:
-        """Mean of e^T P^-1 e / d."""
-        return self._nees / max(self._states, 1)
-
-    def truth(self, at: float, instant: Instant) -> None:
-        """Of a frame."""
-        self._waiting.append((at, instant.transition.nodes, instant.truth))
-
-    def count(self, moments: tuple[SmoothedState, ...]) -> None:
-        """Compare moments with the truth, and forget it."""
-        for moment in moments:
-            if not self._waiting or moment.time < self._waiting[0][0] - 1e-6:
-                continue  # the moment before the first frame
-            _, nodes, truth = self._waiting.popleft()
-            error = moment.mean(nodes) - truth
-            self.moments += 1
-            self._squares += float((error[:, :2] ** 2).sum())
-            P = moment.covariance(nodes)
-            self._nees += float((error[:, None] @ np.linalg.solve(P, error[:, :, None])).sum()) / 4
-            self._states += len(error)
-
-
-def _largest_difference(settings: StreamingBenchSettings, window: WindowSettings | None) -> float:
-    """Of any component of any mean from that of the batch smoother, on the first seconds of the traffic."""
-    smoother, batch = WindowedSmoother(window), BatchSmoother(likelihoods=False, order="time")
-    moments: list[SmoothedState] = []
-    for instant in traffic(settings, round(settings.compared * settings.rate)):
-        _take(smoother, instant)
-        _take(batch, instant)
-        moments += smoother.final()
-    pairs = zip(moments, batch.smoothed(covariances=False), strict=False)  # those that were final before the end
-    return max((float(np.abs(mine.state - theirs.state).max(initial=0.0)) for mine, theirs in pairs), default=np.nan)
+    settings = StreamingBenchSettings(objects, seconds, rate, compared, seed)
+    with progress_bar() as progress:
+        result = bench_streaming(settings, progress)
+    rows = tuple((cell(r.recorded, 0), cell(r.memory, 0), cell(r.peak, 0), cell(r.cpu, 1)) for r in result.rows)
+    columns = ("read, s", "memory, MB", "most so far, MB", "CPU, s")
+    table = FigureTable(f"{objects} objects at {rate:g} Hz, {result.boxes} boxes", columns, rows)
+    figures = (
+        cell(result.peak, 0),
+        cell(result.growth, 2),
+        cell(result.ratio),
+        f"{result.largest_difference:.1e}",
+        f"{result.differing} of {result.compared}",
+    )
+    names = ("peak, MB", "/ first quarter's", "CPU s / s", "off by at most, m", "boxes of one alone")
+    title = f"the whole; the last two: {compared:g} s in chunks against at once"
+    report([table, FigureTable(title, names, (figures,))], {"settings": settings, "result": result}, json_file)

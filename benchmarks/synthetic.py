@@ -1,6 +1,6 @@
-"""The paper's claim on synthetic data: MOTA, MOTP and identity switches over coupling, noise, occlusion and density.
+"""`python -m benchmarks synthetic`: MOTA, MOTP and identity switches over coupling, noise, occlusion and density.
 
-Scenes are drawn from the interaction model (`benchmarks.drawn_scenes`), and tracked by
+Scenes are sampled from the interaction model (`benchmarks.sampled_scenes`), and tracked by
 
     kf       independent objects, with the process noise that is the most likely one on scenes of other seeds
     saga     the true interactions and the true process noise, matched by the Hungarian algorithm
@@ -15,23 +15,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from benchmarks.drawn_scenes import LABEL, DrawnSettings, drawn_config, drawn_scene
 from benchmarks.in_view_fit import fit_interactions_in_view
+from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sampled_config
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
+from pipelines.cli.options import Verbose, names
+from pipelines.cli.reporting import progress_bar
+from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig
+from pipelines.figures import FigureTable, cell, percent
 from pipelines.tracking import Progress, track_scene
+from saga_fg.errors import InputError
 from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Scene
 
-BASE = DrawnSettings()
+BASE = SceneSettings()
 OCCLUDED = replace(BASE, spacing=2.5, hidden=0.4, hidden_for=3.0)
-CELLS: Mapping[str, DrawnSettings] = {
+CELLS: Mapping[str, SceneSettings] = {
     "base": BASE,
     "no coupling": replace(BASE, coupling=0.0),
     "weak coupling": replace(BASE, coupling=1.0),
@@ -60,27 +67,27 @@ DEGREES = (3, 5)  # numbers of edges a node may have, tried in place of the temp
 Sums = Callable[[SceneMetrics], tuple[float, float]]
 
 
-def _independent(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfig:
+def _independent(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfig:
     """Without edges, the noise fitted on scenes of the cell."""
-    config = drawn_config(settings, ())
+    config = sampled_config(settings, ())
     objects = measured_trajectories(scenes, config.sensors)
     return config.with_acceleration_noise(fit_acceleration_noise_by_class(objects))
 
 
-def _learned(settings: DrawnSettings, scenes: Sequence[Scene]) -> TrackConfig:
+def _learned(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfig:
     """Interactions and process noise fitted to the truth of some scenes of the cell; as kf where nothing is shared."""
     recordings = [Trajectories.of_truth(scene).until(LEARNED_SECONDS) for scene in scenes[:LEARNED_SCENES]]
     fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,), DEGREES)
     if not fitted.rules:
         return _independent(settings, scenes)
-    config = drawn_config(settings, fitted.rules).with_acceleration_noise(fitted.acceleration_noise)
+    config = sampled_config(settings, fitted.rules).with_acceleration_noise(fitted.acceleration_noise)
     return replace(config, tracker=replace(config.tracker, explained_noise=fitted.explained_noise))
 
 
-CONTENDERS: Mapping[str, Callable[[DrawnSettings, Sequence[Scene]], TrackConfig]] = {
+CONTENDERS: Mapping[str, Callable[[SceneSettings, Sequence[Scene]], TrackConfig]] = {
     KF: _independent,
-    SAGA: lambda settings, scenes: drawn_config(settings),
-    GRAPH: lambda settings, scenes: drawn_config(settings).with_association("graph"),
+    SAGA: lambda settings, scenes: sampled_config(settings),
+    GRAPH: lambda settings, scenes: sampled_config(settings).with_association("graph"),
     LEARNED: _learned,
 }
 """How each contender tracks a cell, given scenes of it, of other seeds, to learn from."""
@@ -128,21 +135,16 @@ class Cell:
         return np.array([SUMS[figure](m) for m in self.metrics[contender]])
 
 
-@dataclass(frozen=True, eq=False)
-class SyntheticResult:
-    """The cells, and two pools of them: all with interactions, and the dense and occluded ones."""
-
-    cells: tuple[Cell, ...]
-    interacting: Cell
-    dense: Cell
-
-
-def synthetic(
+def bench_synthetic(
     seeds: Sequence[int],
-    cells: Mapping[str, DrawnSettings] | None = None,
+    cells: Mapping[str, SceneSettings] | None = None,
     progress: Progress | None = None,
-) -> SyntheticResult:
-    """Track the scenes of `seeds`, drawn anew for every cell."""
+) -> tuple[Cell, ...]:
+    """Track the scenes of `seeds`, sampled anew for every cell.
+
+    Returns the cells, and after them the pools of all cells with interactions and of the dense and occluded ones, if
+    there are any.
+    """
     cells = CELLS if cells is None else cells
     measured = []
     for done, (name, settings) in enumerate(cells.items()):
@@ -151,17 +153,16 @@ def synthetic(
             progress(name, done + 1, len(cells))
     interacting = [cell for cell in measured if cells[cell.name].coupling > 0]
     dense = [cell for cell in measured if cell.name in DENSE]
-    return SyntheticResult(
-        tuple(measured), _pooled("all interacting", interacting), _pooled("both dense hidden", dense)
-    )
+    pools = {"all interacting": interacting, "both dense hidden": dense}
+    return (*measured, *(_pooled(name, some) for name, some in pools.items() if some))
 
 
-def _cell(name: str, settings: DrawnSettings, seeds: Sequence[int]) -> Cell:
-    to_learn_from = [drawn_scene(settings, FIRST_FIT_SEED + k) for k in range(FIT_SCENES)]
+def _cell(name: str, settings: SceneSettings, seeds: Sequence[int]) -> Cell:
+    to_learn_from = [sample_scene(settings, FIRST_FIT_SEED + k) for k in range(FIT_SCENES)]
     configs = {contender: make(settings, to_learn_from) for contender, make in CONTENDERS.items()}
     metrics: dict[str, list[SceneMetrics]] = {contender: [] for contender in configs}
     for seed in seeds:
-        scene = drawn_scene(settings, seed)
+        scene = sample_scene(settings, seed)
         assert scene.ground_truth is not None
         for contender, config in configs.items():
             tracks = track_scene(scene, config.new_tracker("saga")).tracks
@@ -171,3 +172,57 @@ def _cell(name: str, settings: DrawnSettings, seeds: Sequence[int]) -> Cell:
 
 def _pooled(name: str, cells: Sequence[Cell]) -> Cell:
     return Cell(name, {each: [m for cell in cells for m in cell.metrics[each]] for each in CONTENDERS})
+
+
+def synthetic(
+    seeds: Annotated[int, typer.Option("--seeds", min=2, help="Scenes of each cell.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first of them.")] = 0,
+    cells: Annotated[
+        str | None, typer.Option("--cells", help="Names of cells, with commas between; all if left out.")
+    ] = None,
+    json_file: JsonFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """Independent objects, interactions, and graph matching over coupling, noise, occlusion and density.
+
+    A cell of ten scenes takes two minutes of one core, half of it to learn interactions.
+
+    \b
+    Examples:
+      python -m benchmarks synthetic
+      python -m benchmarks synthetic --seeds 2 --cells 'base,no coupling' --json figures.json
+    """
+    chosen = dict(CELLS) if cells is None else {}
+    for name in names("--cells", cells) if cells is not None else ():
+        if name not in CELLS:
+            raise InputError(f"--cells {name}: expected some of {', '.join(CELLS)}")
+        chosen[name] = CELLS[name]
+    with progress_bar(unit="cells") as progress:
+        measured = bench_synthetic(range(seed, seed + seeds), chosen, progress)
+    pairs = [(each, figure) for figure in FIGURES for each in CONTENDERS]
+    values = FigureTable(
+        f"{seeds} scenes a cell; MOTP in m, identity switches (IDS) a scene",
+        ("cell", *(f"{figure} {each}" for each, figure in pairs)),
+        tuple((part.name, *(cell(part.figure(*pair)) for pair in pairs)) for part in measured),
+    )
+    changes = FigureTable(
+        "changes with 95 % intervals: MOTA as a difference, the others in %",
+        ("cell", *(f"{figure}, {a} to {b}" for a, b, figure in COMPARISONS)),
+        tuple((part.name, *(_interval(part, *each) for each in COMPARISONS)) for part in measured),
+    )
+    report([values, changes], {part.name: _as_json(part) for part in measured}, json_file)
+
+
+def _interval(cell: Cell, contender: str, baseline: str, figure: str) -> str:
+    change = cell.change(contender, baseline, figure)
+    if figure == "MOTA":
+        return f"{change.estimate:+.3f} ({change.low:+.3f} to {change.high:+.3f})"
+    return percent(change, 0)
+
+
+def _as_json(cell: Cell) -> dict[str, Any]:
+    return {
+        "figures": {each: {figure: cell.figure(each, figure) for figure in FIGURES} for each in CONTENDERS},
+        "changes": {f"{figure}: {a} to {b}": cell.change(a, b, figure) for a, b, figure in COMPARISONS},
+        "significantly_worse_than_kf": {each: cell.worse(each, KF) for each in CONTENDERS if each != KF},
+    }

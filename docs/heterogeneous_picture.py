@@ -11,13 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from benchmarks.affected import affected
-from benchmarks.heterogeneous import cars_alone
 from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.world import World, build_world
 from pipelines.config import TrackConfig, load_config
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
@@ -26,6 +25,24 @@ from saga_fg.types.track import Tracks
 HORIZON, MOMENT = 2.0, 5.0  # s: of the prediction, and when it is made
 KIND, SEED, TITLE = "red-light", 500, "before a red light"
 COLOURS = {"cars alone": "#1f77b4", "full graph": "#d62728"}
+
+
+def cars_alone(config: TrackConfig) -> TrackConfig:
+    """The configuration without the edges of lights, lines, cones and couplings."""
+    edges = tuple(edge for edge in config.tracker.edges if isinstance(edge, Following | Neighbours))
+    return replace(config, tracker=replace(config.tracker, edges=edges))
+
+
+def before_a_red_light(world: World, time: float) -> StrArray:
+    """Ids of vehicles within 100 m before a closed stop line."""
+    history = world.history
+    k = int(np.argmin(np.abs(history.time - time)))
+    found = np.zeros(history.s.shape[1], dtype=np.bool_)
+    for line in world.layout.stop_lines:
+        if line.closed(time):
+            ahead = line.s - history.s[k]
+            found |= np.isin(history.lane[k], line.lanes) & (ahead > 0) & (ahead < 100.0)
+    return np.array([f"vehicle-{number}" for number in np.flatnonzero(found & history.on_road[k])])
 
 
 def predicted(scene: Scene, config: TrackConfig, row: int) -> Tracks:
@@ -45,14 +62,14 @@ def draw(axes: Any, boxes: Boxes, world_T_local: FloatArray, **style: Any) -> No
 
 
 def panel(axes: Any) -> None:
-    """One scene: what is there, and where the affected vehicles are and are said to be two seconds on."""
+    """One scene: what is there, and where vehicles before the light are, and are predicted to be, two seconds later."""
     settings = replace(scenario_settings(KIND), duration=MOMENT + HORIZON + 1)
     world: World = build_world(settings, SEED)
     scene = scene_from_world(world, settings, SEED)
     row = round(MOMENT * settings.keyframe_rate)
     then = scene.ground_truth[row + round(HORIZON * settings.keyframe_rate)]  # type: ignore[index]
     now = scene.ground_truth[row]  # type: ignore[index]
-    asked = np.isin(then.id, affected(world, world.start + MOMENT))
+    asked = np.isin(then.id, before_a_red_light(world, world.start + MOMENT))
     pose = scene.world_T_ego[row]
     draw(axes, now.boxes, pose, facecolor="#dddddd", edgecolor="none")
     draw(axes, then.boxes.select(asked), pose, facecolor="none", edgecolor="black", linewidth=1.2)
@@ -80,7 +97,7 @@ def write_heterogeneous_picture(folder: Path) -> None:
     axes.set_xlabel("ahead, m")
     handles = [
         Patch(facecolor="#dddddd", label="now"),
-        Patch(facecolor="none", edgecolor="black", label="affected vehicles, true, in 2 s"),
+        Patch(facecolor="none", edgecolor="black", label="vehicles before the light, true, in 2 s"),
         *(Patch(facecolor="none", edgecolor=colour, label=f"predicted by {n}") for n, colour in COLOURS.items()),
         Line2D([], [], color="#d62728", linewidth=3, label="stop line"),
     ]

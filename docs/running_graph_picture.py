@@ -9,7 +9,7 @@ import numpy as np
 from data_tools.plots import running_graph_picture
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from factors import bearing_range_factor
-from pipelines.bench.drawn_traffic import Traffic, draw_traffic, providers
+from pipelines.bench.sampled_traffic import Traffic, providers, sample_traffic
 from pipelines.config import load_config
 from pipelines.explaining import graph_picture
 from saga_fg import Tracker
@@ -40,7 +40,7 @@ class Post:
 
 def write_running_graph_pictures(folder: Path) -> None:
     """Both pictures."""
-    scene = draw_traffic(np.random.default_rng(SEED), frames=5, cars=2, pedestrians=3, intervals=(0.6,))
+    scene = sample_traffic(np.random.default_rng(SEED), frames=5, cars=2, pedestrians=3, intervals=(0.6,))
     smoother = IncrementalSmoother([*providers(scene), Post(scene)], lag=0.5)
     for moment in scene.moments:
         smoother.step(moment.time)

@@ -8,7 +8,7 @@ Each iteration linearises at x, GTSAM's own factors in C++ and ours by their `li
 
 and moves to x + delta. Robust factors enter with the weights of the present x (iteratively reweighted least squares).
 Of ours, those that come together (`ResidualFactors`) take one call for all; the same factors as `CustomFactor`s in
-GTSAM's optimisers took 25 times as long with a hundred nodes (benchmarks/factor_costs.py).
+GTSAM's optimisers took 25 times as long with a hundred nodes.
 
 Levenberg-Marquardt starts at lambda = 0, that is as Gauss-Newton, and damps only steps that fail to lower E
 (Nocedal and Wright, Numerical Optimization, 2nd ed. 2006, section 10.3). Both stop when the next step is short: the

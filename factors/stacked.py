@@ -90,7 +90,7 @@ class ResidualFactors:
         """All keys, each once."""
         return tuple(np.unique(self.rows).tolist())
 
-    def singles(self) -> list[ResidualFactor]:
+    def individual_factors(self) -> list[ResidualFactor]:
         """Return the same as factors of their own, each of which evaluates the whole stack."""
         return [
             ResidualFactor(

@@ -1,4 +1,4 @@
-"""Figures as people and programs read them: tables of texts, and JSON with null for what is not defined."""
+"""Figures for people and programs: tables of texts, and JSON with null for undefined numbers."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import json
 import math
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
+
+if TYPE_CHECKING:
+    from data_tools.metrics import Interval
 
 
 @dataclass(frozen=True)
@@ -28,19 +31,25 @@ class FigureTable:
 
 
 def cell(value: float, digits: int = 3) -> str:
-    """A number as text: whole numbers as they are, others to so many digits, "-" for what is not defined."""
+    """A number as text: whole numbers as they are, others to so many digits, "-" if it is not finite."""
     if isinstance(value, int | np.integer):
         return str(int(value))
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def count(value: float) -> str:
-    """A number that counts something, "-" where it is not defined."""
+    """A count as text, "-" if it is not finite."""
     return cell(value, 0)
 
 
+def percent(change: Interval, digits: int = 1) -> str:
+    """A relative change in percent with its interval: -0.2 becomes "-20.0 % (-25.0 to -15.0)"."""
+    estimate, low, high = (f"{100 * value:+.{digits}f}" for value in (change.estimate, change.low, change.high))
+    return f"{estimate} % ({low} to {high})"
+
+
 def as_json(value: Any) -> Any:
-    """Dataclasses, mappings, sequences, arrays and numbers as JSON has them: null for what is not finite."""
+    """Dataclasses, mappings, sequences, arrays and numbers as values of JSON: null for numbers that are not finite."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, np.ndarray | np.generic):

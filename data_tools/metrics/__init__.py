@@ -9,63 +9,63 @@ from data_tools.metrics.bootstrap import (
     root_mean_square,
 )
 from data_tools.metrics.consistency import coverage, coverages, nees, nees_band
-from data_tools.metrics.error_figures import (
+from data_tools.metrics.error_sample import ErrorSample
+from data_tools.metrics.error_summary import (
     Calibration,
-    ErrorFigures,
+    ErrorSummary,
     calibration,
-    error_figures,
+    error_summary,
     errors_by_class,
 )
-from data_tools.metrics.error_sample import ErrorSample
-from data_tools.metrics.hota import HotaFigures, hota_figures
+from data_tools.metrics.hota import HotaMetrics, hota_metrics
 from data_tools.metrics.kitti_tracking import (
     KittiSimilarity,
-    KittiTrackingFigures,
+    KittiTrackingMetrics,
     KittiTrackingSequence,
-    kitti_hota_figures,
-    kitti_tracking_figures,
+    kitti_hota_metrics,
+    kitti_tracking_metrics,
 )
 from data_tools.metrics.label_errors import LabelErrors, label_errors, label_velocities
 from data_tools.metrics.matching import Matching, match_scene
 from data_tools.metrics.nuscenes_tracking import (
+    NuScenesClassMetrics,
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
     RecallCurves,
-    TrackingFigures,
     nuscenes_tracking_metrics,
 )
 from data_tools.metrics.scene import SceneMetrics, SceneMetricSettings, scene_metrics, scene_metrics_by_label
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 
 __all__ = [
     "Calibration",
-    "ErrorFigures",
     "ErrorSample",
-    "HotaFigures",
+    "ErrorSummary",
+    "HotaMetrics",
     "Interval",
     "KittiSimilarity",
-    "KittiTrackingFigures",
+    "KittiTrackingMetrics",
     "KittiTrackingSequence",
     "LabelErrors",
     "Matching",
+    "NuScenesClassMetrics",
     "NuScenesTrackingMetrics",
     "NuScenesTrackingScene",
     "NuScenesTrackingSettings",
     "RecallCurves",
+    "SceneBoxes",
     "SceneMetricSettings",
     "SceneMetrics",
-    "TrackTable",
-    "TrackingFigures",
     "calibration",
     "coverage",
     "coverages",
     "difference",
-    "error_figures",
+    "error_summary",
     "errors_by_class",
-    "hota_figures",
-    "kitti_hota_figures",
-    "kitti_tracking_figures",
+    "hota_metrics",
+    "kitti_hota_metrics",
+    "kitti_tracking_metrics",
     "label_errors",
     "label_velocities",
     "match_scene",

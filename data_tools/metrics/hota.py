@@ -21,7 +21,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.types.boxes import Boxes
@@ -31,7 +31,7 @@ Similarity = Literal["centre", "bev_iou", "iou_3d"]
 
 
 @dataclass(frozen=True, eq=False)
-class HotaFigures:
+class HotaMetrics:
     """Figures of one class over all scenes, shares in [0, 1] (MOTA may be negative), and counts.
 
     hota, deta, assa, loca are means over `alpha` (19,), the values at each of which are in `hota_at`. CLEAR (mota,
@@ -56,7 +56,7 @@ class HotaFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class SceneSimilarities:
     """One scene as the metrics see it: at each moment the names of true and found objects, and (n, m) similarities."""
 
     true: Sequence[IntArray | StrArray]
@@ -78,13 +78,13 @@ class Compared:
         }
 
 
-def hota_figures(
-    scenes: Sequence[tuple[TrackTable, TrackTable]],
+def hota_metrics(
+    scenes: Sequence[tuple[SceneBoxes, SceneBoxes]],
     label: str,
     similarity: Similarity = "centre",
     reach: float = 4.0,
     threshold: float = 0.5,
-) -> HotaFigures:
+) -> HotaMetrics:
     """Compare the tracks of class `label` with the truth: (truth, found) of each scene.
 
     reach      distance of centres at which their similarity is 0, m
@@ -96,10 +96,10 @@ def hota_figures(
         raise InputError(f"similarity: expected one of {', '.join(get_args(Similarity))}, got {similarity!r}")
     if not scenes:
         raise InputError("scenes: expected at least one scene")
-    return compared_figures([_compared(*scene, label, similarity, reach) for scene in scenes], threshold)
+    return similarity_metrics([_similarities(*scene, label, similarity, reach) for scene in scenes], threshold)
 
 
-def compared_figures(scenes: Sequence[Compared], threshold: float = 0.5) -> HotaFigures:
+def similarity_metrics(scenes: Sequence[SceneSimilarities], threshold: float = 0.5) -> HotaMetrics:
     """The figures of scenes whose similarities are known. Raises `MissingExtraError` without trackeval."""
     metrics = _trackeval_metrics()
     options = {"THRESHOLD": threshold, "PRINT_CONFIG": False}
@@ -109,7 +109,7 @@ def compared_figures(scenes: Sequence[Compared], threshold: float = 0.5) -> Hota
         metric.combine_sequences({str(n): metric.eval_sequence(data) for n, data in enumerate(sequences)})
         for metric in (hota, clear, identity)
     )
-    return HotaFigures(
+    return HotaMetrics(
         hota=float(np.mean(h["HOTA"])),
         deta=float(np.mean(h["DetA"])),
         assa=float(np.mean(h["AssA"])),
@@ -144,11 +144,13 @@ def _numbered(names: Sequence[IntArray | StrArray]) -> list[IntArray]:
     return np.split(numbers.astype(np.int64), np.cumsum([len(each) for each in names])[:-1])
 
 
-def _compared(truth: TrackTable, found: TrackTable, label: str, similarity: Similarity, reach: float) -> Compared:
+def _similarities(
+    truth: SceneBoxes, found: SceneBoxes, label: str, similarity: Similarity, reach: float
+) -> SceneSimilarities:
     """The objects of a class in one scene."""
     moments = 1 + int(max(truth.moment.max(initial=-1), found.moment.max(initial=-1)))
     true_rows, found_rows = (_rows_of_class(table, label, moments) for table in (truth, found))
-    return Compared(
+    return SceneSimilarities(
         [truth.id[rows] for rows in true_rows],
         [found.id[rows] for rows in found_rows],
         [
@@ -158,7 +160,7 @@ def _compared(truth: TrackTable, found: TrackTable, label: str, similarity: Simi
     )
 
 
-def _rows_of_class(table: TrackTable, label: str, moments: int) -> list[IntArray]:
+def _rows_of_class(table: SceneBoxes, label: str, moments: int) -> list[IntArray]:
     """Rows of a class at each moment."""
     rows = np.flatnonzero(table.boxes.label == label)
     return np.split(rows, np.searchsorted(table.moment[rows], np.arange(1, moments)))[:moments]

@@ -22,7 +22,7 @@ import numpy as np
 from data_tools.metrics.consistency import nees
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.nearest_pairs import nearest_pairs
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
@@ -82,8 +82,8 @@ class LabelErrors(Columns):
 
 
 def label_errors(
-    truth: TrackTable,
-    found: TrackTable,
+    truth: SceneBoxes,
+    found: SceneBoxes,
     velocity: FloatArray,
     detections: tuple[IntArray, Boxes] | None = None,
     gate: float = GATE,
@@ -116,7 +116,7 @@ def label_errors(
     return LabelErrors(truth.boxes.label, number, np.linalg.norm(velocity, axis=1), matched, **columns)
 
 
-def label_velocities(truth: TrackTable, timestamps: FloatArray, reach: int) -> FloatArray:
+def label_velocities(truth: SceneBoxes, timestamps: FloatArray, reach: int) -> FloatArray:
     """Velocities (N, 2), m/s, of labels over `reach` moments to either side; NaN where these have no label.
 
     timestamps  (K,) of the moments, s

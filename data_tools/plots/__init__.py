@@ -1,12 +1,9 @@
-"""Pictures of tracks and paths, and of how good they are; matplotlib is imported when one is drawn."""
+"""Pictures of tracks, paths, graphs and metrics; matplotlib is imported when one is drawn."""
 
-from data_tools.plots.birds_eye import Panel, birds_eye_view, png, trails
-from data_tools.plots.calibration import calibration_plot
-from data_tools.plots.error_histograms import error_histograms
-from data_tools.plots.from_above import paths_from_above
-from data_tools.plots.recall_sweep import recall_sweep
+from data_tools.plots.birds_eye import Panel, birds_eye_view, png
+from data_tools.plots.maps import paths_from_above, scan_map_from_above
+from data_tools.plots.metrics import calibration_plot, error_histograms, recall_sweep
 from data_tools.plots.running_graph import running_graph_picture
-from data_tools.plots.scan_map import scan_map_from_above
 
 __all__ = [
     "Panel",
@@ -18,5 +15,4 @@ __all__ = [
     "recall_sweep",
     "running_graph_picture",
     "scan_map_from_above",
-    "trails",
 ]

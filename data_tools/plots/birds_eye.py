@@ -1,4 +1,4 @@
-"""Bird's-eye pictures: what is there, what was detected and what the tracks say, around the vehicle at one moment.
+"""Bird's-eye pictures of true objects, detections and tracks around the vehicle at one moment.
 
 The picture is drawn in the vehicle's frame, driving direction to the right. True objects are grey areas, hatched where
 no sensor can see them; detections are small crosses; tracks are coloured outlines, paler the lower their score, with
@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_of
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations
 from saga_fg.types.frame import Detections
 from saga_fg.types.track import Tracks
 
+PAST = 3.0  # s, of the paths that are drawn
 COASTING = 0.15  # s without detection from which a track is drawn as coasting
 ELLIPSE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degrees of freedom
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b", "#637939", "#3949ab")
@@ -29,22 +30,10 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One picture of several side by side.
-
-    tracks  at the moment of the picture, world coordinates
-    trails  past positions (k, 2) by track id, world coordinates, see `trails`
-    """
+    """One picture of several side by side: the tracks of its moment, the last of `history`, and of those before."""
 
     title: str
-    tracks: Tracks
-    trails: dict[int, FloatArray]
-
-
-def trails(history: Sequence[Tracks], duration: float = 3.0) -> dict[int, FloatArray]:
-    """Positions (k, 2) that the tracks of the last moment of `history` took over the `duration` (s) before it."""
-    last = history[-1]
-    window = [tracks for tracks in history if last.timestamp - tracks.timestamp <= duration + 1e-9]
-    return {int(id_): np.concatenate([t.boxes.position[t.id == id_, :2] for t in window]) for id_ in last.id}
+    history: Sequence[Tracks]
 
 
 def birds_eye_view(
@@ -71,7 +60,7 @@ def birds_eye_view(
         ax.set_title(panel.title, loc="left", fontsize=11)
         ax.grid(color="#e6e6e6", linewidth=0.6)
         ax.set_axisbelow(True)
-        _draw_ego(ax)
+        ax.fill([2.2, -1.4, -0.6, -1.4], [0.0, 1.1, 0.0, -1.1], color="black", zorder=8)  # the vehicle
         if truth is not None:
             _draw_truth(ax, truth, ego_T_world)
         if detections is not None:
@@ -84,14 +73,10 @@ def birds_eye_view(
 
 
 def png(figure: Any, dpi: int = 110) -> bytes:
-    """A figure as the content of a PNG file."""
+    """Return a figure as the content of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
-
-
-def _draw_ego(ax: Any) -> None:
-    ax.fill([2.2, -1.4, -0.6, -1.4], [0.0, 1.1, 0.0, -1.1], color="black", zorder=8)
 
 
 def _draw_truth(ax: Any, truth: Annotations, ego_T_world: FloatArray) -> None:
@@ -103,7 +88,8 @@ def _draw_truth(ax: Any, truth: Annotations, ego_T_world: FloatArray) -> None:
 
 
 def _draw_tracks(ax: Any, panel: Panel, ego_T_world: FloatArray, extent: Extent) -> None:
-    tracks = panel.tracks
+    tracks = panel.history[-1]
+    recent = [before for before in panel.history if tracks.timestamp - before.timestamp <= PAST + 1e-9]
     outlines = _outlines(tracks.boxes, ego_T_world)
     centres = transform_points(ego_T_world, tracks.boxes.position)[:, :2]
     velocity = tracks.boxes.velocity @ ego_T_world[:2, :2].T
@@ -115,14 +101,17 @@ def _draw_tracks(ax: Any, panel: Panel, ego_T_world: FloatArray, extent: Extent)
         style = {"color": colour, "alpha": 0.3 + 0.7 * min(max(track.score, 0.0), 1.0), "zorder": 6}
         closed = np.concatenate([outline, outline[:1]])
         ax.plot(*closed.T, linewidth=1.4, linestyle="--" if coasting else "-", **style)
-        past = panel.trails.get(track.id, np.empty((0, 2)))
-        ax.plot(*_to_ego(past, ego_T_world).T, color=colour, linewidth=1.0, alpha=0.55, zorder=2)
+        past = np.concatenate([before.boxes.position[before.id == track.id, :2] for before in recent])
+        ax.plot(
+            *(past @ ego_T_world[:2, :2].T + ego_T_world[:2, 3]).T, color=colour, linewidth=1.0, alpha=0.55, zorder=2
+        )
         if np.hypot(*velocity[row]) > 0.5:
             ax.arrow(
                 *centre, *velocity[row], width=0.12, head_width=0.7, length_includes_head=True, linewidth=0, **style
             )
         if coasting:
-            ax.plot(*_ellipse(centre, track.position_covariance, ego_T_world).T, linewidth=0.8, **style)
+            ring = centre + ellipse_95(track.position_covariance) @ ego_T_world[:2, :2].T
+            ax.plot(*ring.T, linewidth=0.8, **style)
         ax.annotate(
             str(track.id), centre, xytext=(0, 7), textcoords="offset points", fontsize=7, ha="center",
             annotation_clip=True, **style,
@@ -130,25 +119,19 @@ def _draw_tracks(ax: Any, panel: Panel, ego_T_world: FloatArray, extent: Extent)
 
 
 def _outlines(boxes: Boxes, ego_T_world: FloatArray) -> FloatArray:
-    """Footprints (N, 4, 2) in the vehicle's frame; a metre square where size or heading are unknown."""
+    """Return footprints (N, 4, 2) in the vehicle's frame; a metre square where size or heading are unknown."""
     local = boxes.transformed(ego_T_world)
     known = np.isfinite(local.size).all(axis=1) & np.isfinite(local.yaw)
     size = np.where(known[:, None], local.size, 1.0)
     return Boxes(local.label, local.position, size, np.where(known, local.yaw, 0.0), local.velocity).corners()
 
 
-def _to_ego(points: FloatArray, ego_T_world: FloatArray) -> FloatArray:
-    return np.asarray(points @ ego_T_world[:2, :2].T + ego_T_world[:2, 3])
-
-
-def _ellipse(centre: FloatArray, covariance: FloatArray, ego_T_world: FloatArray) -> FloatArray:
-    """The 95 % ellipse (64, 2) of a horizontal position covariance (2, 2) given in world coordinates."""
+def ellipse_95(covariance: FloatArray) -> FloatArray:
+    """Return the 95 % ellipse (64, 2) of a position covariance (2, 2), about the origin."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2 * np.pi, 64)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.sqrt(ELLIPSE_95 * np.maximum(values, 0.0))
-    turn = yaw_of(ego_T_world[:3, :3])
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    return np.asarray(centre + circle @ vectors.T @ R.T)
+    return np.asarray(circle @ vectors.T)
 
 
 def _legend() -> list[Any]:

@@ -1,4 +1,4 @@
-"""Pictures of a running graph: variables where they are, a square for each factor, joined to its variables."""
+"""Pictures of a running graph: variables at their places, a square for each factor, joined to its variables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.plots.birds_eye import ELLIPSE_95
+from data_tools.plots.birds_eye import ellipse_95
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 COLOURS = {"interaction": "#4d4d4d", "detection": "#009e73", "birth": "#cc79a7", "marginal prior": "#8c8c8c"}
@@ -23,11 +23,11 @@ WAYS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
 def running_graph_picture(
     record: Mapping[str, Any], title: str = "", centre: Sequence[float] | None = None, radius: float = 30.0
 ) -> Any:
-    """A matplotlib `Figure` of a graph as `saga_fg.tracking.graph_record` lists it.
+    """Return a matplotlib `Figure` of a graph as `saga_fg.tracking.graph_record` lists it.
 
-    Variables of the newest time are filled and named, where they are; earlier ones are hollow, and set back where they
-    would be hidden. `centre` (x, y) and `radius`, m, choose a part. Raises `KeyError`, `IndexError`, `TypeError` or
-    `ValueError` for what is no such list.
+    Variables of the newest time are filled and named; earlier ones are hollow, and set back where they would be hidden.
+    `centre` (x, y) and `radius`, m, choose a part. Raises `KeyError`, `IndexError`, `TypeError` or `ValueError` for
+    another kind of record.
     """
     from matplotlib.figure import Figure
 
@@ -68,7 +68,7 @@ def running_graph_picture(
 
 
 def _behind(node: Mapping[str, Any]) -> FloatArray:
-    """The unit vector (2,) to the rear of a node's box, to the left where there is none."""
+    """Return the unit vector (2,) to the rear of a node's box, to the left without one."""
     corners = np.array(node.get("outline", ()), dtype=float)
     along = corners[1] - corners[0] if node["kind"] == "object" and len(corners) else np.array([-1.0, 0.0])
     return np.asarray(along / np.linalg.norm(along))
@@ -77,7 +77,7 @@ def _behind(node: Mapping[str, Any]) -> FloatArray:
 def _set_back(
     nodes: Sequence[Mapping[str, Any]], places: FloatArray, behind: FloatArray, newest: BoolArray, least: float
 ) -> FloatArray:
-    """The places (n, 2), of earlier states at least `least` m from the newest of the same name."""
+    """Return the places (n, 2), earlier states at least `least` m from the newest one of their name."""
     now = {node["name"].split(" at ")[0]: n for n, node in enumerate(nodes) if newest[n]}
     places = places.copy()
     for n, node in enumerate(nodes):
@@ -95,7 +95,7 @@ def _draw_factors(
     colours: Mapping[str, str],
     stub: float,
 ) -> FloatArray:
-    """Draw all factors, those on one node beside it; returns places (m, 2) of their squares and along their lines."""
+    """Draw all factors, unary ones beside their node; return places (m, 2) of their squares and along their lines."""
     covered = [np.empty((0, 2))]
     beside: dict[int, int] = {}
     for factor in factors:
@@ -103,7 +103,7 @@ def _draw_factors(
         mine = places[rows]
         at = mine[:2].mean(axis=0) if kind == "interaction" else mine.mean(axis=0)
         apart = float(np.hypot(*(mine[-1] - mine[0])))
-        if len(rows) == 2 and apart > 4 * stub:  # a measurement from afar stands beside what is measured
+        if len(rows) == 2 and apart > 4 * stub:  # a measurement from afar is drawn beside the measured node
             at = mine[1] + 1.5 * stub / apart * (mine[0] - mine[1])
         if len(rows) == 1:
             turn = (-np.pi / 2, np.pi / 2, -np.pi / 4, np.pi / 4, np.pi)[beside.get(rows[0], 0) % 5]
@@ -130,10 +130,7 @@ def _draw_node(ax: Any, node: Mapping[str, Any], place: FloatArray, newest: bool
         points = np.concatenate([outline, outline[:1]]) if box else outline
         ax.plot(*points.T, color="#9a9a9a" if box else "#56b4e9", linewidth=0.8, zorder=2)
     if "covariance" in node:
-        values, vectors = np.linalg.eigh(np.array(node["covariance"], dtype=float))
-        angle = np.linspace(0.0, 2 * np.pi, 48)
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.sqrt(ELLIPSE_95 * np.maximum(values, 0.0))
-        ring = (place + circle @ vectors.T).T
+        ring = (place + ellipse_95(np.array(node["covariance"], dtype=float))).T
         ax.plot(*ring, color="#1f77b4", alpha=0.45, linewidth=0.6, zorder=2)
         if np.ptp(ring, axis=1).max() < LARGE:
             ax.fill(*ring, facecolor="#1f77b4", alpha=0.15, linewidth=0, zorder=2)
@@ -141,15 +138,13 @@ def _draw_node(ax: Any, node: Mapping[str, Any], place: FloatArray, newest: bool
 
 
 def _style(kind: str, newest: bool) -> dict[str, Any]:
-    face = {"ego pose": "black", "known ego pose": "#9a9a9a", "landmark": "#e69f00", "map node": "#56b4e9"}.get(
-        kind, "#1f77b4"
-    )
+    face = FACES.get(kind, "#1f77b4")
     edge = {"markeredgecolor": "#333333", "markeredgewidth": 0.8}
     return {"marker": MARKERS.get(kind, "o"), "markerfacecolor": face if newest else "white", **edge}
 
 
 def _draw_names(ax: Any, names: Sequence[str], places: FloatArray, obstacles: FloatArray, point: float) -> None:
-    """Put each name where it covers the least of what is there: nodes, factors, other names. Sizes in points."""
+    """Draw each name where it covers the least of nodes, factors and other names. Sizes in points."""
     places, boxes = places / point, [np.array([*(place - 3.5), *(place + 3.5)]) for place in obstacles / point]
     for name, place in zip(names, places, strict=True):
         size = np.array([0.58 * LABEL * len(name), 1.15 * LABEL])
@@ -166,7 +161,7 @@ def _draw_names(ax: Any, names: Sequence[str], places: FloatArray, obstacles: Fl
 
 
 def _overlap(a: FloatArray, b: FloatArray) -> float:
-    """Area that two boxes (left, low, right, high) share, in square points."""
+    """Return the common area of two boxes (left, low, right, high), square points."""
     return float(np.prod(np.maximum(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0.0)))
 
 

@@ -1,18 +1,14 @@
-"""Hostile clients of a service, in a process of their own.
-
-Lines on standard input say how far the good clients are, from 0 to 1; the attack goes as far and ends with them. The
-number of messages sent is printed at the end.
-"""
+"""Hostile clients of a service, in a process of their own, which keep pace with the good clients."""
 
 from __future__ import annotations
 
+import os
 import select
 import socket
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
+from multiprocessing import get_context, parent_process
+from typing import Any
 
 import numpy as np
 
@@ -27,60 +23,52 @@ MESSAGES_OF_A_CONNECTION = 100
 
 
 class Attack:
-    """Starts the process. seconds: how long the good clients' clocks run."""
+    """Starts the process. seconds: duration of the good clients' clocks."""
 
     def __init__(self, address: Address, seed: int, messages: int, seconds: float) -> None:
-        command = [sys.executable, "-m", "pipelines.bench.attack", *map(str, (address, seed, messages, seconds))]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        context = get_context("spawn")
+        self._share = -(-messages // CLIENTS)
+        self._done = context.Value("d", 0.0)
+        arguments = (address, seed, self._share, seconds, self._done)
+        self._process = context.Process(target=_attack, args=arguments, daemon=True)
+        self._process.start()
 
     def go_on(self, done: float) -> None:
-        """The good clients are as far, 0 to 1. Raises `SagaError` when the process has failed."""
-        assert self._process.stdin is not None
-        try:
-            print(done, file=self._process.stdin, flush=True)
-        except OSError as error:
-            raise SagaError("the hostile clients have gone away") from error
+        """Send up to this share of the messages, 0 to 1. Raises `SagaError` when the process has failed."""
+        if self._process.exitcode:
+            raise SagaError("the hostile clients have failed")
+        self._done.value = done
 
     def end(self) -> int:
-        """Wait for the last message; how many were sent."""
-        sent, _ = self._process.communicate(f"{1.0}\n")
-        if self._process.returncode != 0:
-            raise SagaError("the hostile clients have failed")
-        return int(sent)
+        """Wait for the last message; returns the number of messages."""
+        self.go_on(1.0)
+        self._process.join()
+        self.go_on(1.0)
+        return self._share * CLIENTS
 
     def kill(self) -> None:
-        """At once."""
+        """End the process at once."""
         self._process.kill()
-        self._process.communicate()
+        self._process.join()
 
 
-class _Progress:
-    """How far the good clients are; 1 when nobody says so any more."""
-
-    def __init__(self) -> None:
-        self.done = 0.0
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        for line in sys.stdin:
-            self.done = float(line)
-        self.done = 1.0
-
-
-def _main(path: str, seed: str, messages: str, seconds: str) -> None:
-    progress, share = _Progress(), -(-int(messages) // CLIENTS)
-    threads = [
-        threading.Thread(target=_send, args=(Address(path=Path(path)), int(seed) + k, share, progress, float(seconds)))
-        for k in range(CLIENTS)
-    ]
+def _attack(address: Address, seed: int, share: int, seconds: float, done: Any) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threads = [threading.Thread(target=_send, args=(address, seed + k, share, seconds, done)) for k in range(CLIENTS)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    print(share * CLIENTS)
 
 
-def _send(address: Address, seed: int, messages: int, progress: _Progress, seconds: float) -> None:
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _send(address: Address, seed: int, messages: int, seconds: float, done: Any) -> None:
     rng = np.random.default_rng([seed, 7])
     sent = 0
     while sent < messages:
@@ -88,9 +76,9 @@ def _send(address: Address, seed: int, messages: int, progress: _Progress, secon
             with _connected(address) as client:
                 reads, count = rng.random() >= RUDE, int(rng.integers(1, 2 * MESSAGES_OF_A_CONNECTION))
                 for _ in range(min(count, messages - sent)):
-                    while sent > progress.done * messages:
+                    while sent > done.value * messages:
                         time.sleep(0.005)
-                    line = hostile_line(rng, EPOCH + seconds * progress.done)
+                    line = hostile_line(rng, EPOCH + seconds * done.value)
                     sent += 1
                     if rng.random() < UNFINISHED:
                         client.sendall(line[: len(line) // 2])
@@ -114,11 +102,7 @@ def _connected(address: Address) -> socket.socket:
 
 
 def _discard(client: socket.socket) -> None:
-    """Read what answers are there."""
+    """Read the answers that are there."""
     while select.select([client], [], [], 0.0)[0]:
         if not client.recv(2**16):
             raise ConnectionError
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])

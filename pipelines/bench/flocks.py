@@ -1,4 +1,4 @@
-"""Flocks: nodes that interact by shared velocity, with data drawn from the model itself.
+"""Flocks: nodes that interact by shared velocity, with data sampled from the model itself.
 
     connected   points drift in the plane, every node listens to the four nearest, chosen anew at every frame
     components  groups of five, in which everybody listens to most of the others, to others at every frame
@@ -75,14 +75,20 @@ def flock(kind: Kind, n: int, frames: int, seed: int, mixing: float = 0.35) -> F
         A = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (len(target), 1, 1))
         edges = Edges("shared velocity", target, source, rate, -A, A, np.zeros((len(target), 4)))
         transition = discretise(SceneGraph.of(np.arange(n), CAR, [edges]), DT)
-        truth = (transition.F_matrix @ truth.ravel() + transition.b).reshape(n, 4)
-        for blocks in transition.Q:
-            root = np.linalg.cholesky(blocks.values)
-            truth[blocks.target] += (root @ rng.normal(size=(len(blocks.target), 4, 1)))[:, :, 0]
+        truth = sample_step(transition, truth, rng)
         seen = np.flatnonzero(rng.random(n) >= MISSED)
         z = truth[seen, :2] + NOISE * rng.normal(size=(len(seen), 2))
         record.append(Frame(transition, Measurements(seen, z, np.eye(2, 4), NOISE**2 * np.eye(2)), truth))
     return Flock(kind, np.arange(n), means, np.tile(P, (n, 1, 1)), tuple(record))
+
+
+def sample_step(transition: Transition, states: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """States (n, d) at the end of an interval, with sampled process noise, in the order of the transition's nodes."""
+    moved: FloatArray = (transition.F_matrix @ states.ravel() + transition.b).reshape(states.shape)
+    for blocks in transition.Q:
+        noise = rng.normal(size=(len(blocks.target), states.shape[1], 1))
+        moved[blocks.target] += (np.linalg.cholesky(blocks.values) @ noise)[:, :, 0]
+    return moved
 
 
 def _nearest(points: FloatArray) -> tuple[IntArray, IntArray]:

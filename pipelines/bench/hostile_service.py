@@ -1,16 +1,15 @@
-"""A service among hostile clients: what becomes of the frames of two good ones.
+"""A service among hostile clients: which frames of two good clients are lost, doubled or late.
 
     two good clients   numbered frames of the same objects, each of its own sensor
     hostile clients    broken, poisonous and random messages, clocks that jump, connections that break off
     a listener         that has subscribed and does not read
     the driver         kills the service half-way (SIGKILL) and starts it again from its snapshot
 
-What counts of a good frame is that the service judged it, and once: it was taken in (`tracks`), came too late by a
-clock that others have set (`late`), or awaited a confirmation of that clock (`unconfirmed`). *Lost* is a frame with no
-such answer, or one that the service has not counted in `taken`; *doubled* is one that was answered as taken in twice,
-or that the service has counted beyond that. Frames
-judged after the last snapshot before the kill are judged anew, and the new answer counts, since the service has
-forgotten the first with all that followed from it.
+The service has to answer each good frame once: it was taken in (`tracks`), came too late by a clock that others have
+set (`late`), or waits for a confirmation of that clock (`unconfirmed`). A frame is *lost* without such an answer, or if
+the service has not counted it in `taken`; it is *doubled* if it was answered as taken in twice, or if the service has
+counted it twice. Frames answered after the last snapshot before the kill are answered again, and the new answer counts,
+because the service has forgotten the first.
 """
 
 from __future__ import annotations
@@ -29,12 +28,13 @@ from typing import Any
 import numpy as np
 
 from pipelines.bench.attack import Attack
-from pipelines.bench.circling_objects import INTERVAL, CirclingObjects
 from pipelines.bench.good_client import JUDGED, GoodClient
 from pipelines.bench.hostile_messages import EPOCH, SENSORS
 from pipelines.bench.served import Served
+from pipelines.bench.service import INTERVAL, CirclingObjects
 from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
+from pipelines.tracking import Progress
 from saga_fg.errors import SagaError
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
@@ -61,7 +61,7 @@ class HostileBenchSettings(Settings):
 
 @dataclass(frozen=True)
 class HostileBench:
-    """What came of it.
+    """Counts of messages, times and memory.
 
     tracked                         frames of the good clients whose answer was `tracks`
     valid, answered, lost, doubled  frames of the good clients
@@ -95,21 +95,18 @@ class HostileBench:
 
     @property
     def shortcomings(self) -> list[str]:
-        """What is not as it should be."""
-        growth = self.memory[1] / self.memory[0]
+        """One text for each figure that is out of bounds."""
+        growth, stall = self.memory[1] / self.memory[0], self.longest_stall
         checks = {
             f"{self.lost} frames lost": self.lost > 0,
             f"{self.doubled} frames doubled": self.doubled > 0,
-            f"a stall of {self.longest_stall:.3f} s, expected at most {MOST_STALL:g} s": self.longest_stall
-            > MOST_STALL,
+            f"a stall of {stall:.3f} s, expected at most {MOST_STALL:g} s": stall > MOST_STALL,
             f"memory grew to {growth:.3f} of the start, expected at most {MOST_GROWTH:g}": growth > MOST_GROWTH,
         }
         return [text for text, wrong in checks.items() if wrong]
 
 
-def bench_hostile_service(
-    settings: HostileBenchSettings, progress: Callable[[int, int], None] | None = None
-) -> HostileBench:
+def bench_hostile_service(settings: HostileBenchSettings, progress: Progress | None = None) -> HostileBench:
     """Run it on this machine. Raises `SagaError` when the service does not come up, or does not come back."""
     with tempfile.TemporaryDirectory() as folder:
         address = Address(path=Path(folder) / "service.sock")
@@ -120,11 +117,7 @@ class _Run:
     """One run: its processes and threads, and what they share."""
 
     def __init__(
-        self,
-        settings: HostileBenchSettings,
-        address: Address,
-        state: Path,
-        progress: Callable[[int, int], None] | None,
+        self, settings: HostileBenchSettings, address: Address, state: Path, progress: Progress | None
     ) -> None:
         self._settings = settings
         self._address = address
@@ -182,7 +175,7 @@ class _Run:
             done = sum(len(client.waits) for client in clients)
             attack.go_on(done / total)
             if self._progress is not None:
-                self._progress(done, total)
+                self._progress("valid frames", done, total)
 
     def _status(self) -> dict[str, Any]:
         with StreamClient(self._address) as client:

@@ -14,9 +14,9 @@ from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_sce
 from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
+    SceneBoxes,
     SceneMetrics,
-    TrackTable,
-    kitti_tracking_figures,
+    kitti_tracking_metrics,
     label_errors,
     nuscenes_tracking_metrics,
     scene_metrics,
@@ -121,7 +121,7 @@ class KittiSet:
         def figures_of(rows: Sequence[int]) -> dict[str, float]:
             figures: dict[str, float] = {}
             for label, iou in (*((label, 0.25) for label in CLASSES), ("car", 0.5)):
-                f = kitti_tracking_figures([pairs[row] for row in rows], label, iou)
+                f = kitti_tracking_metrics([pairs[row] for row in rows], label, iou)
                 if f is not None:
                     name = label if iou == 0.25 else f"{label} at {iou:g}"
                     figures |= {f"{name} sAMOTA": f.samota, f"{name} AMOTA": f.amota}
@@ -129,7 +129,7 @@ class KittiSet:
             return figures
 
         def of_cars() -> Sequence[HotaRow]:
-            f = kitti_tracking_figures(pairs, "car", 0.25)
+            f = kitti_tracking_metrics(pairs, "car", 0.25)
             return kitti_hota(pairs, {"car": f.threshold}) if f is not None else ()
 
         return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()), of_cars)
@@ -151,8 +151,8 @@ class SimulatedSet:
             truth = run.scene.ground_truth
             assert truth is not None
             metrics.append(scene_metrics(truth, run.tracks))
-            labels = TrackTable.of_annotations(truth, hidden=False)
-            errors.append(label_errors(labels, TrackTable.of_tracks(run.tracks), labels.boxes.velocity))
+            labels = SceneBoxes.of_annotations(truth, hidden=False)
+            errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
 
         def figures_of(rows: Sequence[int]) -> dict[str, float]:
             m = SceneMetrics.pool(metrics[row] for row in rows)

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from data_tools.metrics import nees_band
 from factors import gaussian_factors, prior_factors
-from pipelines.bench.drawn_traffic import Moment, draw_traffic, process_noise, providers
 from pipelines.bench.estimator_figures import Row
 from pipelines.bench.flocks import Kind
 from pipelines.bench.measuring import timed
+from pipelines.bench.sampled_traffic import Moment, process_noise, providers, sample_traffic
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphView, NewVariable
 from saga_fg.graph.factor_checks import Factor
@@ -121,7 +121,7 @@ def windows(scenes: int, frames: int, seed: int) -> list[Row]:
     squares: dict[str, float] = dict.fromkeys(times, 0.0)
     degrees = nodes = 0
     for k in range(scenes):
-        scene = draw_traffic(np.random.default_rng([seed, k]), frames)
+        scene = sample_traffic(np.random.default_rng([seed, k]), frames)
         nodes = max(nodes, max(1 + len(moment.states) for moment in scene.moments))
         lags = dict(zip(times, (None, LAG), strict=True))
         both = {name: IncrementalSmoother(providers(scene), lag) for name, lag in lags.items()}

@@ -8,16 +8,16 @@ refused.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
-from pipelines.bench.circling_objects import INTERVAL, CirclingObjects
 from pipelines.bench.served import Served
 from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
+from pipelines.tracking import Progress
 from saga_fg.settings import PositiveInt, Range, Settings, setting
 
 BROKEN = (
@@ -26,13 +26,15 @@ BROKEN = (
     b'{"timestamp": "noon", "detections": []}\n',
     b'{"timestamp": 1, "detections": [{"x": 1}]}\n',
 )
+INTERVAL = 0.1  # s between frames
+NOISE = 0.2  # of detections, m
 IN_FLIGHT = 4  # frames sent ahead of their answers
 ANSWERS = ("tracks", "held", "repeat")
 
 
 @dataclass(frozen=True)
 class ServiceBenchSettings(Settings):
-    """How long, and how rough."""
+    """Length of the run and shares of bad messages."""
 
     frames: PositiveInt = setting(100_000, "frames to send")
     objects: PositiveInt = setting(50, "objects in each")
@@ -43,7 +45,7 @@ class ServiceBenchSettings(Settings):
 
 @dataclass(frozen=True)
 class ServiceBench:
-    """What came of it; memory in MB after a tenth and at the end, latencies in ms."""
+    """Counts of messages; memory in MB after a tenth and at the end, latencies in ms."""
 
     valid: int
     taken_in: int
@@ -60,7 +62,23 @@ class ServiceBench:
         return self.valid == self.taken_in and self.broken == self.refused
 
 
-def bench_service(settings: ServiceBenchSettings, progress: Callable[[int, int], None] | None = None) -> ServiceBench:
+class CirclingObjects:
+    """`number` cars within 200 m, each on a circle of 20 m."""
+
+    def __init__(self, number: int, seed: int) -> None:
+        rng = np.random.default_rng([seed, 2])
+        self._centre = rng.uniform(-200, 200, (number, 2))
+        self._phase = rng.uniform(0, 2 * np.pi, number)
+
+    def detections(self, time: float, rng: np.random.Generator) -> list[dict[str, Any]]:
+        """Detections of all objects at a time, s, with noise, in the form of a message."""
+        angle = self._phase + 0.3 * time
+        position = self._centre + 20 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        position = position + rng.normal(0, NOISE, position.shape)
+        return [{"label": "car", "x": x, "y": y, "score": 0.9} for x, y in position.round(3).tolist()]
+
+
+def bench_service(settings: ServiceBenchSettings, progress: Progress | None = None) -> ServiceBench:
     """Run it on this machine. Raises `SagaError` when the service does not come up."""
     server = Served("--listen", "127.0.0.1:0")
     try:
@@ -69,9 +87,7 @@ def bench_service(settings: ServiceBenchSettings, progress: Callable[[int, int],
         server.end()
 
 
-def _drive(
-    address: Address, settings: ServiceBenchSettings, progress: Callable[[int, int], None] | None
-) -> ServiceBench:
+def _drive(address: Address, settings: ServiceBenchSettings, progress: Progress | None) -> ServiceBench:
     rng = np.random.default_rng([settings.seed, 1])
     unanswered: deque[bytes] = deque()
     early: dict[str, Any] = {}
@@ -93,7 +109,7 @@ def _drive(
         if k == settings.frames // 10:
             early = _settled(client, unanswered)
         if progress is not None:
-            progress(k + 1, settings.frames)
+            progress("frames sent", k + 1, settings.frames)
     final = _settled(client, unanswered)
     client.close()
     return ServiceBench(

@@ -7,26 +7,32 @@ errors at labels from their sums, the figures averaged over recall by scoring ea
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.coasting import coasting_errors
-from pipelines.bench.drawn_differences import drawn_differences
-from pipelines.bench.learned_folds import learn_by_folds
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
 from pipelines.evaluation.hota import HotaRow
+from pipelines.learning import learn_interactions
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
+from saga_fg.errors import InputError
+from saga_fg.learning import Trajectories
 from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.types.dataset import Dataset
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
 
 SAGA, KF, BASELINE = "saga", "kf", "centerpoint"
 LEARNED = Variant("learned interactions")
+FOLDS = 2  # of scenes that interactions are learned from
 LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE")
 
 
@@ -152,6 +158,23 @@ def _in_space(score: Score) -> list[HotaRow]:
     return [row for row in score.hota() if row.label == "car" and row.overlap == "3D"]
 
 
+def learn_by_folds(dataset: Dataset, progress: Progress | None = None) -> dict[str, LearnedInteractions]:
+    """Interactions for every scene, learned from the truth of the scenes of the other fold.
+
+    Raises `InputError` for a single scene.
+    """
+    if len(dataset.scenes) < FOLDS:
+        raise InputError(f"{', '.join(dataset.scenes)}: expected scenes to learn from beside it")
+    trajectories = {name: Trajectories.of_truth(dataset.scene(name)) for name in dataset.scenes}
+    learned: dict[str, LearnedInteractions] = {}
+    for fold in range(FOLDS):
+        tested = dataset.scenes[fold::FOLDS]
+        others = {name: found for name, found in trajectories.items() if name not in tested}
+        found = learn_interactions(others, f"scenes {', '.join(others)}", progress=progress)
+        learned |= dict.fromkeys(tested, found)
+    return learned
+
+
 def graph_differences(
     saga: Score, kf: Score, coasting: Sequence[Mapping[str, ErrorSample]], settings: TrackingBenchSettings
 ) -> dict[str, Interval]:
@@ -160,13 +183,41 @@ def graph_differences(
         return {}
     result = {}
     if settings.draws:
-        result = drawn_differences(saga.figures_of, kf.figures_of, len(saga.errors), settings.draws, settings.seed)
+        result = sampled_differences(saga.figures_of, kf.figures_of, len(saga.errors), settings.draws, settings.seed)
     for name in ("position", "velocity", "heading"):
         a, b = ([errors.sample(name).square_sums for errors in score.errors] for score in (saga, kf))
         result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
     if coasting:
         a, b = ([scene[name].square_sums for scene in coasting] for name in (SAGA, KF))
         result["coasting RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
+    return result
+
+
+def sampled_differences(
+    first: Callable[[Sequence[int]], Mapping[str, float]],
+    second: Callable[[Sequence[int]], Mapping[str, float]],
+    scenes: int,
+    draws: int,
+    seed: int = 0,
+    confidence: float = 0.95,
+) -> dict[str, Interval]:
+    """First less second over `scenes` scenes in each figure that both have, with its interval."""
+    rng = np.random.default_rng(seed)
+    sampled: dict[str, list[float]] = {}
+    for _ in range(draws):
+        rows = rng.integers(scenes, size=scenes).tolist()
+        a, b = first(rows), second(rows)
+        for name in a:
+            if name in b:
+                sampled.setdefault(name, []).append(a[name] - b[name])
+    tail = (1 - confidence) / 2
+    ours, theirs = first(range(scenes)), second(range(scenes))
+    result = {}
+    for name, values in sampled.items():
+        known = [value for value in values if math.isfinite(value)]
+        if name in ours and name in theirs and known:
+            low, high = np.quantile(known, [tail, 1 - tail]).tolist()
+            result[name] = Interval(ours[name] - theirs[name], low, high, confidence)
     return result
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from data_tools.metrics import Interval, calibration, error_figures, errors_by_class
+from data_tools.metrics import Interval, calibration, error_summary, errors_by_class
 from pipelines.bench.tracking import SetResult, verdict
 from pipelines.figures import FigureTable, cell
 
@@ -21,7 +21,7 @@ def figures(result: SetResult) -> dict[str, Any]:
         "variants": {
             name: {
                 "figures": each.figures,
-                "errors": {label: error_figures(e) for label, e in errors_by_class(result.errors(name)).items()},
+                "errors": {label: error_summary(e) for label, e in errors_by_class(result.errors(name)).items()},
                 "milliseconds_per_frame": each.milliseconds,
                 "milliseconds_by_stage": each.stages,
                 "ratio_to_centerpoint": result.ratio(name),
@@ -42,7 +42,7 @@ def _variants(result: SetResult) -> FigureTable:
     columns = ("variant", *names, "position", "velocity", "... moving", "ms / frame", "/ centerpoint")
     rows = []
     for name, each in result.variants.items():
-        errors = error_figures(result.errors(name))
+        errors = error_summary(result.errors(name))
         headline = (_headline(figure, value) for figure, value in each.figures.items())
         rest = (cell(errors.position), cell(errors.velocity), cell(errors.velocity_moving))
         rows.append((name, *headline, *rest, cell(each.milliseconds, 2), cell(result.ratio(name), 1)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.bench_estimators import estimators
-from pipelines.cli.bench_joint import joint
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
 from pipelines.cli.bench_tracking import tracking
@@ -13,7 +12,7 @@ from pipelines.cli.reporting import ReportingGroup
 
 bench_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
-for command in (estimators, joint, service, slam, tracking):
+for command in (estimators, service, slam, tracking):
     bench_app.command()(command)
 
 

@@ -7,16 +7,15 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
-from pipelines.cli.tables import JsonFile
+from pipelines.cli.tables import JsonFile, report, show_tables
 
 if TYPE_CHECKING:
     from pipelines.bench.estimator_figures import Row
     from pipelines.bench.estimators import EstimatorBench
+    from pipelines.figures import FigureTable
 
 
 def estimators(
@@ -52,9 +51,7 @@ def estimators(
       saga-fg bench estimators
       saga-fg bench estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
     """
-    from data_tools.files.atomic_files import check_writable
     from pipelines.bench.estimators import EstimatorBenchSettings, bench_estimators
-    from pipelines.figures import write_figures
 
     settings = EstimatorBenchSettings(
         counts("--sizes", sizes),
@@ -68,25 +65,10 @@ def estimators(
         seed,
         everything=everything,
     )
-    if json_file is not None:
-        check_writable(json_file)
     with progress_bar(unit="cases") as progress:
         result = bench_estimators(settings, progress)
-    _print(result)
-    if json_file is not None:
-        write_figures(json_file, _figures(result))
-
-
-def _print(result: EstimatorBench) -> None:
-    console = Console()
-    console = Console(width=max(console.width, 110))  # narrower, the table is no longer one
-    columns = ("case", "graph", "nodes", "estimator", "ms", "ratio", "largest error", "covariance", "ANEES", "MB")
-    table = Table(*columns, title="cost, and error in standard deviations", title_justify="left")
-    for row in result.rows:
-        cells = [f"{row.milliseconds:.3g}", _number(row.ratio), _number(row.largest_error, ".1e")]
-        cells += [_number(row.covariance_error, ".1e"), _number(row.anees, ".3f") + _band(row), _number(row.memory)]
-        table.add_row(row.case, row.graph, str(row.nodes), row.contender, *cells)
-    console.print(table)
+    tables = _tables(result)
+    report(tables[:1], _figures(result), json_file)
     for name, exponent in result.exponents.items():
         typer.echo(f"cost of {name}: grows as nodes^{exponent:.2f}")
     for soak in result.soaks:
@@ -96,12 +78,26 @@ def _print(result: EstimatorBench) -> None:
             f"end, {ms[0]:.3g} ms of a young filter in turn with it; {memory[0]:.0f} MB at the start, "
             f"{memory[1]:.0f} MB at the end"
         )
-    table = Table("figure", "measured", "to reach", "", title="figures to reach", title_justify="left")
-    words = {True: "reached", False: "missed", None: "not measured"}
-    for criterion in result.criteria:
-        table.add_row(criterion.name, _number(criterion.value), f"<= {criterion.limit}", words[criterion.reached])
-    console.print(table)
+    show_tables(tables[1:])
     typer.echo(", ".join(f"{name} {value}" for name, value in result.environment.items()))
+
+
+def _tables(result: EstimatorBench) -> list[FigureTable]:
+    """The rows, and the figures to reach."""
+    from pipelines.figures import FigureTable
+
+    rows = []
+    for row in result.rows:
+        cells = [f"{row.milliseconds:.3g}", _number(row.ratio), _number(row.largest_error, ".1e")]
+        cells += [_number(row.covariance_error, ".1e"), _number(row.anees, ".3f") + _band(row), _number(row.memory)]
+        rows.append((row.case, row.graph, str(row.nodes), row.contender, *cells))
+    columns = ("case", "graph", "nodes", "estimator", "ms", "ratio", "largest error", "covariance", "ANEES", "MB")
+    words = {True: "reached", False: "missed", None: "not measured"}
+    criteria = tuple((c.name, _number(c.value), f"<= {c.limit}", words[c.reached]) for c in result.criteria)
+    return [
+        FigureTable("cost, and error in standard deviations", columns, tuple(rows)),
+        FigureTable("figures to reach", ("figure", "measured", "to reach", ""), criteria),
+    ]
 
 
 def _band(row: Row) -> str:
@@ -113,8 +109,6 @@ def _number(value: float, form: str = ".3g") -> str:
 
 
 def _figures(result: EstimatorBench) -> dict[str, Any]:
-    """For programs: with what each criterion came to."""
-    figures = asdict(result)
-    figures["criteria"] = [asdict(criterion) | {"reached": criterion.reached} for criterion in result.criteria]
-    figures["settings"] = asdict(result.settings)
-    return figures
+    """The figures for programs, with the result of each criterion."""
+    criteria = [asdict(criterion) | {"reached": criterion.reached} for criterion in result.criteria]
+    return asdict(result) | {"criteria": criteria}

@@ -10,7 +10,7 @@ import typer
 
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
-from pipelines.cli.tables import JsonFile
+from pipelines.cli.tables import JsonFile, report
 from saga_fg.errors import SagaError
 
 if TYPE_CHECKING:
@@ -53,26 +53,20 @@ def service(
       saga-fg bench service --frames 2000 --objects 10 --json figures.json
       saga-fg bench service --hostile
     """
-    from data_tools.files.atomic_files import check_writable
+    from pipelines.bench.hostile_service import HostileBenchSettings
+    from pipelines.bench.service import ServiceBenchSettings
 
-    if json_file is not None:
-        check_writable(json_file)
     if hostile:
-        from pipelines.bench.hostile_service import HostileBenchSettings
-
         _hostile(HostileBenchSettings(messages, objects, pace, seed), json_file)
     else:
-        from pipelines.bench.service import ServiceBenchSettings
-
         _endurance(ServiceBenchSettings(frames, objects, malformed, late, seed), json_file)
 
 
 def _endurance(settings: ServiceBenchSettings, json_file: Path | None) -> None:
     from pipelines.bench.service import bench_service
-    from pipelines.figures import write_figures
 
     with progress_bar() as progress:
-        result = bench_service(settings, lambda done, total: progress("frames sent", done, total))
+        result = bench_service(settings, progress)
     latency = result.latency
     typer.echo(f"{result.taken_in} of {result.valid} valid frames taken in, {result.out_of_order} of them out of order")
     typer.echo(f"{result.refused} of {result.broken} broken lines refused")
@@ -84,18 +78,16 @@ def _endurance(settings: ServiceBenchSettings, json_file: Path | None) -> None:
         f"latency, ms: median {latency['p50']:.3g}; p99 / median {latency['p99'] / latency['p50']:.2f}, "
         f"p99.9 / median {latency['p99.9'] / latency['p50']:.2f}"
     )
-    if json_file is not None:
-        write_figures(json_file, {**asdict(result), "nothing_lost": result.nothing_lost})
+    report([], {**asdict(result), "nothing_lost": result.nothing_lost}, json_file)
     if not result.nothing_lost:
         raise SagaError("frames were lost, doubled or wrongly refused")
 
 
 def _hostile(settings: HostileBenchSettings, json_file: Path | None) -> None:
     from pipelines.bench.hostile_service import bench_hostile_service
-    from pipelines.figures import write_figures
 
     with progress_bar() as progress:
-        result = bench_hostile_service(settings, lambda done, total: progress("valid frames", done, total))
+        result = bench_hostile_service(settings, progress)
     start, end = result.memory
     dropped = ", ".join(f"{count} {reason}" for reason, count in sorted(result.dropped.items())) or "none"
     typer.echo(f"valid frames: {result.valid} sent, {result.tracked} tracked")
@@ -110,7 +102,6 @@ def _hostile(settings: HostileBenchSettings, json_file: Path | None) -> None:
     typer.echo(f"restarts of the tracker: {result.restarts}, internal errors: {result.failures}")
     typer.echo(f"frames sent again: {result.sent_again}")
     typer.echo(f"from the restart of the service to its first answer: {result.first_answer:.3f} s")
-    if json_file is not None:
-        write_figures(json_file, {**asdict(result), "shortcomings": result.shortcomings})
+    report([], {**asdict(result), "shortcomings": result.shortcomings}, json_file)
     if result.shortcomings:
         raise SagaError("; ".join(result.shortcomings))

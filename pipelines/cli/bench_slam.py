@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
-from pipelines.cli.tables import JsonFile
-
-if TYPE_CHECKING:
-    from pipelines.bench.slam import SlamRow
+from pipelines.cli.tables import JsonFile, report
 
 
 def slam(
@@ -39,28 +33,19 @@ def slam(
       saga-fg bench slam --dataroot data/kitti --sequence 0000
     """
     from data_tools.datasets.kitti import KittiScans
-    from data_tools.files.atomic_files import check_writable
     from pipelines.bench.slam import bench_slam
-    from pipelines.figures import write_figures
+    from pipelines.figures import FigureTable, cell
 
-    if json_file is not None:
-        check_writable(json_file)
     with progress_bar() as progress:
         rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress)
-    _print(rows, sequence)
-    if json_file is not None:
-        write_figures(json_file, [asdict(row) for row in rows])
-
-
-def _print(rows: list[SlamRow], sequence: str) -> None:
-    columns = ("scans", "method", "RPE, m per 10 m", "RPE, deg per 10 m", "end, m", "residual, mm", "ms a scan")
-    table = Table(*columns, title=f"sequence {sequence}: odometry against GPS/IMU", title_justify="left")
+    shown = []
     for row in rows:
         e = row.errors
-        figures = (e.relative_translation, 57.29578 * e.relative_rotation, e.end_error, 1e3 * row.residual)
-        table.add_row(row.case, row.contender, *(f"{x:.3f}" for x in figures), f"{row.milliseconds:.1f}")
-    console = Console()
-    Console(width=max(console.width, 110)).print(table)
+        errors = (e.relative_translation, 57.29578 * e.relative_rotation, e.end_error, 1e3 * row.residual)
+        shown.append((row.case, row.contender, *(cell(x) for x in errors), cell(row.milliseconds, 1)))
+    columns = ("scans", "method", "RPE, m per 10 m", "RPE, deg per 10 m", "end, m", "residual, mm", "ms a scan")
+    table = FigureTable(f"sequence {sequence}: odometry against GPS/IMU", columns, tuple(shown))
+    report([table], rows, json_file)
     for ours, theirs in itertools.pairwise(rows):
         if ours.case == theirs.case:
             worse = 100 * (ours.errors.relative_translation - theirs.errors.relative_translation)

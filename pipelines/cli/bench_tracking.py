@@ -9,7 +9,7 @@ import typer
 
 from pipelines.cli.options import Config, Verbose, names
 from pipelines.cli.reporting import progress_bar
-from pipelines.cli.tables import JsonFile, show_tables
+from pipelines.cli.tables import JsonFile, MarkdownFile, report
 
 
 def tracking(
@@ -36,9 +36,7 @@ def tracking(
     draws: Annotated[int, typer.Option("--draws", min=0, help="Drawn sets of scenes for intervals; 0: none.")] = 200,
     config: Config = None,
     json_file: JsonFile = None,
-    markdown: Annotated[
-        Path | None, typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE")
-    ] = None,
+    markdown: MarkdownFile = None,
     verbose: Verbose = False,
 ) -> None:
     """Track the same recordings by every method, and with every component off; compare accuracy and time.
@@ -52,16 +50,11 @@ def tracking(
       saga-fg bench tracking --data data --sets kitti --no-components --no-coasting
       saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components --no-coasting
     """
-    from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.bench.recordings import SETS, recording_set
     from pipelines.bench.tracking import TrackingBenchSettings, bench_set
     from pipelines.bench.tracking_tables import figures, tables
     from pipelines.config import load_config
-    from pipelines.figures import write_figures
 
-    for path in (json_file, markdown):
-        if path is not None:
-            check_writable(path)
     everything = (*SETS, "simulated") if data is not None else ("simulated",)
     chosen = [recording_set(name, data, scenes) for name in (names("--sets", sets) if sets else everything)]
     settings = TrackingBenchSettings(components, contenders, draws, coasting)
@@ -70,8 +63,4 @@ def tracking(
         for recordings in chosen:
             results.append(bench_set(recordings, load_config(recordings.family, config), settings, progress))
     shown = [table for result in results for table in tables(result)]
-    show_tables(shown)
-    if json_file is not None:
-        write_figures(json_file, {result.name: figures(result) for result in results})
-    if markdown is not None:
-        write_text(markdown, "\n".join(table.markdown() for table in shown))
+    report(shown, {result.name: figures(result) for result in results}, json_file, markdown)

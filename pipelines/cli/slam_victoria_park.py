@@ -36,7 +36,7 @@ def victoria_park(
 
     from data_tools.datasets.victoria_park import read_victoria_park
     from data_tools.files.atomic_files import check_writable_folder
-    from data_tools.metrics.grouping import pairwise_agreement
+    from data_tools.metrics.pairwise_agreement import pairwise_agreement
     from pipelines.slam.results import landmark_rows, planar_trajectory, write_landmark_map
     from pipelines.slam.victoria_park import ParkSettings, map_park
 

@@ -1,10 +1,10 @@
-"""Tables of figures on the screen, and JSON files of them."""
+"""Tables of figures on the screen, and files of them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -13,7 +13,37 @@ from rich.table import Table
 if TYPE_CHECKING:
     from pipelines.figures import FigureTable
 
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file too.", metavar="FILE")]
+
+def _writable(path: Path | None) -> Path | None:
+    """Refuse a file that cannot be written before the work begins."""
+    if path is not None:
+        from data_tools.files.atomic_files import check_writable
+
+        check_writable(path)
+    return path
+
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", help="Write the figures to this file too.", metavar="FILE", callback=_writable),
+]
+MarkdownFile = Annotated[
+    Path | None,
+    typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE", callback=_writable),
+]
+
+
+def report(tables: Iterable[FigureTable], figures: Any, json_file: Path | None, markdown: Path | None = None) -> None:
+    """Print the tables, and write the figures and the tables to the files that were asked for."""
+    from data_tools.files.atomic_files import write_text
+    from pipelines.figures import write_figures
+
+    tables = list(tables)
+    show_tables(tables)
+    if json_file is not None:
+        write_figures(json_file, figures)
+    if markdown is not None:
+        write_text(markdown, "\n".join(table.markdown() for table in tables))
 
 
 def show_tables(tables: Iterable[FigureTable]) -> None:

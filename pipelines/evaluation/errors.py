@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics import Calibration, ErrorFigures, LabelErrors, calibration, error_figures, errors_by_class
+from data_tools.metrics import Calibration, ErrorSummary, LabelErrors, calibration, error_summary, errors_by_class
 from data_tools.plots import calibration_plot, error_histograms
 from pipelines.figures import FigureTable, cell
 
@@ -22,7 +22,7 @@ def error_tables(errors: LabelErrors) -> list[FigureTable]:
     classes = errors_by_class(errors)
     title = "RMSE at labels: position in m, velocity in m/s, heading in degrees"
     tables = [
-        FigureTable(title, _ERRORS, tuple((name, *_error_cells(error_figures(e))) for name, e in classes.items()))
+        FigureTable(title, _ERRORS, tuple((name, *_error_cells(error_summary(e))) for name, e in classes.items()))
     ]
     calibrations = {name: calibration(e) for name, e in classes.items()}
     if any(c.boxes for c in calibrations.values()):
@@ -37,7 +37,7 @@ def error_json(errors: LabelErrors) -> dict[str, Any]:
     classes = errors_by_class(errors)
     fits = {name: calibration(e) for name, e in classes.items()}
     return {
-        "errors": {name: error_figures(e) for name, e in classes.items()},
+        "errors": {name: error_summary(e) for name, e in classes.items()},
         "calibration": {
             name: {
                 **{
@@ -56,7 +56,7 @@ def error_pictures(errors: LabelErrors) -> dict[str, Any]:
     return pictures | ({"calibration": calibration_plot(errors)} if np.isfinite(errors.nees).any() else {})
 
 
-def _error_cells(f: ErrorFigures) -> tuple[str, ...]:
+def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
     errors = (f.position, f.detection, f.velocity, f.velocity_parked, f.velocity_moving)
     heading = cell(float(np.degrees(f.heading)), 1)
     return (cell(f.labels), cell(f.tracked), *(cell(x) for x in errors), heading, cell(f.flipped))

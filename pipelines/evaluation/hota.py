@@ -1,6 +1,6 @@
 """HOTA, CLEAR and Identity figures of a result, class by class, in the plane (2D) and in space (3D).
 
-KITTI's are of what its benchmark judges (`data_tools.metrics.kitti_tracking.judged_objects`), by the overlap in the
+KITTI's are of what its benchmark judges (`data_tools.metrics.kitti_tracking.evaluated_objects`), by the overlap in the
 image as well, as published figures are.
 
 These metrics judge one set of tracks, without a sweep over scores. The tracks judged are those whose mean score reaches
@@ -17,12 +17,12 @@ import numpy as np
 
 from data_tools.kitti_objects import KittiObjects
 from data_tools.metrics import (
-    HotaFigures,
+    HotaMetrics,
     KittiSimilarity,
     KittiTrackingSequence,
-    TrackTable,
-    hota_figures,
-    kitti_hota_figures,
+    SceneBoxes,
+    hota_metrics,
+    kitti_hota_metrics,
 )
 from data_tools.metrics.hota import Similarity
 from pipelines.figures import FigureTable, cell
@@ -43,16 +43,16 @@ class HotaRow:
     label: str
     overlap: str
     threshold: float
-    figures: HotaFigures
+    figures: HotaMetrics
 
 
-def hota(scenes: Sequence[tuple[TrackTable, TrackTable]], thresholds: Mapping[str, float]) -> list[HotaRow]:
+def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[str, float]) -> list[HotaRow]:
     """Judge (truth, found) of all scenes for the classes of `thresholds`. Raises `MissingExtraError` w/o trackeval."""
     rows = []
     for label, threshold in thresholds.items():
         judged = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
         for overlap, similarity in SIMILARITIES.items():
-            rows.append(HotaRow(label, overlap, threshold, hota_figures(judged, label, similarity)))
+            rows.append(HotaRow(label, overlap, threshold, hota_metrics(judged, label, similarity)))
     return rows
 
 
@@ -62,7 +62,7 @@ def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[s
     for label, threshold in thresholds.items():
         judged = [replace(each, found=_surer_lines(each.found, label, threshold)) for each in sequences]
         for overlap, similarity in KITTI_SIMILARITIES.items():
-            rows.append(HotaRow(label, overlap, threshold, kitti_hota_figures(judged, label, similarity)))
+            rows.append(HotaRow(label, overlap, threshold, kitti_hota_metrics(judged, label, similarity)))
     return rows
 
 
@@ -83,7 +83,7 @@ def hota_json(rows: Sequence[HotaRow]) -> dict[str, Any]:
     return result
 
 
-def _surer(found: TrackTable, label: str, threshold: float) -> TrackTable:
+def _surer(found: SceneBoxes, label: str, threshold: float) -> SceneBoxes:
     """The tracks of a class whose mean score is at least `threshold`."""
     rows = np.flatnonzero(found.boxes.label == label)
     return found.select(rows[_mean_scores(found.id[rows], found.score[rows]) >= threshold - 1e-12])
@@ -102,7 +102,7 @@ def _mean_scores(track: IntArray | StrArray, score: FloatArray) -> FloatArray:
     return np.asarray((np.bincount(number, weights=score) / np.maximum(np.bincount(number), 1))[number])
 
 
-def _cells(f: HotaFigures) -> tuple[str, ...]:
+def _cells(f: HotaMetrics) -> tuple[str, ...]:
     percent = (cell(100 * value, 2) for value in (f.hota, f.deta, f.assa, f.loca, f.mota, f.motp))
     identity = (cell(100 * value, 2) for value in (f.idf1, f.idp, f.idr))
     return (*percent, cell(f.ids), cell(f.frag), *identity)

@@ -10,10 +10,10 @@ import numpy as np
 
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence
 from data_tools.metrics import (
-    KittiTrackingFigures,
+    KittiTrackingMetrics,
     KittiTrackingSequence,
     LabelErrors,
-    kitti_tracking_figures,
+    kitti_tracking_metrics,
     label_errors,
     label_velocities,
 )
@@ -31,7 +31,7 @@ _COLUMNS = (
     *("class", "3D IoU", "sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
     *("TP", "FP", "FN", "GT", "MT", "ML"),
 )
-ByIou = Mapping[float, KittiTrackingFigures]
+ByIou = Mapping[float, KittiTrackingMetrics]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def evaluate_kitti(
     pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
     tracking: dict[str, ByIou] = {}
     for label in classes:
-        by_iou = {iou: figures for iou in ious if (figures := kitti_tracking_figures(pairs, label, iou)) is not None}
+        by_iou = {iou: figures for iou in ious if (figures := kitti_tracking_metrics(pairs, label, iou)) is not None}
         if by_iou:
             tracking[label] = by_iou
     best = {label: next(iter(by_iou.values())).threshold for label, by_iou in tracking.items()}
@@ -107,7 +107,7 @@ def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:
     return FigureTable(title, _COLUMNS, tuple((label, iou, *_cells(f)) for label, iou, f in rows))
 
 
-def _cells(f: KittiTrackingFigures) -> tuple[str, ...]:
+def _cells(f: KittiTrackingMetrics) -> tuple[str, ...]:
     def percent(*values: float) -> tuple[str, ...]:
         return tuple(cell(100 * value, 2) for value in values)
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from data_tools.export.labels import LabelRows, read_label_table
-from data_tools.metrics import TrackTable, coverages
+from data_tools.metrics import SceneBoxes, coverages
 from data_tools.metrics.labels import (
+    CommonBoxes,
     LabelledScene,
     PrecisionRecall,
-    SameBoxes,
     SelfConsistency,
+    common_boxes,
     precision_recall,
-    same_boxes,
     scored_pairs,
     self_consistency,
 )
@@ -51,7 +51,7 @@ class LabelEvaluation:
 
     scenes: tuple[str, ...]
     curves: Mapping[float, Mapping[str, PrecisionRecall]]
-    same: Mapping[float, SameBoxes]
+    same: Mapping[float, CommonBoxes]
     consistency: Mapping[str, SelfConsistency]
 
     def tables(self) -> list[FigureTable]:
@@ -76,13 +76,13 @@ class LabelEvaluation:
                 }
                 for distance, curves in self.curves.items()
             },
-            "same_boxes": {
+            "common_boxes": {
                 title: {group: _json_of(boxes) for group, boxes in groups.items()} for title, groups in self._groups()
             },
             "consistency": {name: asdict(value) for name, value in self.consistency.items()},
         }
 
-    def _groups(self) -> list[tuple[str, dict[str, SameBoxes]]]:
+    def _groups(self) -> list[tuple[str, dict[str, CommonBoxes]]]:
         """Tables of the same boxes: by distance of the match, class, range, and whether they could be seen."""
         if not self.same:
             return []
@@ -116,14 +116,14 @@ def evaluate_labels(
     scenes: list[str] = []
     timestamps: list[FloatArray] = []
     labelled: list[LabelledScene] = []
-    parts: dict[str, list[TrackTable]] = {name: [] for name in SYSTEMS}
+    parts: dict[str, list[SceneBoxes]] = {name: [] for name in SYSTEMS}
     seen: list[tuple[IntArray, Boxes, FloatArray]] = []
     for name in np.unique(rows.tracks.scene).tolist():
         scene = dataset.scene(name)
         online = track_scene(scene, config.tracking.new_tracker(method), progress)
         systems = {
             "detections": _detections(scene, config),
-            "online": TrackTable.of_tracks(online.tracks),
+            "online": SceneBoxes.of_tracks(online.tracks),
             "labels": _labels(scene, rows, table),
         }
         first = len(np.concatenate([np.empty(0), *timestamps]))
@@ -139,7 +139,7 @@ def evaluate_labels(
     noise = np.concatenate(moment), Boxes.concatenate(boxes), np.concatenate(R)
     consistency = {name: self_consistency(_joined(parts[name]), times, noise) for name in ("online", "labels")}
     curves: dict[float, dict[str, PrecisionRecall]] = {}
-    same: dict[float, SameBoxes] = {}
+    same: dict[float, CommonBoxes] = {}
     if len(labelled) == len(scenes):
         for distance in DISTANCES:
             curves[distance] = {
@@ -148,11 +148,11 @@ def evaluate_labels(
                 )
                 for system in SYSTEMS
             }
-            same[distance] = SameBoxes.pool(same_boxes(scene, distance) for scene in labelled)
+            same[distance] = CommonBoxes.pool(common_boxes(scene, distance) for scene in labelled)
     return LabelEvaluation(tuple(scenes), curves, same, consistency)
 
 
-def _labels(scene: Scene, rows: LabelRows, table: str | Path) -> TrackTable:
+def _labels(scene: Scene, rows: LabelRows, table: str | Path) -> SceneBoxes:
     """The rows of a scene at its moments."""
     mine = np.flatnonzero(rows.tracks.scene == scene.name)
     times = scene.timestamps
@@ -165,10 +165,10 @@ def _labels(scene: Scene, rows: LabelRows, table: str | Path) -> TrackTable:
     mine = mine[order]
     tracks = rows.tracks
     boxes = tracks.boxes.select(mine)
-    return TrackTable(moment[order], tracks.id[mine], boxes, tracks.score[mine], tracks.position_covariance[mine])
+    return SceneBoxes(moment[order], tracks.id[mine], boxes, tracks.score[mine], tracks.position_covariance[mine])
 
 
-def _detections(scene: Scene, config: SmoothConfig) -> TrackTable:
+def _detections(scene: Scene, config: SmoothConfig) -> SceneBoxes:
     """The detections taken at the scene's moments, each an object of its own, scores as probabilities."""
     moment, boxes = placed_detections(scene)
     moments = set(scene.timestamps.tolist())
@@ -179,7 +179,7 @@ def _detections(scene: Scene, config: SmoothConfig) -> TrackTable:
         for frame in scene.frames
         if frame.timestamp in moments
     ]
-    return TrackTable(moment, np.arange(len(boxes)).astype(np.str_), boxes, np.concatenate([np.empty(0), *scores]))
+    return SceneBoxes(moment, np.arange(len(boxes)).astype(np.str_), boxes, np.concatenate([np.empty(0), *scores]))
 
 
 def _noise(scene: Scene, config: SmoothConfig, first: int) -> tuple[IntArray, Boxes, FloatArray]:
@@ -192,24 +192,24 @@ def _noise(scene: Scene, config: SmoothConfig, first: int) -> tuple[IntArray, Bo
     return at[there] + first, world, evidence.R[there, :2, :2]
 
 
-def _labelled(scene: Scene, systems: Mapping[str, TrackTable]) -> LabelledScene:
+def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
     assert scene.ground_truth is not None
-    truth = TrackTable.of_annotations(scene.ground_truth)
+    truth = SceneBoxes.of_annotations(scene.ground_truth)
     visible = np.concatenate([np.empty(0, dtype=np.bool_), *(moment.visible for moment in scene.ground_truth)])
     place = scene.world_T_ego[truth.moment][:, :2, 3]
     distance = np.hypot(*(truth.boxes.position[:, :2] - place).T)
     return LabelledScene(truth, visible, truth.boxes.velocity, distance, systems)
 
 
-def _moved(table: TrackTable, first: int, scene: str) -> TrackTable:
+def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
     """The same with moments from `first` on and ids that name the scene."""
     names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
     return replace(table, moment=table.moment + first, id=names)
 
 
-def _joined(tables: Sequence[TrackTable]) -> TrackTable:
+def _joined(tables: Sequence[SceneBoxes]) -> SceneBoxes:
     """The boxes of several scenes whose moments follow each other."""
-    return TrackTable(
+    return SceneBoxes(
         np.concatenate([t.moment for t in tables]),
         np.concatenate([t.id for t in tables]),
         Boxes.concatenate([t.boxes for t in tables]),
@@ -230,7 +230,7 @@ def _recall_table(curves: Mapping[float, Mapping[str, PrecisionRecall]]) -> Figu
     return FigureTable(title, (*columns, *(f"at {p:g}" for p in PRECISIONS)), tuple(rows))
 
 
-def _group_table(group: tuple[str, Mapping[str, SameBoxes]]) -> FigureTable:
+def _group_table(group: tuple[str, Mapping[str, CommonBoxes]]) -> FigureTable:
     title, parts = group
     columns = (
         *(title, "boxes", "position: detections", "online", "labels", "labels / online", "labels / detections"),
@@ -241,7 +241,7 @@ def _group_table(group: tuple[str, Mapping[str, SameBoxes]]) -> FigureTable:
     return FigureTable(f"RMSE on the same boxes, by {title}: m, degrees, m/s", columns, rows)
 
 
-def _errors(same: SameBoxes) -> tuple[str, ...]:
+def _errors(same: CommonBoxes) -> tuple[str, ...]:
     position = {name: same.rmse(name, "position") for name in SYSTEMS}
     heading = (cell(float(np.degrees(same.rmse(name, "heading"))), 1) for name in SYSTEMS)
     ratios = (position["labels"] / position[name] if len(same) else float("nan") for name in ("online", "detections"))
@@ -250,7 +250,7 @@ def _errors(same: SameBoxes) -> tuple[str, ...]:
     return (*map(cell, position.values()), *map(cell, ratios), *heading, *size, *velocity)
 
 
-def _calibration_table(same: SameBoxes) -> FigureTable:
+def _calibration_table(same: CommonBoxes) -> FigureTable:
     rows = []
     visible = same.select(same.visible)
     for label in ("all", *np.unique(visible.label).tolist()):
@@ -273,7 +273,7 @@ def _consistency_table(consistency: Mapping[str, SelfConsistency]) -> FigureTabl
     return FigureTable("Self-consistency, without ground truth", columns, rows)
 
 
-def _json_of(same: SameBoxes) -> dict[str, Any]:
+def _json_of(same: CommonBoxes) -> dict[str, Any]:
     rmse = {name: {q: same.rmse(name, q) for q in ("position", "heading", "size", "velocity")} for name in SYSTEMS}
     held = {name: coverages(same.known(name, "nees")) for name in ("online", "labels")}
     return {"boxes": len(same), "rmse": rmse, "held": held}

@@ -11,11 +11,11 @@ import numpy as np
 from data_tools.datasets.nuscenes import ScoredScene
 from data_tools.metrics import (
     LabelErrors,
+    NuScenesClassMetrics,
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
-    TrackingFigures,
-    TrackTable,
+    SceneBoxes,
     label_errors,
     label_velocities,
     nuscenes_tracking_metrics,
@@ -107,11 +107,11 @@ def nuscenes_table(title: str, metrics: NuScenesTrackingMetrics) -> FigureTable:
     return FigureTable(title, _COLUMNS, tuple((name, *_cells(figures)) for name, figures in rows))
 
 
-def _in_range(scene: NuScenesTrackingScene) -> tuple[TrackTable, TrackTable]:
+def _in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
     """Truth and tracks within the distance from the vehicle up to which their class is scored."""
     limits = NuScenesTrackingSettings().class_range
 
-    def near(table: TrackTable) -> TrackTable:
+    def near(table: SceneBoxes) -> SceneBoxes:
         reach = np.array([limits.get(label, 0.0) for label in table.boxes.label.tolist()])
         offset = table.boxes.position[:, :2] - scene.ego_position[table.moment]
         return table.select(np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) < reach))
@@ -128,7 +128,7 @@ def _best_thresholds(metrics: NuScenesTrackingMetrics) -> dict[str, float]:
     return best
 
 
-def _cells(f: TrackingFigures) -> tuple[str, ...]:
+def _cells(f: NuScenesClassMetrics) -> tuple[str, ...]:
     shares = (cell(value) for value in (f.amota, f.amotp, f.mota, f.motp, f.recall))
     counts = (count(value) for value in (f.ids, f.frag, f.tp, f.fp, f.fn, f.gt, f.mt, f.ml))
     return (*shares, *counts, *(cell(value, 2) for value in (f.faf, f.tid, f.lgd)))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from data_tools.metrics import LabelErrors, SceneMetrics, TrackTable, label_errors, scene_metrics_by_label
+from data_tools.metrics import LabelErrors, SceneBoxes, SceneMetrics, label_errors, scene_metrics_by_label
 from pipelines.evaluation.errors import error_json, error_pictures, error_tables
 from pipelines.evaluation.innovations import innovation_json, innovation_table
 from pipelines.figures import FigureTable, cell
@@ -68,8 +68,8 @@ def evaluate_simulated(
         for label, metrics in scene_metrics_by_label(truth, run.tracks).items():
             by_label.setdefault(label, []).append(metrics)
         visible = [Annotations(t.id[t.visible], t.boxes.select(t.visible), t.visible[t.visible]) for t in truth]
-        labels = TrackTable.of_annotations(visible)
-        errors.append(label_errors(labels, TrackTable.of_tracks(run.tracks), labels.boxes.velocity))
+        labels = SceneBoxes.of_annotations(visible)
+        errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
     overall = SceneMetrics.pool(pooled.values())
     return SimulatedEvaluation(

@@ -1,4 +1,4 @@
-"""Results as they are on disk, as scenes to look at: nuScenes, KITTI, and tables of one's own."""
+"""Results on disk as scenes to view: nuScenes, KITTI, and tables of tracks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from data_tools.datasets.detection_files import TrackRows, read_detections, read_tracks
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence
 from data_tools.datasets.nuscenes import ScoredScene
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from pipelines.config import Family, load_config
 from pipelines.report.run_record import RunRecord, read_run_record
 from pipelines.report.scenes import ReportScene
@@ -22,9 +22,9 @@ from saga_fg.types.dataset import Scene
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The scenes of a result, and the record of the run that made it, if there is one beside it.
+    """The scenes of a result, and the record of its run if there is one beside it.
 
-    The edges are those of the rules that are configured for such recordings.
+    Edges are by the rules of the default configuration of such recordings.
     """
 
     name: str
@@ -33,17 +33,17 @@ class Results:
 
 
 def nuscenes_results(result: Path, scored: Mapping[str, ScoredScene]) -> Results:
-    """Those of a tracking-result JSON, of any tracker. Raises `InputError` for a broken record of the run."""
+    """Read a tracking-result JSON, of any tracker. Raises `InputError` for a broken record of the run."""
     return _results(result, "nuscenes", ((each.scene, each.tracking.found, None) for each in scored.values()))
 
 
 def kitti_results(result: Path, scored: Mapping[str, ScoredSequence]) -> Results:
-    """Those of a folder of results NNNN.txt. Raises `InputError` as above."""
+    """Read a folder of results NNNN.txt. Raises `InputError` as above."""
     return _results(result, "kitti", ((each.scene, each.found, None) for each in scored.values()))
 
 
 def table_results(result: Path, detections: Path | None) -> Results:
-    """Those of a table of tracks, with the table of their detections. Raises `InputError` for broken tables."""
+    """Read a table of tracks, with the table of their detections. Raises `InputError` for broken tables."""
     rows = read_tracks(result)
     dataset = read_detections(detections) if detections is not None else None
     shown = []
@@ -58,7 +58,7 @@ def table_results(result: Path, detections: Path | None) -> Results:
     return _results(result, "file", shown)
 
 
-def _results(result: Path, family: Family, shown: Iterable[tuple[Scene, TrackTable, FloatArray | None]]) -> Results:
+def _results(result: Path, family: Family, shown: Iterable[tuple[Scene, SceneBoxes, FloatArray | None]]) -> Results:
     record, config = read_run_record(result), load_config(family)
     method = record.method if record is not None else "tracks"
     scenes = [
@@ -71,13 +71,13 @@ def _results(result: Path, family: Family, shown: Iterable[tuple[Scene, TrackTab
 
 
 def _amid(rows: TrackRows, mine: IntArray, count: int) -> FloatArray:
-    """Where nobody says where the vehicle is: poses (count, 4, 4) in the middle of all tracks."""
+    """Return poses (count, 4, 4) in the middle of all tracks, in place of unknown poses of the vehicle."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :2, 3] = np.median(rows.boxes.position[mine, :2], axis=0)
     return poses
 
 
-def _placed(scene: Scene, rows: TrackRows, mine: IntArray, path: Path) -> tuple[Scene, TrackTable, FloatArray]:
+def _placed(scene: Scene, rows: TrackRows, mine: IntArray, path: Path) -> tuple[Scene, SceneBoxes, FloatArray]:
     moment = np.searchsorted(scene.timestamps, rows.timestamp[mine] - 1e-6)
     strange = (moment >= len(scene)) | (np.abs(scene.timestamps[moment % len(scene)] - rows.timestamp[mine]) > 1e-6)
     if strange.any():
@@ -87,7 +87,7 @@ def _placed(scene: Scene, rows: TrackRows, mine: IntArray, path: Path) -> tuple[
         )
     order = np.argsort(moment, kind="stable")
     chosen = mine[order]
-    table = TrackTable(
+    table = SceneBoxes(
         moment[order], rows.id[chosen], rows.boxes.select(chosen), rows.score[chosen], rows.position_covariance[chosen]
     )
     return scene, table, rows.coasting[chosen]

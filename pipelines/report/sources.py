@@ -1,4 +1,4 @@
-"""Reports on results as they are on disk: nuScenes, KITTI, and tables of one's own."""
+"""Reports on results on disk: nuScenes, KITTI, and tables of tracks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipelines.report.run_record import RunRecord
 def nuscenes_report(
     result: Path, dataroot: Path, version: str, scenes: Collection[str], detections: Mapping[str, Path]
 ) -> Report:
-    """On a tracking-result JSON of any tracker, in the chosen scenes.
+    """Report on a tracking-result JSON of any tracker, in the chosen scenes.
 
     Raises `InputError` for missing or broken files, and for a result that lacks a sample of these scenes.
     """
@@ -30,14 +30,14 @@ def nuscenes_report(
 
 
 def kitti_report(result: Path, dataroot: Path, sequences: Collection[str] | None, detections: Path | None) -> Report:
-    """On a folder of results NNNN.txt of any tracker; the same errors as above."""
+    """Report on a folder of results NNNN.txt of any tracker; the same errors as above."""
     scored = read_scored_sequences(result, dataroot, sequences, detections)
     evaluation = evaluate_kitti(scored)
     return _report(kitti_results(result, scored), evaluation.tables(), accuracy_charts(evaluation.errors))
 
 
 def table_report(result: Path, detections: Path | None) -> Report:
-    """On a table of tracks; without ground truth there are no figures. Raises `InputError` for broken tables."""
+    """Report on a table of tracks; without ground truth there are no figures. Raises `InputError` for broken tables."""
     return _report(table_results(result, detections), (), ())
 
 

@@ -1,4 +1,4 @@
-"""Where scenes come from: one read by the driver, a sequence of KITTI, a simulated one, a file of one's own."""
+"""Inputs of jobs: a scene in memory, a sequence of KITTI, a simulated scene, a file of detections."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class HeldScene:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
-        """With the digests of all that the scene holds, but for its ground truth."""
+        """Open with the digests of all of the scene but its ground truth."""
         yield OpenedInput(scene_digests(self.held), lambda: self)
 
 
@@ -56,7 +56,7 @@ class SimulatedInput:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
-        """With the digest of what the scene is made from."""
+        """Open with the digest of the settings, seed and name."""
         made_from = f"{self.settings!r} {self.seed} {self.name}".encode()
         yield OpenedInput({"simulator": sha256(made_from)}, self._read)
 
@@ -74,7 +74,7 @@ class KittiInput:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
-        """With the digests of its text files."""
+        """Open with the digests of its text files."""
         from data_tools.datasets.kitti import local_kitti
 
         with local_kitti(self.dataroot, self.detections, [self.name]) as dataset:
@@ -97,7 +97,7 @@ class DetectionFileInput:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedInput]:
-        """With the digest of the file."""
+        """Open with the digest of the file."""
         from data_tools.datasets.detection_files import read_detections
 
         with local_copy(self.url) as path:
@@ -105,7 +105,7 @@ class DetectionFileInput:
 
 
 def scene_digests(scene: Scene) -> dict[str, str]:
-    """SHA-256 of a scene's moments and of the frames of each sensor: of all that its results can depend on."""
+    """Return the SHA-256 of a scene's moments and of the frames of each sensor, on which its results depend."""
     moments = hashlib.sha256(repr((scene.name, scene.tokens)).encode())
     for array in (scene.timestamps, scene.world_T_ego):
         moments.update(np.ascontiguousarray(array).tobytes())

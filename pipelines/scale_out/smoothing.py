@@ -1,4 +1,4 @@
-"""Smoothing as a task for many scenes: what `saga-fg smooth` writes of all, here of each."""
+"""Smoothing as a task for many scenes."""
 
 from __future__ import annotations
 

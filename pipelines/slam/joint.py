@@ -1,7 +1,7 @@
-"""The vehicle's path and the objects around it from one scene: its frames, and odometry between them.
+"""Joint estimation of the vehicle's path and the objects around it, from the frames of one scene.
 
-Ego odometry comes from the scene's own poses, made worse by a stated amount where a poor device shall be studied. What
-is estimated jointly is compared with the decoupled pipeline: the odometry's path, and objects tracked along it.
+Ego odometry comes from the scene's own poses, degraded by a stated amount. The joint estimate is compared with the
+decoupled pipeline: the odometry's path, and objects tracked along it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from saga_fg.types.frame import Frame
 
 @dataclass(frozen=True, eq=False)
 class JointRun:
-    """One scene: the true path, the odometry's, the estimate, and the online one if it was asked for."""
+    """One scene: the true path, the odometry's, the estimate, and the online one where there is one."""
 
     truth: Trajectory
     odometry: Trajectory
@@ -110,7 +110,7 @@ def degraded_drive(
 
 
 def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:
-    """The first frame, and each that comes more than `period` s after the last one chosen."""
+    """Return the first frame, and each that comes more than `period` s after the last one chosen."""
     chosen: list[Frame] = []
     for frame in frames:
         if not chosen or frame.timestamp > chosen[-1].timestamp + period:

@@ -1,4 +1,4 @@
-"""LiDAR SLAM with what moves: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
+"""LiDAR SLAM with objects: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
 
 The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.slam.joint` (detections,
 interactions, objects that stand) are solved as one. Its moments are the keyframes, and scans in between where the

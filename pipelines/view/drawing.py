@@ -1,9 +1,9 @@
-"""What there is to draw, whoever draws it: shapes with a name, in a frame of coordinates, at a time.
+"""Drawings for any viewer: shapes with a name, in a frame of coordinates, at a time.
 
     scenes.py, slam.py -> `Drawing`s in order of time -> to_rerun.py, to_mcap.py
 
 Frames are a tree of names: `Drawing(frame="scene/ego", name="lidar", shape=Pose(...))` says where the frame
-`scene/ego/lidar` is in `scene/ego`. A name that is drawn again takes the place of what it showed before.
+`scene/ego/lidar` is in `scene/ego`. A drawing replaces the one before it of the same name.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ VEHICLE = (4.6, 1.9, 1.6)  # length, width, height of the box drawn for the vehi
 Colour = tuple[int, int, int]
 """Red, green, blue, 0 to 255. Shapes have one of them for all, (1, 3), or one each, (N, 3)."""
 Facts = Mapping[str, Sequence[str]]
-"""Columns of texts by name: what is known of each of a number of things; the first one tells them apart."""
+"""Columns of texts by name, a row for each thing; the first column holds their identifiers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cubes:
-    """N boxes: centre, size (length, width, height) (N, 3), m, yaw (N,), rad; facts of each, or none at all."""
+    """N boxes: centre, size (length, width, height) (N, 3), m, yaw (N,), rad; facts of each, or none."""
 
     centre: FloatArray
     size: FloatArray
@@ -35,7 +35,7 @@ class Cubes:
 
     @property
     def labels(self) -> list[str]:
-        """The facts of each box in a line; empty if there are none."""
+        """The facts of each box in a line; empty without facts."""
         return [" ".join(row) for row in zip(*self.facts.values(), strict=True)]
 
 
@@ -89,7 +89,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where a frame is in its parent: (4, 4)."""
+    """The pose (4, 4) of a frame in its parent."""
 
     parent_T_child: FloatArray
 
@@ -99,12 +99,12 @@ Shape = Cubes | Lines | Arrows | Ellipses | Marks | Points | Pose
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A shape.
+    """A shape in a frame.
 
-    frame   whose coordinates the shape is in
+    frame   frame of the shape's coordinates
     name    of the layer, below that of the frame; of a pose: of the frame that it places
-    time    s from the start, None for what is always there
-    moment  which of the scene's moments, if it belongs to one
+    time    s from the start, None for a static shape
+    moment  row of the scene's moment, if it belongs to one
     """
 
     frame: str
@@ -115,15 +115,15 @@ class Drawing:
 
     @property
     def path(self) -> str:
-        """The name with those of all frames above it."""
+        """The name with the names of all frames above it."""
         return f"{self.frame}/{self.name}"
 
 
 def in_order(*drawings: Iterable[Drawing]) -> Iterator[Drawing]:
-    """Merge drawings that are each in order of time; what is always there comes first."""
+    """Merge sequences of drawings, each in order of time; static ones come first."""
     return heapq.merge(*drawings, key=lambda each: -np.inf if each.time is None else each.time)
 
 
 def one_colour(colour: Colour) -> IntArray:
-    """(1, 3), a colour for all."""
+    """Return a colour for all shapes, (1, 3)."""
     return np.array([colour], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Files of drawings; the name's suffix says whose: `.rrd` is rerun's, `.mcap` is for Foxglove."""
+"""Files of drawings: `.rrd` for rerun, `.mcap` for Foxglove."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from saga_fg.errors import InputError
 
 
 def check_view_file(path: Path) -> None:
-    """What `write_view` would find wrong before it begins: the suffix, a missing package, the folder.
+    """Check the suffix, the package and the folder of a file for `write_view`.
 
     Raises `InputError`, `MissingExtraError`.
     """
@@ -25,7 +25,7 @@ def write_view(path: Path, name: str, roots: Sequence[str], drawings: Iterable[D
     """Write drawings in order of time to a file for rerun or Foxglove, whole or not at all.
 
     name   of the recording
-    roots  frames that are a space of their own each
+    roots  frames that get a 3D view each
 
     Raises `InputError` for other suffixes and where the file cannot be written, `MissingExtraError` where the package
     that writes it is not installed.

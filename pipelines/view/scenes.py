@@ -6,16 +6,16 @@
     NAME/detections          boxes of all sensors since the moment before
     NAME/truth/{seen,hidden} true boxes with their ids
     NAME/METHOD/boxes        of the tracks, with ids, classes and scores
-    NAME/METHOD/trails       where they were in the last seconds
+    NAME/METHOD/trajectories their paths of the last seconds
     NAME/METHOD/velocities   arrows of one second
     NAME/METHOD/ellipses     that hold the true centre with 90 % in the plane, if the covariance is right
     NAME/METHOD/edges        lines from source to target, the thicker the higher the rate
-    NAME/graph/nodes         variables of the running graph with their names, earlier ones 2 m below, where the run kept
-                             a journal
+    NAME/graph/nodes         variables of the running graph with their names, earlier ones 2 m below, if there is a
+                             journal of the run
     NAME/graph/KIND          lines from each factor of a kind to its variables
 
-Metres about the vehicle's first place, z up: viewers count in float32. All layers of a moment are drawn at it, so that
-nothing outlives its moment.
+Metres about the vehicle's first place, z up: viewers count in float32. All layers of a moment are drawn at its time,
+so that none outlives it.
 """
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ from typing import Any
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
-from data_tools.metrics import TrackTable
-from pipelines.report.edges import Edges, edges_of_moments
-from pipelines.report.scenes import UNMEASURED, ReportScene, latest_detections
+from data_tools.metrics import SceneBoxes
+from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections
 from pipelines.scan_sequence import ScanSequence
 from pipelines.view.drawing import (
     VEHICLE,
@@ -53,7 +52,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 
-TRAIL = 4.0  # s
+HISTORY = 4.0  # s, of trajectories
 SUNK = 2.0  # m, earlier states below the newest ones
 HELD = 2 * np.log(10.0)  # squared sigmas of the ellipse that holds 90 % in the plane
 DETECTION, SEEN, HIDDEN, PATH, EDGE, POINT, NODE = map(
@@ -76,7 +75,7 @@ class SceneView:
 
 
 def draw_scene(view: SceneView) -> Iterator[Drawing]:
-    """All of it in order of time, in the frame of the scene's name."""
+    """Draw a scene in order of time, in the frame of its name."""
     scene, root = view.report.scene, view.report.scene.name
     origin = scene.world_T_ego[0, :3, 3] if len(scene) else np.zeros(3)
     path = scene.world_T_ego[:, :3, 3] - origin
@@ -96,7 +95,7 @@ def draw_scene(view: SceneView) -> Iterator[Drawing]:
 def _moments(report: ReportScene, origin: FloatArray, start: float) -> Iterator[Drawing]:
     scene, root = report.scene, report.scene.name
     detections, _ = latest_detections(scene, report.sensors)
-    drawn = {name: _Method(table, origin, report) for name, table in report.tracks.items()}
+    methods = {name: _Method(table, origin, report) for name, table in report.tracks.items()}
     edges = {name: edges_of_moments(table, len(scene), report.rules) for name, table in report.tracks.items()}
     for k, time in enumerate((scene.timestamps - start).tolist()):
         pose = scene.world_T_ego[k].copy()
@@ -109,7 +108,7 @@ def _moments(report: ReportScene, origin: FloatArray, start: float) -> Iterator[
             for name, rows, colour in (("seen", truth.visible, SEEN), ("hidden", ~truth.visible, HIDDEN)):
                 boxes = _boxes(truth.boxes.select(rows), origin, colour, {"id": truth.id[rows].tolist()})
                 yield Drawing(root, f"truth/{name}", boxes, time, k)
-        for name, method in drawn.items():
+        for name, method in methods.items():
             for layer, shape in method.at(k, next(edges[name])):
                 yield Drawing(root, f"{name}/{layer}", shape, time, k)
 
@@ -122,17 +121,17 @@ def _scans(root: str, scans: ScanSequence, start: float, spacing: float) -> Iter
 
 
 def _graphs(view: SceneView, origin: FloatArray, start: float) -> Iterator[Drawing]:
-    """Each frame's running graph. Raises `InputError` for what is none."""
+    """Draw the running graph of each frame. Raises `InputError` for records that are no graph."""
     root, moments = (
         view.report.scene.name,
         {round(t, 3): k for k, t in enumerate(view.report.scene.timestamps.tolist())},
     )
     try:
-        drawn = [_graph(graph, origin) for graph in view.graphs]
+        shapes = [_graph(graph, origin) for graph in view.graphs]
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{root}: expected graphs as --explain writes them: {error!r:.80}") from error
-    kinds = sorted({kind for _, lines in drawn for kind in lines})
-    for graph, (marks, lines) in zip(view.graphs, drawn, strict=True):
+    kinds = sorted({kind for _, lines in shapes for kind in lines})
+    for graph, (marks, lines) in zip(view.graphs, shapes, strict=True):
         when = float(graph["time"]) - start, moments.get(round(graph["time"], 3))
         yield Drawing(root, "graph/nodes", marks, *when)
         for number, kind in enumerate(kinds):
@@ -141,7 +140,7 @@ def _graphs(view: SceneView, origin: FloatArray, start: float) -> Iterator[Drawi
 
 
 def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Marks, dict[str, list[FloatArray]]]:
-    """Variables, and by kind lines from the middle of each factor to its variables; upwards where there is only one."""
+    """Return variables, and by kind lines from the middle of each factor to its variables, up from a single one."""
     nodes = graph["nodes"]
     newest = max((node["time"] for node in nodes if node["time"] is not None), default=None)
     depth = [0.0 if node["time"] in (newest, None) else -SUNK for node in nodes]
@@ -161,14 +160,14 @@ def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Marks, dict[st
 class _Method:
     """The tracks of one method."""
 
-    def __init__(self, table: TrackTable, origin: FloatArray, report: ReportScene) -> None:
+    def __init__(self, table: SceneBoxes, origin: FloatArray, report: ReportScene) -> None:
         self._table, self._place = table, table.boxes.position - origin
         self._origin, self._time = origin, report.scene.timestamps
         names, self._number = np.unique(table.id, return_inverse=True)
         self._colour = np.array([colour_of(k) for k in range(len(names))], dtype=np.int64).reshape(-1, 3)
 
     def at(self, moment: int, edges: Edges) -> Iterator[tuple[str, Shape]]:
-        """(layer, shape) of all there is to draw at a moment."""
+        """Yield the layers of a moment with their shapes."""
         table, place = self._table, self._place
         rows = np.flatnonzero(table.moment == moment)
         colour = self._colour[self._number[rows]]
@@ -179,7 +178,7 @@ class _Method:
             "score": [f"{score:.2f}" for score in table.score[rows].tolist()],
         }
         yield "boxes", _boxes(boxes, self._origin, colour, facts)
-        yield "trails", Lines(self._trails(moment, rows), colour, np.array([0.05]))
+        yield "trajectories", Lines(self._trajectories(moment, rows), colour, np.array([0.05]))
         yield "velocities", Arrows(place[rows], np.nan_to_num(boxes.velocity), colour, 0.08)
         known = np.isfinite(table.position_covariance[rows]).all(axis=(1, 2))
         half, yaw = ellipses(table.position_covariance[rows[known]])
@@ -188,9 +187,9 @@ class _Method:
         strips = np.stack([place[source], place[target]], axis=1)
         yield "edges", Lines(list(strips), EDGE, 0.05 + 0.1 * np.minimum(rate, 2.0))
 
-    def _trails(self, moment: int, rows: IntArray) -> list[FloatArray]:
-        """The places (n, 3) of each of the tracks of `rows` in the last seconds."""
-        first = np.searchsorted(self._time, self._time[moment] - TRAIL)
+    def _trajectories(self, moment: int, rows: IntArray) -> list[FloatArray]:
+        """Return the places (n, 3) of the tracks of `rows` in the last seconds."""
+        first = np.searchsorted(self._time, self._time[moment] - HISTORY)
         window = np.arange(*np.searchsorted(self._table.moment, [first, moment + 1]))
         window = window[np.argsort(self._number[window], kind="stable")]
         numbers = self._number[window]
@@ -199,13 +198,13 @@ class _Method:
 
 
 def ellipses(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Half axes (N, 2), m, and yaw (N,) of the first of them, of ellipses that hold 90 %; covariance (N, 2, 2)."""
+    """Return half axes (N, 2), m, and yaw (N,) of the first one, of the 90 % ellipses of covariances (N, 2, 2)."""
     variance, axes = np.linalg.eigh(covariance)
     return np.sqrt(HELD * np.maximum(variance, 0.0)), np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
 
 
 def colour_of(number: int) -> Colour:
-    """A colour for the track of a number; neighbours differ (the hues step by the golden ratio)."""
+    """Return a colour for a track's number; neighbours differ (the hues step by the golden ratio)."""
     red, green, blue = colorsys.hsv_to_rgb(number * 0.618034 % 1.0, 0.65, 0.95)
     return round(255 * red), round(255 * green), round(255 * blue)
 

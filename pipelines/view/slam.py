@@ -1,9 +1,9 @@
-"""What `saga-fg slam kitti`, `victoria-park` or `plaza` wrote, as drawings: paths, the map, landmarks with their names.
+"""Results of `saga-fg slam kitti`, `victoria-park` or `plaza` as drawings: paths, the map, landmarks with their names.
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
     ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
     ROOT/map, ROOT/landmarks                      points of map.ply and landmarks.ply
-    ROOT/names                                    kind and number of the landmarks that are at a place (planes are not)
+    ROOT/names                                    kind and number of landmarks with a place (planes have none)
 
 Metres, about `origin`.
 """
@@ -58,7 +58,7 @@ def read_slam_view(folder: Path) -> SlamView:
 
 
 def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> Iterator[Drawing]:
-    """All of it in the frame `root`; origin (3,) in its coordinates, the first pose if None.
+    """Draw a run in the frame `root`; origin (3,) in its coordinates, the first pose if None.
 
     Times count from the first pose.
     """
@@ -81,7 +81,7 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
 
 
 def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:
-    """Kind and number of each landmark that is at a place, and the places (M, 3)."""
+    """Return kind and number of each landmark with a place, and the places (M, 3)."""
     if not path.is_file():
         return (), np.empty((0, 3))
     rows = parsed_json(read_bytes(path), str(path))

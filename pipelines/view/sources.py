@@ -1,4 +1,4 @@
-"""What there is to see of a result on disk: scenes with the scans of their LiDAR, where those are there."""
+"""Results on disk as scenes to view, with the scans of their LiDAR where there are any."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipelines.view.scenes import SceneView
 def nuscenes_view(
     result: Path, dataroot: Path, version: str, scenes: Collection[str], detections: Mapping[str, Path], spacing: float
 ) -> list[SceneView]:
-    """Of a tracking-result JSON; points are thinned to `spacing` m, 0 leaves them out.
+    """Read a tracking-result JSON; points are thinned to `spacing` m, 0 leaves them out.
 
     Raises `InputError` for missing or broken files, and for a result that lacks a sample of these scenes.
     """
@@ -27,7 +27,7 @@ def nuscenes_view(
 def kitti_view(
     result: Path, dataroot: Path, sequences: Collection[str] | None, detections: Path | None, spacing: float
 ) -> list[SceneView]:
-    """Of a folder of results NNNN.txt; otherwise as above."""
+    """Read a folder of results NNNN.txt; otherwise as above."""
     results = kitti_results(result, read_scored_sequences(result, dataroot, sequences, detections))
     root = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
     views = []
@@ -39,5 +39,5 @@ def kitti_view(
 
 
 def table_view(result: Path, detections: Path | None) -> list[SceneView]:
-    """Of a table of tracks, with the table of their detections. Raises `InputError` for broken tables."""
+    """Read a table of tracks, with the table of their detections. Raises `InputError` for broken tables."""
     return [SceneView(each) for each in table_results(result, detections).scenes]

@@ -1,4 +1,4 @@
-"""Drawings for rerun (https://rerun.io): a file .rrd, whole or not at all, or a viewer on the screen.
+"""Drawings for rerun (https://rerun.io): a file .rrd, written whole or not at all, or a viewer on the screen.
 
 Paths are rerun's entities, frames its transforms; times are on the timelines `time`, s, and `moment`.
 """
@@ -27,7 +27,7 @@ def load_rerun() -> ModuleType:
     try:
         import rerun
     except ImportError as error:
-        raise MissingExtraError('the view in space needs rerun; pip install "saga-fg[view]"') from error
+        raise MissingExtraError('the 3D view needs rerun; pip install "saga-fg[view]"') from error
     module: ModuleType = rerun
     return module
 
@@ -36,7 +36,7 @@ def write_rerun(path: Path, name: str, roots: Sequence[str], drawings: Iterable[
     """Write a file that rerun opens.
 
     name   of the recording, for the viewer's list
-    roots  frames that get a view in space each
+    roots  frames that get a 3D view each
 
     Raises `InputError` where the file cannot be written, `MissingExtraError` without rerun.
     """
@@ -68,7 +68,7 @@ def show_rerun(name: str, roots: Sequence[str], drawings: Iterable[Drawing]) -> 
 
 
 def _blueprint(roots: Sequence[str]) -> Any:
-    """A tab in space for each root."""
+    """Return a layout with a tab for each root."""
     from rerun import blueprint
 
     views = [blueprint.Spatial3DView(origin=f"/{root}", name=root) for root in roots]

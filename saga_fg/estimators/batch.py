@@ -1,7 +1,7 @@
 """The batch smoother: a whole recording, every state given everything measured.
 
 All factors since the start are solved at once, with the means and covariances of every node at every epoch, in
-whichever order of elimination takes least time (`saga_fg.estimators.elimination_order`). Robust losses are solved by
+whichever order of elimination takes least time (`saga_fg.estimators.sparse_elimination`). Robust losses are solved by
 iteratively reweighted least squares, or by graduated non-convexity, which finds outliers without a good start
 (`saga_fg.estimators.graduated`).
 """
@@ -13,24 +13,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import FactorError, Robust, nonlinear_graph
+from factors import FactorError, Robust
 from saga_fg.errors import InputError
-from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.elimination import NoSolution, marginal_covariances, solved_tree, tree_covariances
-from saga_fg.estimators.elimination_order import Order, cheapest_order
 from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.factor_graph import recording_factors
 from saga_fg.estimators.graduated import GraduatedNonConvexity
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.graph_solution import NoSolution
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
+from saga_fg.estimators.sparse_elimination import Order, SparseSolution, cheapest_order
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
@@ -73,7 +69,7 @@ class BatchSmoother(RecordedSmoother):
         self._recording = Recording(self._settings, lazy=not likelihoods)
         self._wanted = order
         self._order: Order | None = None  # of the recording as it is
-        self._sparse: _Sparse | None = None  # its solution, where that is not in the order of time
+        self._sparse: SparseSolution | None = None  # its solution, where that is not in the order of time
         self._graduated = True  # whether the weights of graduated non-convexity are those of the whole recording
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
@@ -216,11 +212,11 @@ class BatchSmoother(RecordedSmoother):
         sparse = self._solution()
         return self._recording.means() if sparse is None else sparse.means
 
-    def _solution(self) -> _Sparse | None:
+    def _solution(self) -> SparseSolution | None:
         """The solution in a sparse order, None where that of time is better or the only one."""
         if self.order != "time" and self._sparse is None:
             try:
-                self._sparse = _Sparse.of(self._recording, self.order, self._settings.max_iterations)
+                self._sparse = SparseSolution.of(self._recording, self.order, self._settings.max_iterations)
             except (NoSolution, FactorError, GraphError) as reason:
                 self._give_up(reason)
         return self._sparse
@@ -232,42 +228,6 @@ class BatchSmoother(RecordedSmoother):
 
     def _changed(self) -> None:
         self._order = self._sparse = None
-
-
-@dataclass(eq=False)
-class _Sparse:
-    """Means of every epoch, and the tree from which covariances can be had."""
-
-    means: list[FloatArray]
-    keys: list[dict[int, int]]  # of each epoch's nodes
-    dims: dict[int, int]
-    tree: gtsam.GaussianBayesTree
-    known: list[MarginalCovariances] | None = None
-
-    @staticmethod
-    def of(recording: Recording, order: Order, max_iterations: int) -> _Sparse:
-        """Raises `NoSolution`, `FactorError` or `GraphError` where it cannot be had in this order."""
-        means = recording.rough_means()
-        recorded = recording_factors(recording.prior, recording.epochs, recording.layouts, means)
-        states, dims, start = dict[int, FloatArray](), dict[int, int](), gtsam.Values()
-        for one, layout, mean in zip(recorded, recording.layouts, means, strict=True):
-            states |= zip(one.keys.values(), np.split(mean, layout.offsets[1:-1]), strict=False)
-        for key, state in states.items():
-            start.insert(key, state)
-            dims[key] = len(state)
-        factors = [factor for one in recorded for kind in one.factors.values() for factor in kind]
-        linear = nonlinear_graph([factor for factor in factors if isinstance(factor, gtsam.JacobianFactor)], dims)
-        others = [factor for factor in factors if not isinstance(factor, gtsam.JacobianFactor)]
-        values, tree = solved_tree(linear, others, start, order, max_iterations)
-        keys = [one.keys for one in recorded]
-        solved = [np.concatenate([np.empty(0), *(values.atVector(key) for key in own.values())]) for own in keys]
-        return _Sparse(solved, keys, dims, tree)
-
-    def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
-        """Of all single states, by epoch."""
-        if self.known is None:
-            self.known = marginal_covariances(tree_covariances(self.tree, self.dims), self.keys, layouts)
-        return self.known
 
 
 def _all_measurements(epochs: Sequence[Epoch]) -> Iterable[RecordedMeasurements]:

@@ -14,10 +14,9 @@ import numpy as np
 from factors import nonlinear_graph
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.block_variables import BlockVariables
-from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.dynamics import Dynamics, PredictionSummary
 from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.prediction import Prediction
 from saga_fg.numerics.arrays import IntArray
 
 
@@ -65,7 +64,7 @@ class BayesTree:
         return replace(self, factors=self.factors + tuple(self.variables.detections(rows)))
 
     def predicted(
-        self, rows: IntArray, dynamics: Dynamics, prediction: Prediction, by_covariance: BlockGaussian
+        self, rows: IntArray, dynamics: Dynamics, prediction: PredictionSummary, by_covariance: BlockGaussian
     ) -> BayesTree:
         """Move over an interval; rows: of the nodes that stay.
 

@@ -38,8 +38,8 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.factor_graph import prior_graph
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout, checked_prior
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
@@ -102,7 +102,7 @@ class BoundedKalmanFilter(LatestMarginals):
 
     def predict(self, transition: Transition) -> None:
         layout = self._clusters.layout
-        dynamics = Motion(transition).dynamics(layout, self.joint_mean(layout.nodes))
+        dynamics = IntervalDynamics(transition).linearised(layout, self.joint_mean(layout.nodes))
         F = dynamics.matrix.copy()
         F.eliminate_zeros()
         acting = [blocks.values.any(axis=(1, 2)) for blocks in dynamics.F]

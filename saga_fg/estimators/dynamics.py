@@ -49,7 +49,7 @@ class Dynamics:
         b[layout.places(rows)] = transition.b
         return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
 
-    def beside(self, layout: Layout, others: IntArray) -> Dynamics:
+    def with_static(self, layout: Layout, others: IntArray) -> Dynamics:
         """Over `layout`, which has further nodes at the rows `others`: these stay as they are."""
         rows, b = np.delete(np.arange(len(layout)), others), np.zeros(layout.size)
         b[layout.places(rows)] = self.b
@@ -212,6 +212,48 @@ def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
     return BlockGaussian(partition, mean, blocks)
 
 
+@dataclass(frozen=True, eq=False)
+class PredictionSummary:
+    """Where a prediction will lie and how large it will be, known before it is made.
+
+    components  what will be correlated
+    mean        (D,), exact
+    scale       (D,) standard deviations as if nodes were not correlated yet
+    ratio       (n,) largest variance of a node's state in units of its process noise; infinite where it has none
+    """
+
+    components: Partition
+    mean: FloatArray
+    scale: FloatArray
+    ratio: FloatArray
+
+    @staticmethod
+    def of(x: BlockGaussian, dynamics: Dynamics) -> PredictionSummary:
+        """Raises `InputError` where the prediction is not finite."""
+        layout = x.layout
+        own = {d: np.zeros((len(layout), d, d)) for d in np.unique(layout.dims).tolist()}
+        predicted = {d: np.zeros_like(blocks) for d, blocks in own.items()}
+        for d, blocks in own.items():
+            rows = np.flatnonzero(layout.dims == d)
+            blocks[rows] = x.covariances(rows)
+        for F in dynamics.F:
+            _, d_i, d_j = F.values.shape
+            np.add.at(predicted[d_i], F.target, F.values @ own[d_j][F.source] @ np.swapaxes(F.values, 1, 2))
+        ratio = np.full(len(layout), np.inf)
+        for Q in dynamics.Q:
+            d = Q.values.shape[1]
+            predicted[d][Q.target] += Q.values
+            ratio[Q.target] = _ratio(predicted[d][Q.target], Q.values)
+        variances = np.empty(layout.size)
+        for d, blocks in predicted.items():
+            rows = np.flatnonzero(layout.dims == d)
+            variances[layout.spans(rows)] = np.diagonal(blocks[rows], axis1=1, axis2=2)
+        mean = dynamics.moved(x.mean) + dynamics.b
+        if not (np.isfinite(mean).all() and np.isfinite(variances).all() and (variances > 0).all()):
+            raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
+        return PredictionSummary(dynamics.joined(x.partition), mean, np.sqrt(variances), ratio)
+
+
 def identity(layout: Layout, rows: IntArray) -> tuple[Blocks, ...]:
     """Blocks of the nodes at `rows` that stay as they are."""
     alike = [rows[layout.dims[rows] == d] for d in np.unique(layout.dims[rows])]
@@ -253,3 +295,16 @@ def _sparse(groups: tuple[Blocks, ...], starts: IntArray, size: int) -> scipy.sp
     matrix = scipy.sparse.csr_array(entries, shape=(size, size))
     matrix.eliminate_zeros()  # blocks are mostly zeros: a neighbour's velocity says nothing across the axes
     return matrix
+
+
+def _ratio(P: FloatArray, Q: FloatArray) -> FloatArray:
+    """(m,) trace of Q^-1 P; infinite where Q is singular."""
+    try:
+        L = np.linalg.cholesky(Q)
+    except np.linalg.LinAlgError:
+        if len(Q) == 1:
+            return np.array([np.inf])
+        half = len(Q) // 2
+        return np.concatenate([_ratio(P[:half], Q[:half]), _ratio(P[half:], Q[half:])])
+    half_done = np.linalg.solve(L, P)
+    return np.asarray(np.trace(np.linalg.solve(L, np.swapaxes(half_done, 1, 2)), axis1=1, axis2=2))

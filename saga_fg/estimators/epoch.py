@@ -1,8 +1,8 @@
-"""The record of what an estimator was told, epoch by epoch, and the filter's pass over it.
+"""The inputs of an estimator, epoch by epoch, and the filter over them.
 
 An epoch is a time at which something was measured, or at which nodes appeared or went. It keeps the inputs (priors of
-new nodes, measurements, which nodes go, the motion to the next epoch), so that the pass can be done again: with a late
-measurement, or linearised at better estimates.
+new nodes, measurements, nodes that leave, the interval to the next epoch), so that it can be filtered again: with late
+measurements, or linearised at better estimates.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct
 from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import RecordedMeasurements
-from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
@@ -32,27 +32,29 @@ class Birth:
 
 @dataclass(frozen=True, eq=False)
 class Epoch:
-    """time (s); nodes that appear, what is seen, ids of the nodes that go afterwards, motion to the next epoch."""
+    """time (s); new nodes, measurements, ids of the nodes that leave afterwards, interval to the next epoch."""
 
     time: float
     births: tuple[Birth, ...] = ()
     measurements: tuple[RecordedMeasurements, ...] = ()
     gone: tuple[int, ...] = ()
-    motion: Motion | Standstill | None = None
+    interval: IntervalDynamics | ZeroInterval | None = None
 
     @property
     def linear(self) -> bool:
-        """Whether linearising it again elsewhere gives the same."""
-        return (self.motion is None or self.motion.linear) and all(recorded.linear for recorded in self.measurements)
+        """True where linearising it again elsewhere gives the same."""
+        return (self.interval is None or self.interval.linear) and all(
+            recorded.linear for recorded in self.measurements
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class FilterStep:
-    """What the filter made of an epoch.
+    """The filter at an epoch.
 
-    carried     number of nodes that were there before; those that appear stand behind them
-    prior     before anything is seen
-    filtered    after everything is seen
+    carried     number of nodes from the epoch before; new ones stand behind them
+    prior       before the measurements
+    filtered    after the measurements
     gains       of the corrections, in order
     log_likelihood  of the innovations
     dynamics    to the next epoch, over the nodes that stay
@@ -67,11 +69,11 @@ class FilterStep:
 
     @property
     def layout(self) -> Layout:
-        """All nodes of the epoch, those that go afterwards too."""
+        """All nodes of the epoch, with those that leave afterwards."""
         return self.filtered.layout
 
     def with_birth(self, birth: Birth) -> FilterStep:
-        """With nodes that appear."""
+        """Add new nodes."""
         layout = self.layout.extended(birth.nodes, birth.means.shape[1])
         prior = self.prior.extended(layout, birth.means, birth.covariances)
         if not self.gains:
@@ -79,7 +81,7 @@ class FilterStep:
         return replace(self, prior=prior, filtered=self.filtered.extended(layout, birth.means, birth.covariances))
 
     def updated(self, recorded: RecordedMeasurements, mean: FloatArray | None = None) -> FilterStep:
-        """With measurements taken in, linearised at the joint state `mean` (the filter's own for None)."""
+        """Take in measurements, linearised at the joint state `mean` (the filter's own for None)."""
         if len(recorded.measured) == 0:
             return self
         x = self.filtered
@@ -94,39 +96,39 @@ class FilterStep:
         return self.filtered.without(self.layout.rows(gone))
 
     def to_next(
-        self, gone: Sequence[int], motion: Motion | Standstill, mean: FloatArray | None = None
+        self, gone: Sequence[int], interval: IntervalDynamics | ZeroInterval, mean: FloatArray | None = None
     ) -> tuple[FilterStep, BlockGaussian]:
-        """With the dynamics to the next epoch, linearised at the joint state `mean`; and the prior they lead to."""
+        """Set the dynamics to the next epoch, linearised at the joint state `mean`; returns also the prior there."""
         x = self.staying(gone)
         at = x.mean
         if mean is not None:
             at = mean if len(mean) == len(at) else mean[self.layout.places(self.layout.rows(x.layout.nodes))]
-        dynamics = motion.dynamics(x.layout, at)
+        dynamics = interval.linearised(x.layout, at)
         return replace(self, dynamics=dynamics), predict(dynamics.separated(x), dynamics)
 
 
 def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> list[FloatArray]:
-    """Joint means of every epoch by the dynamics alone, whatever was seen."""
+    """Joint means of every epoch by the dynamics alone, without measurements."""
     means, mean = [], prior.mean
     for epoch, layout in zip(epochs, layouts, strict=True):
         mean = np.concatenate([mean, *(birth.means.ravel() for birth in epoch.births)])
         means.append(mean)
-        if epoch.motion is not None:
+        if epoch.interval is not None:
             gone = layout.rows(epoch.gone)
             stay = layout.without(gone) if len(gone) else layout
             before = mean[layout.places(layout.rows(stay.nodes))]
-            dynamics = epoch.motion.dynamics(stay, before)
+            dynamics = epoch.interval.linearised(stay, before)
             mean = dynamics.moved(before) + dynamics.b
     return means
 
 
 def initial_step(prior: BlockGaussian) -> FilterStep:
-    """The pass of an epoch at which nothing has happened yet."""
+    """The step of an epoch without events."""
     return FilterStep(len(prior.layout), prior, prior)
 
 
 def filter_epochs(prior: BlockGaussian, epochs: list[Epoch], means: list[FloatArray] | None = None) -> list[FilterStep]:
-    """The filter's pass over `epochs` from what is known before; linearised at joint states `means` if given."""
+    """Filter `epochs` from a prior; linearised at joint states `means` if given."""
     steps = []
     for k, epoch in enumerate(epochs):
         mean = None if means is None else means[k]
@@ -135,7 +137,7 @@ def filter_epochs(prior: BlockGaussian, epochs: list[Epoch], means: list[FloatAr
             step = step.with_birth(birth)
         for recorded in epoch.measurements:
             step = step.updated(recorded, mean)
-        if epoch.motion is not None:
-            step, prior = step.to_next(epoch.gone, epoch.motion, mean)
+        if epoch.interval is not None:
+            step, prior = step.to_next(epoch.gone, epoch.interval, mean)
         steps.append(step)
     return steps

@@ -30,13 +30,13 @@ from factors import (
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Epoch
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import RecordedMeasurements
-from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.transition import Blocks
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
@@ -103,14 +103,14 @@ def recording_factors(
             "detections": [factor for one in seen for factor in one],
         }
         result.append(EpochFactors(keys, factors))
-        if epoch.motion is not None:
+        if epoch.interval is not None:
             gone = layout.rows(epoch.gone)
             stay = layout.without(gone) if len(gone) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
-            resting = stay.nodes[epoch.motion.dynamics(stay, at).still].tolist()
+            resting = stay.nodes[epoch.interval.linearised(stay, at).still].tolist()
             now, keys = keys, {node: keys[node] for node in resting}
             then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
-            native, nonlinear = motion_factors(epoch.motion, stay, at, now, then)
+            native, nonlinear = interval_factors(epoch.interval, stay, at, now, then)
             moved = [*native, *nonlinear]
     return result
 
@@ -152,11 +152,15 @@ def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
     return [H]
 
 
-def motion_factors(
-    motion: Motion | Standstill, layout: Layout, mean: FloatArray, keys: dict[int, int], next_keys: dict[int, int]
+def interval_factors(
+    interval: IntervalDynamics | ZeroInterval,
+    layout: Layout,
+    mean: FloatArray,
+    keys: dict[int, int],
+    next_keys: dict[int, int],
 ) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactors]]:
     """Factors of an interval, native ones and those of nodes that move nonlinearly."""
-    dynamics = motion.dynamics(layout, mean)
+    dynamics = interval.linearised(layout, mean)
     now = np.array([keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
     then = np.array([next_keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
     noise: dict[int, FloatArray] = {}
@@ -169,11 +173,11 @@ def motion_factors(
     for blocks in dynamics.F:
         kinds[np.unique(blocks.target)] += 1
     nonlinear: list[ResidualFactors] = []
-    flowing = same.copy()
-    for flow, rows in motion.flows_of(layout) if isinstance(motion, Motion) else ():
-        flowing[rows[:, 0]] = True
-        nonlinear.append(flow.factors(then[rows[:, 0]], now[rows]))
-    together = regular & (kinds == 1) & ~flowing
+    moves_nonlinearly = same.copy()
+    for group, rows in interval.nonlinear_rows(layout) if isinstance(interval, IntervalDynamics) else ():
+        moves_nonlinearly[rows[:, 0]] = True
+        nonlinear.append(group.factors(then[rows[:, 0]], now[rows]))
+    together = regular & (kinds == 1) & ~moves_nonlinearly
     native: list[gtsam.JacobianFactor] = []
     for blocks in dynamics.F:
         mine = np.flatnonzero(together[blocks.target])
@@ -184,7 +188,7 @@ def motion_factors(
             Q = np.stack([noise[row] for row in rows.tolist()])
             names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
             native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
-    for row in np.flatnonzero(~together & ~flowing).tolist():
+    for row in np.flatnonzero(~together & ~moves_nonlinearly).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
         heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]

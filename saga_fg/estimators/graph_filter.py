@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.graph_moments import by_covariance, condense, lossy
 from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
-from saga_fg.estimators.incremental_graph import IncrementalSmoother
+from saga_fg.estimators.incremental_smoother import IncrementalSmoother
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
+from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
-from saga_fg.graph.providers import FactorProvider, beginnings
+from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -38,13 +38,13 @@ class GraphState:
     graph: SceneFactorGraph
     layout: Layout
     keys: Mapping[int, int]
-    beside: tuple[int, ...]
+    auxiliary: tuple[int, ...]
 
 
 class GraphFilter(LatestMarginals):
     """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
-    providers  asked by `ask`, once a frame
+    providers  asked by `ask_providers`, once a frame
     lag        s; how long epochs stay in the graph, at least until all providers have been asked at the next one
     relinearised  keep the epoch before until the next one in any case, so that nonlinear motion is linearised anew
                where measurements put it; else it is linearised at the prediction, as by the extended Kalman filter
@@ -60,7 +60,7 @@ class GraphFilter(LatestMarginals):
         self._smoother.step(0.0)
         self._layout = Layout()
         self._keys: Mapping[int, int] = {}
-        self._beside: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
+        self._auxiliary: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._posterior: BlockGaussian | None = None  # until the graph changes
 
     def __copy__(self) -> GraphFilter:
@@ -77,19 +77,19 @@ class GraphFilter(LatestMarginals):
     def time(self) -> float:
         return self._smoother.time
 
-    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+    def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
         """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
         self._smoother.origin, self._smoother.frame = origin, frame
         graph = self._smoother.graph()
         if graph.epoch == 0 and not graph.variables:
-            self.extend(beginnings(self.providers))
+            self.extend(predictors(self.providers))
 
-    def ask(self) -> None:
+    def ask_providers(self) -> None:
         """Let the users' providers add their factors."""
         smoother = self._changed()
         smoother.extend(self.providers)
         smoother.forget(self._keys.values())
-        self._beside = self._beside_now()
+        self._auxiliary = self._auxiliary_now()
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Let some providers add their factors at the present epoch."""
@@ -123,25 +123,25 @@ class GraphFilter(LatestMarginals):
 
     def predict(self, transition: Transition) -> None:
         require_kind("transition", transition, Transition)
-        motion = Motion(transition)
-        motion.check(self._layout)
+        interval = IntervalDynamics(transition)
+        interval.check(self._layout)
         x, nodes = self.posterior(), self._layout.nodes
-        dynamics = motion.dynamics(self._layout, x.mean)
+        dynamics = interval.linearised(self._layout, x.mean)
         still = dynamics.still
         if transition.dt == 0 and still.all():
             return
-        standing, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
-        keys = {n: key if n in standing else node_key(n, epoch) for n, key in self._keys.items()}
+        carried_over, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
+        keys = {n: key if n in carried_over else node_key(n, epoch) for n, key in self._keys.items()}
         chosen = lossy(x, dynamics, still, window=self._lag > 0)
         unused = np.isin(transition.nodes, nodes[still | chosen])
         change = self._in_moments(dynamics, chosen, keys) if chosen.any() else None
         smoother = self._changed()
-        smoother.forget({*self._keys.values(), *self._beside})
-        moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, standing)
-        begun = [moved, *beginnings(self.providers)]
-        smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in standing], change)
+        smoother.forget({*self._keys.values(), *self._auxiliary})
+        moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, carried_over)
+        begun = [moved, *predictors(self.providers)]
+        smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in carried_over], change)
         self._keys = keys
-        self._beside += self._beside_now()
+        self._auxiliary += self._auxiliary_now()
         if not self._relinearised:  # nobody is to be asked for factors on the epoch before
             smoother.forget(keys.values())
 
@@ -174,7 +174,7 @@ class GraphFilter(LatestMarginals):
 
     def snapshot(self) -> GraphState:
         """The whole state as a value. iSAM2 begins anew from it, so that both go on to the same bits."""
-        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._beside)
+        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._auxiliary)
         self.restore(state)
         return state
 
@@ -182,9 +182,9 @@ class GraphFilter(LatestMarginals):
         """Continue from a snapshot."""
         require_kind("state", state, GraphState)
         self._changed().restore(state.graph)
-        self._layout, self._keys, self._beside = state.layout, state.keys, state.beside
+        self._layout, self._keys, self._auxiliary = state.layout, state.keys, state.auxiliary
 
-    def _beside_now(self) -> tuple[int, ...]:
+    def _auxiliary_now(self) -> tuple[int, ...]:
         """Variables of the present epoch beside the nodes."""
         graph, nodes = self._smoother.graph(), set(self._keys.values())
         return tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
@@ -194,19 +194,19 @@ class GraphFilter(LatestMarginals):
     ) -> Callable[[SceneFactorGraph], None]:
         """What is to be done to the graph to move the components of the `chosen` nodes (n,) by covariances."""
         every = self._smoother.graph().variables
-        beside = {key: key for key, one in every.items() if one.epoch is None or key in self._beside}
-        x = self._joint(beside)
+        auxiliary = {key: key for key, one in every.items() if one.epoch is None or key in self._auxiliary}
+        x = self._joint(auxiliary)
         others = np.arange(len(self._layout), len(x.layout))
-        moved = by_covariance(x, dynamics.beside(x.layout, others), chosen)
-        earlier, now = ({**beside, **nodes} for nodes in (self._keys, keys))
-        return lambda graph: condense(graph, moved, earlier, now)
+        moved = by_covariance(x, dynamics.with_static(x.layout, others), chosen)
+        earlier, now = ({**auxiliary, **nodes} for nodes in (self._keys, keys))
+        return lambda graph: replace_by_prior(graph, moved, earlier, now)
 
-    def _joint(self, beside: Iterable[int] = ()) -> BlockGaussian:
+    def _joint(self, auxiliary: Iterable[int] = ()) -> BlockGaussian:
         """The joint Gaussian of all nodes, then of other variables, by increments from the base."""
         layout, every = self._layout, self._smoother.graph().variables
-        for key in beside:
+        for key in auxiliary:
             layout = layout.extended([key], every[key].dim)
-        keys = {**dict.fromkeys(beside), **self._keys}
+        keys = {**dict.fromkeys(auxiliary), **self._keys}
         return self._smoother.joint_gaussian(layout, [keys[node] or node for node in layout.nodes.tolist()])
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:

@@ -14,14 +14,14 @@ from typing import ClassVar
 import numpy as np
 
 from factors import detection_factors, gaussian_factors, prior_factors
-from saga_fg.estimators.factor_graph import motion_factors
+from saga_fg.estimators.factor_graph import interval_factors
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import Observations
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -53,12 +53,12 @@ class Interactions:
     """Objects move by a transition over those that stay.
 
     earlier    by id, the keys of their variables, by default those of the epoch before
-    standing   ids of those whose variables stay as they are
+    carried_over   ids of those whose variables stay as they are
     """
 
     transition: Transition
     earlier: Mapping[int, int] | None = None
-    standing: Collection[int] = ()
+    carried_over: Collection[int] = ()
     name: str = "interactions"
     internal: ClassVar[bool] = True
 
@@ -71,17 +71,17 @@ class Interactions:
         now = {node: node_key(node, view.epoch) for node in nodes}
         layout = Layout(nodes, transition.graph.dims)
         mean = np.concatenate([view.state(earlier[node]) for node in nodes])
-        motion = Motion(transition)
-        dynamics = motion.dynamics(layout, mean)
+        interval = IntervalDynamics(transition)
+        dynamics = interval.linearised(layout, mean)
         moved = dynamics.moved(mean) + dynamics.b
         states = np.split(moved, transition.offsets[1:-1])
         new = [
             NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
             for n, x in zip(nodes, states, strict=True)
-            if n not in self.standing
+            if n not in self.carried_over
         ]
-        native, nonlinear = motion_factors(motion, layout, mean, dict(earlier), now)
-        still = {now[node] for node in self.standing}
+        native, nonlinear = interval_factors(interval, layout, mean, dict(earlier), now)
+        still = {now[node] for node in self.carried_over}
         return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
 
 

@@ -24,14 +24,13 @@ from saga_fg.estimators.backward import smoothed_means
 from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
 from saga_fg.estimators.factor_graph import recording_graph
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
-from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.prediction import Prediction
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
@@ -101,7 +100,7 @@ class IncrementalFilter(LatestMarginals):
         if len(added) == 0:
             return
         if np.isin(added, state.newest.gone).any():  # gone and back at the same time
-            state = _moved(state, Standstill())
+            state = _moved(state, ZeroInterval())
         state, x = _solved(state)
         x = x.extended(x.layout.extended(added, mean.shape[1]), mean, covariance)
         birth = Birth(added, mean, covariance)
@@ -110,9 +109,9 @@ class IncrementalFilter(LatestMarginals):
         self._state = replace(state, live=live, tree=tree, x=x, epochs=epochs)
 
     def predict(self, transition: Transition) -> None:
-        motion = Motion(transition)
-        motion.check(self._state.live)
-        self._state = _moved(self._state, motion)
+        interval = IntervalDynamics(transition)
+        interval.check(self._state.live)
+        self._state = _moved(self._state, interval)
 
     def update(self, measurements: Measurements | Observations) -> float:
         recorded = RecordedMeasurements(measurements)
@@ -200,13 +199,13 @@ def _begun(x: BlockGaussian, small: bool) -> BayesTree | None:
         return None
 
 
-def _moved(state: _State, motion: Motion | Standstill) -> _State:
+def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
     """Move over an interval: by interaction factors, or by covariances for components whose digits these would lose."""
     state, x = _solved(state)
     stay = x.without(x.layout.rows(state.newest.gone))
-    dynamics = motion.dynamics(stay.layout, stay.mean)
+    dynamics = interval.linearised(stay.layout, stay.mean)
     apart = dynamics.separated(stay)
-    prediction = Prediction.of(apart, dynamics)
+    prediction = PredictionSummary.of(apart, dynamics)
     components, small = prediction.components, _largest(prediction.components) <= _SMALL
     lossy = np.zeros(components.count, dtype=bool)
     lossy[components.label[prediction.ratio > (_QR_LIMIT if small else _CHOLESKY_LIMIT)]] = True
@@ -222,13 +221,17 @@ def _moved(state: _State, motion: Motion | Standstill) -> _State:
         tree = _tree_predicted(tree, rows, dynamics.only(by_factors), prediction, predicted)
         if tree is None:
             predicted = predict(apart, dynamics)
-    then, now = state.newest.time, state.newest.time + motion.dt
-    epochs = (Epoch(then, gone=state.newest.gone, motion=motion), Epoch(now))
+    then, now = state.newest.time, state.newest.time + interval.dt
+    epochs = (Epoch(then, gone=state.newest.gone, interval=interval), Epoch(now))
     return _State(apart.layout, tree, predicted if tree is None else None, x, epochs)
 
 
 def _tree_predicted(
-    tree: BayesTree | None, rows: IntArray, dynamics: Dynamics, prediction: Prediction, by_covariance: BlockGaussian
+    tree: BayesTree | None,
+    rows: IntArray,
+    dynamics: Dynamics,
+    prediction: PredictionSummary,
+    by_covariance: BlockGaussian,
 ) -> BayesTree | None:
     """Move the tree over an interval; None where a covariance has no digits left to be inverted."""
     try:

@@ -20,11 +20,11 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.factor_graph import prior_graph
-from saga_fg.estimators.kalman_factors import Beside, asked
+from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
-from saga_fg.graph.providers import FactorProvider, beginnings
+from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -43,13 +43,13 @@ class KalmanState:
     x: BlockGaussian
     predictions: int
     time: float
-    beside: Beside | None
+    auxiliary: AuxiliaryVariables | None
 
 
 class JointKalmanFilter(LatestMarginals):
     """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
-    providers  asked by `ask`, once a frame, for factors on the newest variables: an extended Kalman filter
+    providers  asked by `ask_providers`, once a frame, for factors on the newest variables: an extended Kalman filter
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = ()) -> None:
@@ -57,13 +57,13 @@ class JointKalmanFilter(LatestMarginals):
         self._state = BlockGaussian.empty()
         self._predictions = 0
         self._time = 0.0
-        self._beside = Beside()
+        self._auxiliary = AuxiliaryVariables()
         self._frame: Frame | None = None
         self._origin = np.zeros(2)
 
     @property
     def nodes(self) -> IntArray:
-        return np.delete(self._state.layout.nodes, self._beside.rows(self._state.layout))
+        return np.delete(self._state.layout.nodes, self._auxiliary.rows(self._state.layout))
 
     @property
     def time(self) -> float:
@@ -75,32 +75,32 @@ class JointKalmanFilter(LatestMarginals):
         mean, covariance = checked_prior(nodes, means, covariances)
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
         if self.providers:
-            self._beside = replace(self._beside, labels={**self._beside.labels, **(labels or {})})
+            self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
 
-    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
+    def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
         """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
         self._frame, self._origin = frame, origin
 
-    def ask(self) -> None:
+    def ask_providers(self) -> None:
         """Take in the providers' factors. Raises `GraphError` for one that is not on the newest variables alone."""
-        x, beside = self._state, self._beside
-        for providers, last in ((beginnings(self.providers), False), (self.providers, True)):
+        x, auxiliary = self._state, self._auxiliary
+        for providers, last in ((predictors(self.providers), False), (self.providers, True)):
             if providers:
-                x, beside = asked(x, beside, providers, self._time, self._origin, self._frame, last)
-        self._state, self._beside = x, beside
+                x, auxiliary = asked(x, auxiliary, providers, self._time, self._origin, self._frame, last)
+        self._state, self._auxiliary = x, auxiliary
 
     @property
     def others(self) -> IntArray:
         """Rows of the variables beside the nodes, in the joint state: poses, landmarks."""
-        return self._beside.rows(self._state.layout)
+        return self._auxiliary.rows(self._state.layout)
 
     @property
-    def beside(self) -> SceneFactorGraph:
+    def auxiliary(self) -> SceneFactorGraph:
         """These variables where they are, without factors."""
-        return self._beside.graph
+        return self._auxiliary.graph
 
     def predict(self, transition: Transition) -> None:
-        dynamics = self._beside.dynamics(transition, self._state)
+        dynamics = self._auxiliary.dynamics(transition, self._state)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
         self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         self._predictions += 1
@@ -119,8 +119,8 @@ class JointKalmanFilter(LatestMarginals):
         self._state = self._state.without(self._state.layout.rows(nodes))
         if self.providers:
             gone = set(np.asarray(nodes).tolist())
-            labels = {node: label for node, label in self._beside.labels.items() if node not in gone}
-            self._beside = replace(self._beside, labels=labels)
+            labels = {node: label for node, label in self._auxiliary.labels.items() if node not in gone}
+            self._auxiliary = replace(self._auxiliary, labels=labels)
 
     def posterior(self) -> BlockGaussian:
         """All that the filter knows."""
@@ -128,17 +128,19 @@ class JointKalmanFilter(LatestMarginals):
 
     def graph(self) -> SceneFactorGraph:
         """One joint prior a component: the filter keeps nothing of the past but this. With providers by name."""
-        return self._beside.priors(self._state, self._time) if self.providers else prior_graph(self._state, self._time)
+        return (
+            self._auxiliary.priors(self._state, self._time) if self.providers else prior_graph(self._state, self._time)
+        )
 
     def snapshot(self) -> KalmanState:
         """The whole state, as a value."""
-        return KalmanState(self._state, self._predictions, self._time, self._beside if self.providers else None)
+        return KalmanState(self._state, self._predictions, self._time, self._auxiliary if self.providers else None)
 
     def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
         require_kind("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
-        self._beside = state.beside or Beside()
+        self._auxiliary = state.auxiliary or AuxiliaryVariables()
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         return self._state, self._state.layout.rows(nodes)

@@ -11,9 +11,9 @@ from factors import Robust
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.motion import Motion
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.estimators.recording import Recording
 from saga_fg.model.transition import Transition
@@ -85,7 +85,7 @@ class RecordedSmoother(LatestMarginals):
         self._recording.add(nodes, means, covariances)
 
     def predict(self, transition: Transition) -> None:
-        self._recording.predict(Motion(transition))
+        self._recording.predict(IntervalDynamics(transition))
 
     def update(
         self, measurements: Measurements | Observations, time: float | None = None, robust: Robust | None = None

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
+from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import (
     MarginalCovariances,
     SmoothedCovariance,
@@ -25,10 +26,9 @@ from saga_fg.estimators.backward import (
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
 from saga_fg.estimators.factor_graph import recording_graph
-from saga_fg.estimators.fixed_point import FixedPoint
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
-from saga_fg.estimators.motion import Motion, Standstill
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
@@ -146,7 +146,7 @@ class Recording:
         if len(added) == 0:
             return
         if np.isin(added, self._epochs[-1].gone).any():  # gone and back at the same time: another epoch
-            self._begin_epoch(Standstill())
+            self._begin_epoch(ZeroInterval())
         birth, epoch = Birth(added, mean, covariance), self._epochs[-1]
         if len(self._steps) == len(self._epochs):
             self._steps[-1] = self._steps[-1].with_birth(birth)
@@ -154,10 +154,10 @@ class Recording:
         self._layouts[-1] = self._layouts[-1].extended(added, mean.shape[1])
         self._changed()
 
-    def predict(self, motion: Motion) -> None:
+    def predict(self, interval: IntervalDynamics) -> None:
         """Begin a new epoch."""
-        motion.check(self.layout)
-        self._begin_epoch(motion)
+        interval.check(self.layout)
+        self._begin_epoch(interval)
 
     def update(self, recorded: RecordedMeasurements, time: float | None = None) -> float:
         """Take in measurements, of the newest epoch or of any `time` within the recording.
@@ -265,7 +265,7 @@ class Recording:
         self._steps = _completed(self._steps, self._prior, self._epochs)
         if self._converged:
             return
-        means, step, iteration = smoothed_means(self._steps), math.inf, FixedPoint()
+        means, step, iteration = smoothed_means(self._steps), math.inf, AndersonAcceleration()
         ends = np.cumsum([len(mean) for mean in means])[:-1]
         for count in range(self._settings.max_iterations):
             steps = filter_epochs(self._prior, self._epochs, means)
@@ -283,18 +283,18 @@ class Recording:
         self._changed()
         self._means = solved
 
-    def _begin_epoch(self, motion: Motion | Standstill) -> None:
+    def _begin_epoch(self, interval: IntervalDynamics | ZeroInterval) -> None:
         epoch, layout, steps = self._epochs[-1], self.layout, self._steps
         if not self._lazy:
             self.solve()
-        if not (self._lazy and motion.linear):
+        if not (self._lazy and interval.linear):
             known = _completed(self._steps, self._prior, self._epochs)
-            step, prior = known[-1].to_next(epoch.gone, motion)
+            step, prior = known[-1].to_next(epoch.gone, interval)
             steps = [*known[:-1], step, initial_step(prior)]
-        self._epochs = [*self._epochs[:-1], replace(epoch, motion=motion), Epoch(epoch.time + motion.dt)]
+        self._epochs = [*self._epochs[:-1], replace(epoch, interval=interval), Epoch(epoch.time + interval.dt)]
         self._layouts, self._steps = [*self._layouts, layout], steps
-        self._nonlinear |= not motion.linear
-        self._converged &= motion.linear or not self._lazy
+        self._nonlinear |= not interval.linear
+        self._converged &= interval.linear or not self._lazy
         self._changed()
 
     def _epoch_at(self, time: float) -> tuple[int, list[Epoch], list[Layout]]:
@@ -311,12 +311,12 @@ class Recording:
             k -= 1
         if epochs[k].time >= time - _SAME_TIME:
             return k, epochs, layouts
-        motion = epochs[k].motion
-        assert isinstance(motion, Motion)  # a standstill has no inside
-        start, rest = motion.parts(time - epochs[k].time)
+        interval = epochs[k].interval
+        assert isinstance(interval, IntervalDynamics)  # a zero interval has no inside
+        start, rest = interval.split(time - epochs[k].time)
         gone = layouts[k].rows(epochs[k].gone)
-        epochs[k] = replace(epochs[k], motion=start)
-        epochs.insert(k + 1, Epoch(time, motion=rest))
+        epochs[k] = replace(epochs[k], interval=start)
+        epochs.insert(k + 1, Epoch(time, interval=rest))
         layouts.insert(k + 1, layouts[k].without(gone) if len(gone) else layouts[k])
         return k + 1, epochs, layouts
 
@@ -332,7 +332,7 @@ def _completed(steps: list[FilterStep], prior: BlockGaussian, epochs: list[Epoch
         return steps
     done = list(steps)
     if k > 0:
-        motion = epochs[k - 1].motion
-        assert motion is not None
-        done[-1], prior = done[-1].to_next(epochs[k - 1].gone, motion)
+        interval = epochs[k - 1].interval
+        assert interval is not None
+        done[-1], prior = done[-1].to_next(epochs[k - 1].gone, interval)
     return done + filter_epochs(prior, epochs[k:])

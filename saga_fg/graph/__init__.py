@@ -1,6 +1,7 @@
 """The running graph: one factor graph of objects, the vehicle and landmarks, fed by factor providers."""
 
 from saga_fg.graph.errors import GraphError, ProviderError, UndeterminedError
+from saga_fg.graph.factor_groups import FactorEntry
 from saga_fg.graph.keys import (
     EGO_BIAS,
     EGO_ERROR,
@@ -14,10 +15,9 @@ from saga_fg.graph.keys import (
     key_id,
     key_of,
 )
-from saga_fg.graph.parts import FactorEntry, NewVariable
-from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all, beginnings
+from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphVariable
+from saga_fg.graph.variables import GraphVariable, NewVariable
 
 __all__ = [
     "EGO_BIAS",
@@ -40,7 +40,7 @@ __all__ = [
     "SceneFactorGraph",
     "UndeterminedError",
     "ask_all",
-    "beginnings",
     "key_id",
     "key_of",
+    "predictors",
 ]

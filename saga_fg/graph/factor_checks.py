@@ -32,7 +32,7 @@ from saga_fg.graph.factor_groups import (
     members,
 )
 from saga_fg.graph.keys import described
-from saga_fg.graph.point import LARGEST
+from saga_fg.graph.linearisation_point import LARGEST
 from saga_fg.graph.variables import GraphVariable
 
 Factor = gtsam.JacobianFactor | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph | Linearisable

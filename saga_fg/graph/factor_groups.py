@@ -1,13 +1,13 @@
 """Factors as the running graph holds them: in groups of what was given together, each factor a row of its group.
 
-A group linearises any of its rows at a `Point`. What GTSAM evaluates itself is linearised by GTSAM, one factor at a
-time with the values of its own variables alone; `ResidualFactors` all at once in NumPy. A `gtsam.CustomFactor` is
+A group linearises any of its rows at a `LinearisationPoint`. GTSAM's own factors are linearised by GTSAM, one at a
+time; `ResidualFactors` all at once in NumPy. A `gtsam.CustomFactor` is
 differentiated numerically: GTSAM crashes where its function leaves out a Jacobian, and does not show the function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,8 +17,9 @@ import numpy as np
 from factors import FactorError, Linearisable, ResidualFactor, ResidualFactors, nonlinear_graph, nonlinear_graph_at
 from factors.differences import central_differences
 from factors.gaussian import gaussian_graph, native_factor, whitened_factors
-from saga_fg.graph.point import LARGEST, Point
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.graph.linearisation_point import LARGEST, LinearisationPoint
+from saga_fg.graph.variables import GraphVariable
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 Rows = tuple[tuple[int, ...], ...]
 
@@ -33,17 +34,17 @@ class FactorGroup(Protocol):
     @property
     def linear(self) -> bool: ...
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """The rows `chosen`, on increments from the base. Raises what the factors raise."""
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
         """The rows `chosen` as GTSAM's own factors."""
 
 
 class SolvableGroup(FactorGroup, Protocol):
     """A group that GTSAM does not evaluate itself."""
 
-    def error(self, chosen: IntArray, point: Point) -> float:
+    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
         """The cost, -log phi, of the rows `chosen` together."""
 
 
@@ -61,7 +62,7 @@ class LinearGroup:
     name: str = "linear factor"
     linear: bool = True
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         result = []
         for row in chosen.tolist():
             keys, augmented = self.rows[row], np.array(self.factors[row].augmentedJacobian(), order="F")
@@ -70,7 +71,7 @@ class LinearGroup:
             result.append(native_factor(keys, point.dims(keys), augmented))
         return result
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
         keys = {key for row in chosen.tolist() for key in self.rows[row]}
         dims = dict(zip(keys, point.dims(list(keys)), strict=True))
         return members(nonlinear_graph([self.factors[row] for row in chosen.tolist()], dims))
@@ -85,10 +86,10 @@ class PriorGroup:
     name: str = "marginal"
     linear: bool = True
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         return [self.factors[row] for row in chosen.tolist()]
 
-    def here(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def here(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """The same on increments from the point."""
         result = []
         for row in chosen.tolist():
@@ -102,10 +103,10 @@ class PriorGroup:
             result.append(native_factor(keys, dims, augmented))
         return result
 
-    def error(self, chosen: IntArray, point: Point) -> float:
+    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
         return 0.5 * sum(float(np.sum(f.augmentedJacobian()[:, -1] ** 2)) for f in self.here(chosen, point))
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
         return members(nonlinear_graph_at(self.linearised(chosen, point), point.base))
 
 
@@ -121,7 +122,7 @@ class StackedGroup:
     def name(self) -> str:
         return self.factors.name
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         W, jacobians, residuals = self.factors.linearisation(point.values, chosen)
         keys, rhs, blocks = self.factors.rows[chosen], -residuals, []
         if point.base is point.values:
@@ -142,11 +143,11 @@ class StackedGroup:
             raise FactorError(f"expected a residual and Jacobians of at most {LARGEST:g} standard deviations")
         return whitened_factors(keys, W, blocks, rhs)
 
-    def error(self, chosen: IntArray, point: Point) -> float:
+    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
         return float(self.factors.errors(point.values, chosen).sum())
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
-        singles = self.factors.singles()
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
+        singles = self.factors.individual_factors()
         return [singles[row].as_custom_factor() for row in chosen.tolist()]
 
 
@@ -159,7 +160,7 @@ class SingleGroup:
     name: str
     linear: bool = False
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         made = self.factor.linearise(point.values)
         (keys,) = self.rows
         if not isinstance(made, gtsam.GaussianFactor | gtsam.GaussianFactorGraph):
@@ -172,10 +173,10 @@ class SingleGroup:
         A, b = made.jacobian(gtsam.Ordering(list(keys)))
         return [point.from_base(keys, np.column_stack([A, b]))]
 
-    def error(self, chosen: IntArray, point: Point) -> float:
+    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
         return self.factor.error(point.values)
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
         if not isinstance(self.factor, ResidualFactor):
             raise FactorError(f"{self.name}: expected a ResidualFactor, which GTSAM's solvers can call")
         return [self.factor.as_custom_factor()]
@@ -190,11 +191,11 @@ class NativeGroup:
     name: str
     linear: bool = False
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         made = self.factor.linearize(point.values)
         return [point.from_base(list(made.keys()), made.augmentedJacobian())]
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
         return [self.factor]
 
 
@@ -207,7 +208,7 @@ class CustomGroup:
     name: str = "custom factor"
     linear: bool = False
 
-    def linearised(self, chosen: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         (keys,) = self.rows
         types = [point.variables[key].type for key in keys]
         states = [kind.read(point.values, key) for key, kind in zip(keys, types, strict=True)]
@@ -224,10 +225,10 @@ class CustomGroup:
             whitened *= np.sqrt(noise.weight(whitened[:, -1]))
         return [point.from_base(keys, whitened)]
 
-    def error(self, chosen: IntArray, point: Point) -> float:
+    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
         return float(self.factor.error(point.values))
 
-    def native(self, chosen: IntArray, point: Point) -> list[gtsam.NonlinearFactor]:
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
         return [self.factor]
 
     def _residual(self, keys: Sequence[int], states: Sequence[Any]) -> FloatArray:
@@ -248,16 +249,56 @@ class ActiveRows:
 
     group: SolvableGroup
     chosen: IntArray
-    point: Point
+    point: LinearisationPoint
 
     @property
     def keys(self) -> tuple[int, ...]:
         return tuple({key for row in self.chosen.tolist() for key in self.group.rows[row]})
 
     def error(self, values: gtsam.Values) -> float:
-        return self.group.error(self.chosen, Point(self.point.variables, self.point.base, values))
+        return self.group.error(self.chosen, LinearisationPoint(self.point.variables, self.point.base, values))
 
     def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         if isinstance(self.group, PriorGroup):
-            return gaussian_graph(self.group.here(self.chosen, Point(self.point.variables, self.point.base, values)))
-        return gaussian_graph(self.group.linearised(self.chosen, Point(self.point.variables, values, values)))
+            return gaussian_graph(
+                self.group.here(self.chosen, LinearisationPoint(self.point.variables, self.point.base, values))
+            )
+        return gaussian_graph(
+            self.group.linearised(self.chosen, LinearisationPoint(self.point.variables, values, values))
+        )
+
+
+@dataclass(frozen=True)
+class FactorEntry:
+    """Description of a factor: its provider, its kind and its variables."""
+
+    provider: str
+    kind: str
+    variables: tuple[GraphVariable, ...]
+
+    def __str__(self) -> str:
+        return f"{self.kind} on {', '.join(map(str, self.variables))} (provider {self.provider})"
+
+
+@dataclass(frozen=True, eq=False)
+class HeldGroup:
+    """Factors in the graph: their provider, their name if any, and active (n,): the rows that are still there."""
+
+    provider: str
+    name: Hashable
+    factors: FactorGroup
+    active: BoolArray
+
+    @property
+    def rows(self) -> IntArray:
+        """Numbers of the active rows."""
+        return np.flatnonzero(self.active)
+
+    @property
+    def elimination_order(self) -> tuple[bool, int]:
+        """Sort key for elimination: groups that are likely to have the least noise come first.
+
+        Householder's QR loses digits of rows of small numbers where rows of large ones come after them: with intervals
+        of a millisecond, whose interactions have next to no noise, three to five digits.
+        """
+        return isinstance(self.factors, PriorGroup), -max(map(len, self.factors.rows))

@@ -26,9 +26,8 @@ import numpy as np
 from saga_fg.graph.errors import GraphError, ProviderError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import Kind, key_of
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphVariable
+from saga_fg.graph.variables import GraphVariable, NewVariable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.frame import Frame
 
@@ -64,7 +63,7 @@ class GraphView:
 
     covariance(key): marginal (d, d), as known before this frame; origin (2,): that positions of objects are counted
     from, in the world, m (a tracker's is near its first frame, so that no digits are lost), places of the vehicle and
-    of landmarks as well; frame: what the epoch brings, None where nobody has said
+    of landmarks as well; frame: what the epoch brings, None where nobody has text
     """
 
     def __init__(
@@ -112,7 +111,7 @@ class GraphView:
     def key(self, kind: Kind, id: int, static: bool = False) -> int:  # noqa: A002 -- an id is what it is
         """The key of a variable of this epoch, or of one for all time; whether it is there or only to be added."""
         key = key_of(kind, id, None if static else self.epoch)
-        return self._graph.standing.get(key, key)
+        return self._graph.carried_over.get(key, key)
 
     def state(self, key: int) -> Any:
         """Where a variable is."""
@@ -127,7 +126,7 @@ class GraphView:
 def ask_all(providers: Iterable[FactorProvider], graph: SceneFactorGraph) -> None:
     """Add what providers give at the present epoch of a recording that is solved as a whole."""
     view, asked = GraphView(graph, _unknown, np.zeros(2)), list(providers)
-    for provider in (*beginnings(asked), *asked):
+    for provider in (*predictors(asked), *asked):
         ask(provider, graph, view)
 
 
@@ -136,7 +135,7 @@ def _unknown(key: int) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Beginning:
+class _Predictor:
     """What a provider adds when an epoch begins, as a provider."""
 
     provider: Any
@@ -150,9 +149,9 @@ class _Beginning:
         return added
 
 
-def beginnings(providers: Iterable[FactorProvider]) -> list[FactorProvider]:
+def predictors(providers: Iterable[FactorProvider]) -> list[FactorProvider]:
     """Those of some providers that add something when an epoch begins, to be asked for that."""
-    return [_Beginning(provider) for provider in providers if callable(getattr(provider, "predict", None))]
+    return [_Predictor(provider) for provider in providers if callable(getattr(provider, "predict", None))]
 
 
 def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:
@@ -166,9 +165,9 @@ def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> N
         _ask(name, provider, graph, view)
     except Exception as error:
         expected = isinstance(error, GraphError | ValueError)
-        said = " ".join((str(error) if expected else repr(error)).split()).removeprefix(f"provider {name}: ")
+        text = " ".join((str(error) if expected else repr(error)).split()).removeprefix(f"provider {name}: ")
         kind = GraphError if getattr(provider, "internal", False) else ProviderError
-        raise kind(f"provider {name}: {graph.worded(said, graph.variables)[:500]}") from error
+        raise kind(f"provider {name}: {graph.with_names(text, graph.variables)[:500]}") from error
 
 
 def _ask(name: str, provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:

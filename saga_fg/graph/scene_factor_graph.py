@@ -29,11 +29,18 @@ from factors.validation import format_key
 from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_checks import Factor, grouped
-from saga_fg.graph.factor_groups import ActiveRows, FactorGroup, LinearGroup, NativeGroup, PriorGroup
+from saga_fg.graph.factor_groups import (
+    ActiveRows,
+    FactorEntry,
+    FactorGroup,
+    HeldGroup,
+    LinearGroup,
+    NativeGroup,
+    PriorGroup,
+)
 from saga_fg.graph.keys import Kind, described, key_of
-from saga_fg.graph.parts import FactorEntry, HeldGroup, NewVariable
-from saga_fg.graph.point import Point
-from saga_fg.graph.variables import GraphVariable, insert_state, variable_type
+from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state, variable_type
 from saga_fg.numerics.arrays import IntArray
 
 _MARGINALS = "marginals"
@@ -53,7 +60,7 @@ class SceneFactorGraph:
         self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
         self._count = 0
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
-        self.standing: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
+        self.carried_over: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
 
     @property
     def variables(self) -> Mapping[int, GraphVariable]:
@@ -92,13 +99,13 @@ class SceneFactorGraph:
                 mine = tuple(self._variables[key] for key in held.factors.rows[row])
                 yield FactorEntry(held.provider, held.factors.name, mine)
 
-    def advance(self, time: float, standing: Iterable[int] = ()) -> int:
-        """Begin the next epoch at `time`, s; returns its number. standing: variables that are those of it, too."""
+    def advance(self, time: float, carried_over: Iterable[int] = ()) -> int:
+        """Begin the next epoch at `time`, s; returns its number. carried_over: variables that are those of it, too."""
         if not math.isfinite(time) or time <= self.time:
             raise GraphError(f"time: expected a finite number after {self.time:.6f} s, got {time!r}")
         self.epoch, self.previous_time, self.time = self.epoch + 1, self.time, float(time)
-        its = ((self._variables[key], key) for key in standing)
-        self.standing = {key_of(one.kind, one.id, self.epoch): key for one, key in its}
+        its = ((self._variables[key], key) for key in carried_over)
+        self.carried_over = {key_of(one.kind, one.id, self.epoch): key for one, key in its}
         return self.epoch
 
     def add_variables(self, provider: str, variables: Iterable[NewVariable]) -> list[int]:
@@ -166,7 +173,7 @@ class SceneFactorGraph:
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))
 
-    def condense(self, gone: Collection[int], prior: gtsam.JacobianFactor) -> None:
+    def replace_by_prior(self, gone: Collection[int], prior: gtsam.JacobianFactor) -> None:
         """Put a prior, on increments from the base, in the place of all factors on its variables and those `gone`."""
         self._replace(self._rows_on({*gone, *prior.keys()}), [prior], gone)
         self._choose(prior.cols() - 1)
@@ -175,7 +182,7 @@ class SceneFactorGraph:
         """Rows of groups on any of some variables, by the number of the group, the sharpest first."""
         numbers = {number for key in keys for number in self._touching[key]}
         result = {}
-        for number in sorted(numbers, key=lambda number: self._groups[number].sharpness):
+        for number in sorted(numbers, key=lambda number: self._groups[number].elimination_order):
             held = self._groups[number]
             mine = [row for row in held.rows.tolist() if any(key in keys for key in held.factors.rows[row])]
             if mine:
@@ -212,19 +219,19 @@ class SceneFactorGraph:
 
     def of(self, kind: Kind, epoch: int | None) -> dict[int, GraphVariable]:
         """The variables of a kind and an epoch, None for those for all time, by id."""
-        standing = set(self.standing.values()) if epoch == self.epoch else ()
-        every = (one for one in self._variables.values() if one.epoch == epoch or one.key in standing)
+        carried_over = set(self.carried_over.values()) if epoch == self.epoch else ()
+        every = (one for one in self._variables.values() if one.epoch == epoch or one.key in carried_over)
         return {one.id: one for one in every if one.kind == kind}
 
     def older_than(self, time: float) -> list[int]:
         """Keys of the variables of moments before `time`."""
         return [key for key, one in self._variables.items() if one.time is not None and one.time < time]
 
-    def point(self) -> Point:
+    def point(self) -> LinearisationPoint:
         """Where everything is, to linearise factors at."""
-        return Point(self._variables, self._base, self._values)
+        return LinearisationPoint(self._variables, self._base, self._values)
 
-    def linearised(self, held: HeldGroup, rows: IntArray, point: Point) -> list[gtsam.JacobianFactor]:
+    def linearised(self, held: HeldGroup, rows: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """Rows of a group as linear factors on increments from the base."""
         try:
             return held.factors.linearised(rows, point)
@@ -236,7 +243,7 @@ class SceneFactorGraph:
         self._values = gtsam.Values(values)
         self._fresh.clear()
 
-    def linear(self, number: int, point: Point) -> list[gtsam.JacobianFactor]:
+    def linear(self, number: int, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """What is there of a group, as linear factors on increments from the base."""
         if number in self._fresh:
             return self._fresh[number]
@@ -245,7 +252,7 @@ class SceneFactorGraph:
 
     def solve(self, settings: SolverSettings | None = None) -> Solution:
         """Minimise over everything by Levenberg-Marquardt, and put the variables there."""
-        native, ours = self.parts()
+        native, ours = self.solver_inputs()
         try:
             solution = solve(native, ours, self._values, settings)
         except FactorError as error:
@@ -253,10 +260,10 @@ class SceneFactorGraph:
         self.moved_to(solution.values)
         return solution
 
-    def parts(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
+    def solver_inputs(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
-        for held in sorted(self._groups.values(), key=lambda held: held.sharpness):
+        for held in sorted(self._groups.values(), key=lambda held: held.elimination_order):
             if isinstance(held.factors, LinearGroup | NativeGroup):
                 for factor in held.factors.native(held.rows, point):
                     native.add(factor)
@@ -276,7 +283,7 @@ class SceneFactorGraph:
         """A graph of its own with the same variables and factors, which are shared.
 
         share_values: what is added to the copy comes into these values, too, which costs less than copying them; only
-        one of the two can go on, this one with `drop_strangers`
+        one of the two can go on, this one with `erase_unknown_values`
         """
         other = SceneFactorGraph()
         other.__dict__ |= self.__dict__
@@ -287,16 +294,16 @@ class SceneFactorGraph:
             other._base, other._values = self.base, self.values
         return other
 
-    def drop_strangers(self) -> None:
+    def erase_unknown_values(self) -> None:
         """Erase values of variables that are not in the graph."""
         for values in (self._base, self._values):
             for key in set(values.keys()) - self._variables.keys():
                 values.erase(key)
 
     def undetermined(self, error: Exception) -> GraphError:
-        """What a solver said, in the words of this graph."""
+        """What a solver text, in the words of this graph."""
         if not isinstance(error, SingularSystemError) or not error.keys:
-            return GraphError(self.worded(str(error), self._variables))
+            return GraphError(self.with_names(str(error), self._variables))
         names = [str(self._variables[key]) if key in self._variables else described(key) for key in error.keys[:8]]
         more = f" and {len(error.keys) - 8} more" if len(error.keys) > 8 else ""
         first = error.keys[0]
@@ -307,7 +314,7 @@ class SceneFactorGraph:
             error.keys,
         )
 
-    def worded(self, text: str, keys: Iterable[int]) -> str:
+    def with_names(self, text: str, keys: Iterable[int]) -> str:
         """A text with keys in words in place of numbers and symbols."""
         for key in keys:
             if format_key(key) in text:
@@ -328,9 +335,9 @@ class SceneFactorGraph:
         keys = dict.fromkeys(key for row in rows.tolist() for key in held.factors.rows[row])
         named = [str(self._variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
         expected = isinstance(error, FactorError | InputError)
-        said = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
+        text = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
         where = f"{held.factors.name} on {', '.join(named)}: "
-        return f"provider {held.provider}: {where}{self.worded(said, keys).removeprefix(where)[:500]}"
+        return f"provider {held.provider}: {where}{self.with_names(text, keys).removeprefix(where)[:500]}"
 
     def _hold(self, held: HeldGroup) -> int:
         number, self._count = self._count, self._count + 1

@@ -47,6 +47,22 @@ class GraphVariable:
         return name if self.time is None else f"{name} at {self.time:.2f} s"
 
 
+@dataclass(frozen=True, eq=False)
+class NewVariable:
+    """A variable to add to the graph.
+
+    state: its first value; static: one for all time; label: a word for it, by default the kind's; type: of the state,
+    by default the vector, pose or plane that the state is
+    """
+
+    kind: Kind
+    id: int
+    state: Any
+    static: bool = False
+    label: str = ""
+    type: Any = None
+
+
 def variable_type(name: str, state: Any) -> Variable:
     """Return the type of a state: a vector, a pose, a plane or a bias; raises `GraphError` for anything else."""
     if isinstance(state, gtsam.Pose2):

@@ -61,7 +61,9 @@ def match_to_truth(
         detections = sensor.in_world(frame)
         boxes, truth = detections.boxes, annotations.boxes
         distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - truth.position[None, :, :2], -1, 0))
-        reach = np.where(boxes.label[:, None] == truth.label, gate, gate / 2 * mates.akin(boxes.label, truth.label))
+        reach = np.where(
+            boxes.label[:, None] == truth.label, gate, gate / 2 * mates.same_group(boxes.label, truth.label)
+        )
         possible = distance < reach
         yield MatchedFrame(
             frame, detections, sensor.origin(frame), annotations, *assign(distance, possible, unmatched=gate)

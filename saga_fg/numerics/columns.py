@@ -11,7 +11,10 @@ from saga_fg.numerics.arrays import BoolArray, IntArray
 
 
 class Columns:
-    """For dataclasses whose fields are arrays (n, ...), or other tables, row by row of the same n things."""
+    """For dataclasses whose fields are arrays (n, ...), or other tables, row by row of the same n things.
+
+    A field that is a tuple is of the whole table, and the same in every selection.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -24,15 +27,24 @@ class Columns:
         chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
         for name in self.__dataclass_fields__:
             column = getattr(self, name)
-            object.__setattr__(chosen, name, column.select(index) if isinstance(column, Columns) else column[index])
+            if not isinstance(column, tuple):
+                column = column.select(index) if isinstance(column, Columns) else column[index]
+            object.__setattr__(chosen, name, column)
         return chosen
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """The rows of all parts, of which there is one at least, in order."""
         columns = ([getattr(part, name) for part in parts] for name in cls.__dataclass_fields__)
-        return cls(*(c[0].concatenate(c) if isinstance(c[0], Columns) else np.concatenate(c) for c in columns))
+        return cls(*map(_concatenated, columns))
 
     def extended(self, other: Self) -> Self:
         """With the rows of another at the end."""
         return self.concatenate([self, other])
+
+
+def _concatenated(columns: Sequence[Any]) -> Any:
+    first = columns[0]
+    if isinstance(first, tuple):
+        return first
+    return first.concatenate(columns) if isinstance(first, Columns) else np.concatenate(columns)

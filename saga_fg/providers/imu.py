@@ -16,8 +16,8 @@ import numpy as np
 from factors import prior_factor
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_BIAS, EGO_POSE, EGO_VELOCITY
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.start import StartSettings
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group

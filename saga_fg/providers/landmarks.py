@@ -11,8 +11,8 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import EGO_POSE, LANDMARK
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import Positive, Settings, setting

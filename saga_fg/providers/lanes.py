@@ -14,8 +14,8 @@ from factors import Robust, lane_keeping_factors, prior_factor
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import MAP_NODE, OBJECT
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.polyline import feet, on_it

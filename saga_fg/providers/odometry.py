@@ -17,8 +17,8 @@ import numpy as np
 from factors import Pose, between_factor, pose
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.start import StartSettings
 from saga_fg.settings import Positive, Settings, setting, settings_group

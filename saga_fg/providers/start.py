@@ -11,8 +11,8 @@ import numpy as np
 from factors import Pose, pose, pose_prior_factor
 from saga_fg.errors import InputError
 from saga_fg.graph.keys import EGO_POSE
-from saga_fg.graph.parts import NewVariable
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_of, yaw_transform
 from saga_fg.settings import Positive, Settings, setting

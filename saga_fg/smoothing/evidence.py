@@ -1,7 +1,7 @@
 """Everything the sensors said in a recording, as one table: what offline smoothing attributes to objects.
 
 A recording has moments t_0 < t_1 < ...: the times of all its frames and all times at which boxes are wanted. A row of
-the table is a usable detection (see `saga_fg.tracking.observation`), with the sensor's model of its noise; a look is a
+the table is a usable detection (see `saga_fg.tracking.measurements`), with the sensor's model of its noise; a look is a
 frame, empty or not, which tells where something could have been detected.
 """
 
@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.tracking.observation import observe
+from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
@@ -91,7 +91,7 @@ def gather_evidence(
     for time, frame in ordered:
         sensor = sensor_model(sensors, frame.sensor)
         looks.append(Look(int(np.searchsorted(times, time)), sensor, frame.world_T_ego))
-        parts.append(observe(frame, sensor, classes))
+        parts.append(frame_measurements(frame, sensor, classes))
     boxes = Boxes.concatenate([part.boxes for part in parts])
     counts = [len(part) for part in parts]
     places = [

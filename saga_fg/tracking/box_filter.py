@@ -1,9 +1,9 @@
-"""The part of a track that the graph does not couple: size, height and heading, filtered object by object.
+"""Size, height and heading of tracks, which the graph does not couple, filtered track by track.
 
 size      running mean weighted by detection probability
 height    scalar Kalman filter, random walk
 heading   scalar Kalman filter on the circle, random walk; a detector's heading may be off by half a turn, so that a
-          measurement is first turned to the side of the estimate. On which side is the front, the detections vote,
+          measurement is first turned to the side of the estimate. The detections vote on which side is the front,
           each with its probability, and a clear motion decides
 """
 
@@ -19,14 +19,14 @@ from saga_fg.numerics.geometry import wrap_angle
 
 HEIGHT_DRIFT = 0.1  # standard deviation after one second, m
 MOVING = 2.0  # speed from which the motion tells front from rear, m/s
-MOST_VOTES = 5.0  # that the past has, so that it can be outvoted
+MOST_VOTES = 5.0  # limit on the past votes, so that later ones can outvote them
 
 
 @dataclass(eq=False)
 class BoxFilter(Columns):
     """Columns over n tracks: size (n, 3), size_weight, z, z_variance, yaw, yaw_variance, votes (n,); NaN is unknown.
 
-    votes: for the front being where yaw points, less those against it; >= 0
+    votes: probability-weighted votes for the front at yaw less those against it; >= 0
     """
 
     size: FloatArray
@@ -43,7 +43,7 @@ class BoxFilter(Columns):
         return cls(np.empty((0, 3)), none, none, none, none, none, none)
 
     @classmethod
-    def born(
+    def initiated(
         cls,
         size: FloatArray,
         weight: FloatArray,
@@ -52,12 +52,13 @@ class BoxFilter(Columns):
         yaw: FloatArray,
         yaw_noise: FloatArray,
     ) -> BoxFilter:
-        """Filters of new tracks from their first detections; noises are standard deviations."""
+        """Return the filters of new tracks from their first detections; noises are standard deviations."""
         known = np.isfinite(size).all(axis=1)
         votes = np.where(np.isfinite(yaw), weight, 0.0)
         return cls(size.copy(), np.where(known, weight, 0.0), z.copy(), z_noise**2, yaw.copy(), yaw_noise**2, votes)
 
     def predict(self, dt: float, yaw_drift: FloatArray) -> None:
+        """Predict by `dt` s; yaw_drift (n,), rad after one second."""
         self.z_variance = self.z_variance + HEIGHT_DRIFT**2 * dt
         self.yaw_variance = self.yaw_variance + yaw_drift**2 * dt
 
@@ -98,18 +99,18 @@ class BoxFilter(Columns):
         self._turn(self.votes < 0)
 
     def face_motion(self, velocity: FloatArray) -> None:
-        """Turn headings round that point against a clear motion; velocity (n, 2), zero where it is not clear."""
+        """Reverse headings that point against a clear motion; velocity (n, 2), zero where it is not clear."""
         along = np.cos(self.yaw) * velocity[:, 0] + np.sin(self.yaw) * velocity[:, 1]
         self._turn(along < -MOVING)
         self.votes = np.where(np.abs(along) > MOVING, MOST_VOTES, self.votes)
 
-    def turn_with(self, before: FloatArray, after: FloatArray, hidden: BoolArray) -> None:
-        """Turn the headings of what is clearly in motion as its velocity (n, 2) turns in a prediction.
+    def turn_with(self, before: FloatArray, after: FloatArray, coasting: BoolArray) -> None:
+        """Turn the headings of moving, `coasting` (n,) tracks as their velocities (n, 2) turn in a prediction.
 
-        Only of what is `hidden` (n,): headings that are measured tell more than the course of the neighbours does.
+        Headings of detected tracks are left to their measurements, which are better than the course of neighbours.
         """
         cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-        moving = hidden & (np.hypot(*before.T) > MOVING)
+        moving = coasting & (np.hypot(*before.T) > MOVING)
         turn = np.where(moving, np.arctan2(cross, (before * after).sum(axis=1)), 0.0)
         self.yaw = wrap_angle(self.yaw + turn)
 

@@ -1,14 +1,14 @@
-r"""Of which class an object is: a discrete belief of its track over the classes that detectors mistake for each other.
+r"""Class of an object: a discrete belief of its track over the classes that detectors mistake for each other.
 
-    L_j(c)    = A_s(z_j | c)                              what detection j of the class z_j says
-    cost_ij  += -2 log sum_c b_i(c) L_j(c)                in matching, within the group
-    b_i(c)   <- b_i(c) L_j(c) / sum                       when it is the track's
+    L_j(c)    = A_s(z_j | c)                              likelihood of class c by detection j of the class z_j
+    cost_ij  += -2 log sum_c b_i(c) L_j(c)                in association, within the group
+    b_i(c)   <- b_i(c) L_j(c) / sum                       in the update, when j is matched to i
 
-A_s(z | c) is the chance that sensor s calls an object of class c a z. False detections are reckoned with by class, so
-that this is the ratio of likelihoods of `saga_fg.tracking.matching` again. A track's class is the likeliest, the one it
-had if there are several; its score counts by the belief in that class. Beliefs stay where they can be changed: a
-detector that errs in one frame errs in the next as well. Between groups, and outside of all, nothing is matched, and
-nothing believed but the class at birth.
+A_s(z | c) is the chance that sensor s reports an object of class c as a z. False detections are counted by class, so
+that this is the ratio of likelihoods of `saga_fg.tracking.association` again. A track's class is the likeliest, the
+present one if several are; its score counts by the belief in that class. Beliefs are kept away from 0 and 1: a detector
+that errs in one frame errs in the next as well. Between groups, and outside of all, nothing is matched, and a track
+keeps its first class.
 
 Source: Bar-Shalom, Kirubarajan, Gokberk, Tracking with Classification-Aided Multiframe Data Association, IEEE
 Transactions on Aerospace and Electronic Systems 41(3), 2005.
@@ -41,8 +41,8 @@ class ClassGroups:
     def __len__(self) -> int:
         return len(self.classes)
 
-    def akin(self, labels: StrArray, others: StrArray) -> BoolArray:
-        """Which classes (n,) are one with others (m,), or of one group with them: (n, m)."""
+    def same_group(self, labels: StrArray, others: StrArray) -> BoolArray:
+        """(n, m) which classes (n,) equal others (m,) or share a group with them."""
         (row, inside), (column, there) = self._rows(labels), self._rows(others)
         if not self.classes:
             return np.asarray(labels[:, None] == others)
@@ -57,7 +57,7 @@ class ClassGroups:
         return np.asarray(self._confusion(sensor)[row] * of_group[:, None])
 
     def updated(self, belief: FloatArray, likelihood: FloatArray) -> FloatArray:
-        """Beliefs (k, C) after what one detection each says (k, C); the first one's own word where all are 0."""
+        """Beliefs (k, C) after a detection of likelihood (k, C) each; by that alone where there is no belief yet."""
         if not self.classes:
             return belief
         of_group = likelihood > 0
@@ -68,7 +68,7 @@ class ClassGroups:
         return np.asarray(after / np.maximum(after.sum(axis=1, keepdims=True), 1e-300))
 
     def labels(self, belief: FloatArray, label: StrArray) -> StrArray:
-        """The classes (n,) believed in (n, C), of tracks that had the classes `label` (n,)."""
+        """The likeliest classes (n,) by beliefs (n, C), of tracks that had the classes `label` (n,)."""
         row, of_group = self._rows(label)
         had = np.where(of_group, belief[np.arange(len(label)), row], np.inf)
         best = belief.argmax(axis=1)
@@ -76,12 +76,12 @@ class ClassGroups:
         return np.where(likelier, np.array(self.classes)[best], label)
 
     def certainty(self, belief: FloatArray) -> FloatArray:
-        """(n,) the belief (n, C) in the class that is told; 1 outside of all groups."""
+        """(n,) largest belief of (n, C); 1 outside of all groups."""
         most = belief.max(axis=1, initial=0.0)
         return np.where(most > 0, most, 1.0)
 
     def _rows(self, label: StrArray) -> tuple[IntArray, BoolArray]:
-        """Of labels (n,): their columns (n,), 0 for those outside of all groups, and which are inside of one (n,)."""
+        """Columns (n,) of labels (n,), 0 for those outside of all groups, and which are inside of one (n,)."""
         occurring, index = distinct(label)
         column = np.array([self._column.get(c, -1) for c in occurring], dtype=np.int64)[index]
         return np.maximum(column, 0), column >= 0
@@ -97,13 +97,13 @@ class ClassGroups:
 
 @dataclass(frozen=True, eq=False)
 class ClassEvidence:
-    """Of a frame: belief (n, C) of the tracks, likelihood (m, C) of the detections."""
+    """Evidence of a frame: belief (n, C) of the tracks, likelihood (m, C) of the detections."""
 
     groups: ClassGroups
     belief: FloatArray
     likelihood: FloatArray
 
     def costs(self, track: IntArray, detection: IntArray) -> FloatArray:
-        """(K,) what the classes of pairs cost, see the module."""
+        """(K,) costs of pairs by their classes, see the module."""
         chance = (self.belief[track] * self.likelihood[detection]).sum(axis=1)
         return np.asarray(-2 * np.log(np.where(chance > 0, chance, 1.0)))

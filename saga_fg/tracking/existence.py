@@ -1,13 +1,18 @@
-r"""The probability r that a track is a real object, by Bayes' rule.
+r"""Update of the probability r that a track is a real object, by Bayes' rule, and of the score of its box.
 
     miss    r <- r (1 - p_D) / (1 - r p_D) exp(-dt / lifetime)
     match   r / (1 - r) <- r / (1 - r)  p / (1 - p)  (1 - c) / c
 
-    score   p ( hits / (looks + newness) )^w           when detected; without a detection times r and coasting_score
+p_D is the chance of a detection at the track (0 outside the field of view), p the detection's probability, and c the
+probability at which a detection is no evidence. Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data
+Association, IEEE Transactions on Automatic Control 39(6), 1994.
 
-p_D is the chance to be detected where the track is (0 where no sensor looks), p the detection's probability, and c the
-one at which a detection says nothing. Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data Association,
-IEEE Transactions on Automatic Control 39(6), 1994.
+Boxes behind other boxes have a smaller chance of a detection, by the share of their bearings that is covered:
+
+    covered_i = max over j nearer than i of   | [a_i, b_i] and [a_j, b_j] | / (b_i - a_i)
+
+[a, b] is the interval of bearings of a box. A box is nearer if its centre is by at least half its diagonal. Heights are
+left out, so that a low object in front of a tall one covers more than it hides.
 """
 
 from __future__ import annotations
@@ -17,26 +22,83 @@ import math
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.tracking.columns import TrackColumns
+from saga_fg.numerics.assignment import Matching
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.settings import ExistenceSettings
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.boxes import Boxes
+
+HIDDEN = 0.5  # covered share from which a frame is no opportunity to detect a box
+
+
+def update_existence(state: TrackerState, measurements: FrameMeasurements, matching: Matching, elapsed: float) -> None:
+    """Update existence, score and confirmation of all tracks; elapsed: time since the latest frame, s."""
+    table, settings, memory = state.table, state.settings.existence, state.settings.score_memory
+    if len(table) == 0:
+        return
+    time, t, d = state.time - measurements.delay, matching.track, matching.detection
+    missed = np.ones(len(table), dtype=bool)
+    missed[t] = False
+    now, sensor = state.kinematics(), measurements.sensor
+    visible = sensor.sees(now.position + state.origin, measurements.world_T_ego)
+    table.last_in_view[visible] = state.time
+    p_detect = np.where(visible, sensor.detection_chance(table.label), 0.0)
+    if settings.occlusion > 0 and measurements.viewpoint is not None and missed.any():
+        boxes = state.boxes(now.position, now.velocity)
+        hidden = settings.occlusion * covered(boxes, measurements.viewpoint, ~missed)
+        p_detect, visible = p_detect * (1 - hidden), visible & (hidden < HIDDEN)
+    # a track that another sensor has just detected exists, whether this one misses it or not
+    excused = table.sensors.detected_by_others(measurements.name, time, memory)
+    p_miss = np.where(excused, 0.0, p_detect)[missed]
+    p = measurements.probability[d]
+    table.existence[missed] = after_miss(table.existence[missed], p_miss, elapsed, settings)
+    table.existence[t] = after_hit(table.existence[t], p, settings)
+    table.confirmed |= table.existence >= settings.confirm
+    table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
+    fused = table.sensors.probability(state.time, max(memory, measurements.delay))
+    table.score = np.where(np.isfinite(fused), fused, table.score)
+    table.hits, table.opportunities = table.sensors.best_hits()
+    table.accepted |= table.sensors.confirmed(state.settings.confirmations)
+    table.covariance_scale[t], table.shared_error[t] = measurements.covariance_scale[d], measurements.shared_error[d]
+    table.last_detected[t] = np.maximum(table.last_detected[t], time)
+    table.last_in_view[t] = state.time
 
 
 def after_miss(existence: FloatArray, p_detect: FloatArray, elapsed: float, settings: ExistenceSettings) -> FloatArray:
-    """Existence (k,) of tracks that no detection was found for, `elapsed` s after the last look."""
+    """Existence (k,) of tracks without a detection, `elapsed` s after the frame before."""
     missed = existence * (1 - p_detect) / np.maximum(1 - existence * p_detect, 1e-9)
     return np.asarray(missed * math.exp(-elapsed / settings.lifetime))
 
 
 def after_hit(existence: FloatArray, probability: FloatArray, settings: ExistenceSettings) -> FloatArray:
-    """Existence (k,) of tracks that took in a detection of some `probability` (k,)."""
+    """Existence (k,) of tracks matched to a detection of some `probability` (k,)."""
     odds = probability / (1 - probability) * (1 - settings.clutter_score) / settings.clutter_score
     before = np.clip(existence, 1e-3, 1 - 1e-3)
     after = before / (1 - before) * odds
     return np.clip(after / (1 + after), 0.0, 0.999)
 
 
-def reported_score(columns: TrackColumns, coasting: BoolArray, settings: ExistenceSettings) -> FloatArray:
-    """(n,) how sure a track's box is: by its latest detection, by how steadily it is detected, less while coasting."""
-    steadiness = (columns.hits / (columns.looks + settings.newness)) ** settings.steadiness_weight
-    unseen = columns.existence * settings.coasting_score
-    return np.asarray(columns.score * steadiness * np.where(coasting, unseen, 1.0))
+def covered(boxes: Boxes, viewpoint: FloatArray, opaque: BoolArray) -> FloatArray:
+    """(n,) covered shares between 0 and 1; boxes of unknown size or heading neither cover nor are covered.
+
+    viewpoint (2,) in the frame of the boxes; opaque (n,): which boxes can cover others
+    """
+    known = np.isfinite(boxes.size).all(axis=1) & np.isfinite(boxes.yaw)
+    rows = np.flatnonzero(known)
+    share = np.zeros(len(boxes))
+    if not (known & opaque).any():
+        return share
+    seen = boxes.select(rows)
+    offset = seen.position[:, :2] - viewpoint
+    distance, bearing = np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
+    corners = seen.corners() - viewpoint
+    turn = wrap_angle(np.arctan2(corners[..., 1], corners[..., 0]) - bearing[:, None])
+    low, high = turn.min(axis=1), turn.max(axis=1)
+    front = np.flatnonzero(opaque[rows])
+    apart = wrap_angle(bearing[front] - bearing[:, None])  # of box j from box i
+    common = np.minimum(high[:, None], apart + high[front]) - np.maximum(low[:, None], apart + low[front])
+    nearer = distance[front] + np.hypot(*seen.size[front, :2].T) / 2 < distance[:, None]
+    part = np.where(nearer, common, 0.0) / np.maximum(high - low, 1e-6)[:, None]
+    share[rows] = np.clip(part.max(axis=1), 0.0, 1.0)
+    return share

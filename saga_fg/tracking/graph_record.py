@@ -75,11 +75,11 @@ class GraphRecord:
 
 
 def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -> dict[str, Any]:
-    """The graph of the interval that a frame ended, as the stage `births` leaves it; `before`: the frame before.
+    """The graph of the interval that a frame ended, at the stage `initiate`; `before`: the frame before.
 
     Times are counted from `start`. The states at the beginning of the interval have a joint prior, which is not listed.
     """
-    record, time, n = GraphRecord(), now.timestamp - start, len(now.columns.id)
+    record, time, n = GraphRecord(), now.timestamp - start, len(now.table.id)
     table, corners, numbers = now.nodes, now.boxes.corners(), dict[int, int]()
     for row, id_ in enumerate(table.id.tolist()):
         if id_ >= 0:
@@ -91,13 +91,13 @@ def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -
     if now.running is not None:
         ours = {one.key: numbers[id_] for id_, one in now.running.of(OBJECT, now.running.epoch).items()}
         record.add(now.running, now.origin, ours)
-    elif now.matching is not None and now.observed is not None:
+    elif now.matching is not None and now.measurements is not None:
         for row in now.matching.track.tolist():
             record.factor("detection", [row])
-        for row in range(n - len(now.born), n):
+        for row in range(n - len(now.initiated), n):
             record.factor("birth", [row])
-        if now.observed.viewpoint is not None:
-            record.node(KNOWN_POSE, "vehicle", time, now.observed.viewpoint[:2])
+        if now.measurements.viewpoint is not None:
+            record.node(KNOWN_POSE, "vehicle", time, now.measurements.viewpoint[:2])
     return {"nodes": record.nodes, "factors": record.factors}
 
 

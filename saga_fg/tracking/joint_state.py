@@ -1,6 +1,6 @@
-"""The joint kinematic state of all tracks: an estimator, seen through the classes and components of the tracker.
+"""The joint kinematic state of all tracks and nodes: an estimator, addressed by ids and class labels.
 
-Positions are local: the scene's origin is taken off before anything comes here.
+Positions are local, counted from the scene's origin.
 """
 
 from __future__ import annotations
@@ -8,11 +8,10 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from factors import RangeRate
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import FactorProvider, SceneFactorGraph
 from saga_fg.model.discretisation import discretise
@@ -24,20 +23,12 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, d
 from saga_fg.numerics.pairwise_costs import CrossCovariances
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.ego_pose import RelativePositions, local_pose, relative_covariances
+from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.names import EstimatorName
+from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion, past_position
 from saga_fg.types.frame import Frame
 
-_ANYWHERE = 1e5  # m
-LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
-
-
-class Kinematics(NamedTuple):
-    """Of n tracks: position (n, 2), velocity (n, 2) and their covariances (n, 2, 2); 0 for what stands."""
-
-    position: FloatArray
-    velocity: FloatArray
-    P: FloatArray
-    P_velocity: FloatArray
+_UNKNOWN_POSITION = 1e5  # standard deviation, m
 
 
 TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | GraphFilter
@@ -61,10 +52,10 @@ class JointTrackState:
     """Tracks by id and label over one estimator. `motion` gives the own motion of a class."""
 
     def __init__(self, estimator: TrackEstimator, motion: Callable[[str], Motion]) -> None:
-        self._estimator = estimator
+        self.estimator = estimator
         self._motion = motion
         self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
-        self._born: dict[int, float] = {}  # on the estimator's clock
+        self._initiated: dict[int, float] = {}  # on the estimator's clock
         self._modes: dict[Mixture, ModeTable] = {}  # of tracks that move by a mixture
         self._kinematics: Kinematics | None = None  # until the state changes
 
@@ -87,15 +78,15 @@ class JointTrackState:
         label: StrArray,
         now: Kinematics,
         delay: float = 0.0,
-        seen: RelativePositions | None = None,
+        relative: RelativePositions | None = None,
     ) -> None:
-        """New tracks as they were `delay` s ago; components that `now` does not speak of start at 0.
+        """Add tracks as they were `delay` s ago; components that `now` does not have start at 0.
 
-        Where they are is what they were `seen` to be from the vehicle, if that is given.
+        Where `relative` positions, seen from the vehicle, are given, they stand in for those of `now`.
         """
-        if seen is not None:
-            now = now._replace(P=np.tile(_ANYWHERE**2 * np.eye(2), (len(ids), 1, 1)))
-        for node_type, rows in self._by_type(label, delay > 0):
+        if relative is not None:
+            now = now._replace(P=np.tile(_UNKNOWN_POSITION**2 * np.eye(2), (len(ids), 1, 1)))
+        for node_type, rows in self.rows_by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
             P = np.tile(np.diag(node_type.initial_deviation**2), (len(rows), 1, 1))
             at_p = node_type.index(POSITION)
@@ -104,7 +95,7 @@ class JointTrackState:
                 at_v = node_type.index(VELOCITY)
                 mean[:, at_v], P[:, at_v[:, None], at_v] = now.velocity[rows], now.P_velocity[rows]
             if delay > 0:
-                F, Q = _own_motion(node_type, delay)
+                F, Q = own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
             if isinstance(node_type.motion, Mixture):
                 new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
@@ -114,16 +105,16 @@ class JointTrackState:
                 estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
             else:
                 estimator.add(ids[rows], mean, P)
-        self._born.update(dict.fromkeys(ids.tolist(), self._estimator.time))
-        if seen is not None:
-            self._see(ids, label, seen)
+        self._initiated.update(dict.fromkeys(ids.tolist(), self.estimator.time))
+        if relative is not None:
+            self._add_relative(ids, label, relative)
 
     def remove(self, ids: IntArray) -> None:
-        """Marginalise tracks: what they told of their neighbours stays."""
+        """Marginalise tracks; their information on their neighbours stays."""
         self._changed().marginalise(ids)
         self._modes = {k: t.select(np.flatnonzero(~np.isin(t.ids, ids))) for k, t in self._modes.items()}
         for track in ids.tolist():
-            del self._born[track]
+            del self._initiated[track]
 
     def predict(self, graph: SceneGraph, dt: float) -> None:
         """Move all tracks by `dt` s under the graph's dynamics."""
@@ -146,115 +137,79 @@ class JointTrackState:
         R: FloatArray,
         with_velocity: BoolArray,
         delay: float,
-        seen: RelativePositions | None = None,
+        relative: RelativePositions | None = None,
     ) -> None:
-        """Take in one measurement each of some tracks, made `delay` s ago; of positions by `seen`, where it is given.
+        """Take in one measurement each of some tracks, made `delay` s ago; positions by `relative`, where it is given.
 
-        z (k, 4) position and velocity, R (k, 4, 4); velocity counts where `with_velocity` (k,). A smoother puts a late
-        measurement where it belongs; a filter, one of a track born since, moves it to the present along own motion.
+        z (k, 4) position and velocity, R (k, 4, 4); the velocity is used where `with_velocity` (k,). A smoother puts a
+        late measurement at its time; a filter, or a track initiated since, moves it to the present along own motion.
         """
-        if seen is not None:
-            self._see(ids, label, seen)
-        for node_type, of_type in self._by_type(label, delay > 0):
+        if relative is not None:
+            self._add_relative(ids, label, relative)
+        for node_type, of_type in self.rows_by_type(label, delay > 0):
             measured = with_velocity[of_type] & node_type.has(VELOCITY)
             for velocity in (True, False):
                 rows = of_type[measured == velocity]
-                names = (POSITION if seen is None else ()) + (VELOCITY if velocity else ())
+                names = (POSITION if relative is None else ()) + (VELOCITY if velocity else ())
                 if len(rows) == 0 or not names:
                     continue
-                k = slice(0 if seen is None else 2, 4 if velocity else 2)
+                k = slice(0 if relative is None else 2, 4 if velocity else 2)
                 H = np.broadcast_to(node_type.selector(names), (len(rows), len(names), node_type.dim))
-                self._measure(node_type, ids[rows], z[rows, k], H, R[rows, k, k], delay)
+                self.measure(node_type, ids[rows], z[rows, k], H, R[rows, k, k], delay)
 
-    def _see(self, ids: IntArray, label: StrArray, seen: RelativePositions) -> None:
-        """Take in sightings from the vehicle."""
+    def _add_relative(self, ids: IntArray, label: StrArray, relative: RelativePositions) -> None:
+        """Take in positions seen from the vehicle."""
         estimator = self._changed()
         assert isinstance(estimator, GraphFilter)
-        for node_type, rows in self._by_type(label):
+        for node_type, rows in self.rows_by_type(label):
             x, y = node_type.index(POSITION).tolist()
-            estimator.extend([RelativeDetections(ids[rows], seen.z[rows], seen.R[rows], node_type.dim, (x, y))])
+            estimator.extend([RelativeDetections(ids[rows], relative.z[rows], relative.R[rows], node_type.dim, (x, y))])
 
-    def update_range_rate(
-        self,
-        ids: IntArray,
-        label: StrArray,
-        rate: FloatArray,
-        variance: FloatArray,
-        viewpoint: FloatArray,
-        gate: FloatArray,
-        delay: float,
-    ) -> None:
-        """Take in one range rate each of some tracks, m/s over ground, seen from `viewpoint` (2,) `delay` s ago.
-
-        rate (k,), variance (k,). Every estimator takes the same linear measurement: the range rate linearised at the
-        present estimate, moved back by `delay` along own motion. Left out: tracks within `LEAST_RANGE` of the sensor,
-        and range rates whose normalised innovation squared is above `gate` (k,).
-        """
-        for node_type, rows in self._by_type(label, moving=True):
-            if not node_type.has(VELOCITY):
-                continue
-            at_p, at_v = node_type.index(POSITION).tolist(), node_type.index(VELOCITY).tolist()
-            x = self._estimator.mean(ids[rows])
-            if delay > 0:
-                x = x @ np.linalg.inv(_own_motion(node_type, delay)[0]).T
-            clear = np.hypot(*(x[:, at_p] - viewpoint).T) >= LEAST_RANGE
-            rows, x = rows[clear], x[clear]
-            if len(rows) == 0:
-                continue
-            model = RangeRate(node_type.dim, tuple(at_p), tuple(at_v), (float(viewpoint[0]), float(viewpoint[1]), 0.0))
-            H = model.jacobian(x)
-            innovation, R = rate[rows, None] - model.predict(x), variance[rows, None, None]
-            H_now, R_now = _moved_to_present(node_type, H, R, delay) if delay > 0 else (H, R)
-            S = H_now @ self._estimator.covariance(ids[rows]) @ np.swapaxes(H_now, 1, 2) + R_now
-            likely = innovation[:, 0] ** 2 <= gate[rows] * S[:, 0, 0]
-            z = innovation + (H @ x[:, :, None])[:, :, 0]
-            self._measure(node_type, ids[rows][likely], z[likely], H[likely], R[likely], delay)
-
-    def hear(self, frame: Frame | None, origin: FloatArray) -> None:
-        """What providers are told from now on; positions are from `origin` (2,)."""
-        estimator = self._estimator
+    def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
+        """Set the frame that providers see from now on; positions are from `origin` (2,)."""
+        estimator = self.estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.hear(frame, origin)
+            estimator.set_frame(frame, origin)
             self._changed()
 
     def ask_providers(self) -> None:
-        """Let users' providers add their factors."""
-        estimator = self._estimator
+        """Let factor providers add their factors."""
+        estimator = self.estimator
         if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.ask()
+            estimator.ask_providers()
             self._changed()
 
     @property
-    def bare(self) -> bool:
-        """Whether nothing in it has a place."""
-        estimator = self._estimator
+    def empty(self) -> bool:
+        """Whether there is neither a track nor any other variable."""
+        estimator = self.estimator
         beside = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
         return len(estimator.nodes) + len(beside) == 0
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
-        estimator = self._estimator
+        estimator = self.estimator
         if isinstance(estimator, JointKalmanFilter):
-            return local_pose(estimator.beside)
+            return local_pose(estimator.auxiliary)
         return local_pose(estimator.graph()) if isinstance(estimator, GraphFilter) else None
 
     def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
-        """(n, 2, 2) of where tracks are, seen from the vehicle's pose in the running graph."""
-        assert isinstance(self._estimator, GraphFilter)
-        return relative_covariances(self._estimator, ids, self._by_type(label))
+        """Covariances (n, 2, 2) of the tracks' positions relative to the vehicle's pose in the running graph."""
+        assert isinstance(self.estimator, GraphFilter)
+        return relative_covariances(self.estimator, ids, self.rows_by_type(label))
 
     def running_graph(self) -> SceneFactorGraph:
         """The estimator's graph."""
-        return self._estimator.graph()
+        return self.estimator.graph()
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
-        """Of all tracks, in the order of `ids`, which must be that of the last call until the state changes."""
+        """The estimates of all tracks; `ids` must be in the order of the last call until the state changes."""
         if self._kinematics is None or len(self._kinematics.P) != len(ids):
             self._kinematics = self._read(ids, label)
         return self._kinematics
 
-    def node(self, ids: IntArray, label: StrArray) -> Kinematics:
-        """Of some nodes, which need not be tracks."""
+    def kinematics_of(self, ids: IntArray, label: StrArray) -> Kinematics:
+        """The estimates of some nodes, which need not be tracks."""
         return self._read(ids, label)
 
     def positions_before(self, ids: IntArray, label: StrArray, delay: float) -> tuple[FloatArray, FloatArray]:
@@ -263,22 +218,22 @@ class JointTrackState:
             now = self.kinematics(ids, label)
             return now.position, now.P
         position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
-        for node_type, rows in self._by_type(label, moving=True):
-            H, R = _moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
-            position[rows] = self._estimator.mean(ids[rows]) @ H.T
-            P[rows] = H @ self._estimator.covariance(ids[rows]) @ H.T + R
+        for node_type, rows in self.rows_by_type(label, moving=True):
+            H, R = moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
+            position[rows] = self.estimator.mean(ids[rows]) @ H.T
+            P[rows] = H @ self.estimator.covariance(ids[rows]) @ H.T + R
         return position, P
 
     def cross_covariances_before(self, ids: IntArray, label: StrArray, delay: float) -> CrossCovariances:
-        """Of the positions `delay` s ago, by own motion, of all pairs of tracks that are correlated (rows of `ids`)."""
-        groups = self._by_type(label, moving=True)
+        """Covariances between positions `delay` s ago, by own motion, of correlated pairs of tracks (rows of `ids`)."""
+        groups = self.rows_by_type(label, moving=True)
         group = np.zeros(len(ids), dtype=np.int64)
         for number, (_, rows) in enumerate(groups):
             group[rows] = number
-        x = self._estimator.posterior()
+        x = self.estimator.posterior()
         nodes = x.layout.rows(ids)
         first, second = x.correlated(nodes)
-        past = [_position_before(node_type, delay) for node_type, _ in groups]
+        past = [past_position(node_type, delay) for node_type, _ in groups]
         C = np.zeros((len(first), 2, 2))
         for a, H_a in enumerate(past):
             for b, H_b in enumerate(past):
@@ -289,57 +244,57 @@ class JointTrackState:
 
     def snapshot(self) -> Any:
         """The state as a value."""
-        return self._estimator.snapshot(), dict(self._born), dict(self._modes)
+        return self.estimator.snapshot(), dict(self._initiated), dict(self._modes)
 
     def restore(self, snapshot: Any) -> None:
         """Continue from a snapshot."""
-        state, self._born, self._modes = snapshot
+        state, self._initiated, self._modes = snapshot
         self._changed().restore(state)
 
     @property
     def window(self) -> float:
-        """How far back a late measurement is put where it belongs, s; 0 where it is moved to the present."""
-        return self._estimator.lag if isinstance(self._estimator, FixedLagSmoother) else 0.0
+        """Age up to which a late measurement is put at its own time, s; 0 where it is moved to the present."""
+        return self.estimator.lag if isinstance(self.estimator, FixedLagSmoother) else 0.0
 
     def copied(self) -> JointTrackState:
-        """A state that goes its own way from here."""
+        """Return a state that changes independently of this one."""
         twin = copy.copy(self)
-        twin._estimator, twin._born = copy.copy(self._estimator), dict(self._born)
+        twin.estimator, twin._initiated = copy.copy(self.estimator), dict(self._initiated)
         twin._modes = dict(self._modes)
         return twin
 
-    def _measure(
+    def measure(
         self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
     ) -> None:
-        """z (k, m), H (k, m, d), R (k, m, m) of some tracks, `delay` s old."""
+        """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old."""
         estimator = self._changed()
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
             R = np.broadcast_to(np.eye(node_type.dim), H.shape)
         if delay > 0 and isinstance(estimator, FixedLagSmoother):
             then = estimator.time - delay
-            there = np.array([self._born[track] <= then for track in ids.tolist()]) & (then >= estimator.start)
+            there = np.array([self._initiated[track] <= then for track in ids.tolist()]) & (then >= estimator.start)
             if there.any():
                 estimator.update(Measurements(ids[there], z[there], H[there], R[there]), time=then)
             ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]
         if delay > 0:
-            H, R = _moved_to_present(node_type, H, R, delay)
+            H, R = moved_to_present(node_type, H, R, delay)
         estimator.update(Measurements(ids, z, H, R))
 
     def _anchor_modes(self) -> None:
-        estimator = self._estimator
+        estimator = self.estimator
         for mixture, table in self._modes.items():
             marginals = estimator.mean(table.ids), estimator.covariance(table.ids)
             self._modes[mixture] = table.anchored(*marginals) if len(table) else table
 
     def _changed(self) -> TrackEstimator:
         self._kinematics = None
-        return self._estimator
+        return self.estimator
 
-    def _by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
-        """Rows whose states mean the same, with a type of theirs; if `moving`, rows that also move the same.
+    def rows_by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
+        """Rows whose states have the same components, with a type of theirs; if `moving`, the same motion too.
 
-        What moves nonlinearly, or by a mixture, always stays apart.
+        Nonlinear motions and mixtures are always separate.
         """
         classes, index = distinct(label)
         types = [self.type_of(c) for c in classes]
@@ -355,30 +310,11 @@ class JointTrackState:
     def _read(self, ids: IntArray, label: StrArray) -> Kinematics:
         n = len(ids)
         result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
-        for node_type, rows in self._by_type(label):
-            mean, covariance = self._estimator.mean(ids[rows]), self._estimator.covariance(ids[rows])
+        for node_type, rows in self.rows_by_type(label):
+            mean, covariance = self.estimator.mean(ids[rows]), self.estimator.covariance(ids[rows])
             at_p = node_type.index(POSITION)
             result.position[rows], result.P[rows] = mean[:, at_p], covariance[:, at_p[:, None], at_p]
             if node_type.has(VELOCITY):
                 at_v = node_type.index(VELOCITY)
                 result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
         return result
-
-
-def _moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
-    """A measurement `delay` s old as one of the present state, x(t - delay) = exp(-A delay) x(t) + noise."""
-    F, Q = _own_motion(node_type, delay)
-    H_past = H @ np.linalg.inv(F)
-    return H_past, R + H_past @ Q @ np.swapaxes(H_past, -1, -2)
-
-
-def _position_before(node_type: NodeType, delay: float) -> FloatArray:
-    """(2, d) that takes the present state to the position `delay` s ago, by own motion."""
-    H = node_type.selector(POSITION)
-    return H @ np.linalg.inv(_own_motion(node_type, delay)[0]) if delay > 0 else H
-
-
-def _own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
-    """F (d, d) and Q (d, d) of a node on its own over `dt` s."""
-    transition = discretise(SceneGraph.of([0], node_type), dt)
-    return transition.F[0].values[0], transition.Q[0].values[0]

@@ -1,6 +1,6 @@
-"""Watching a tracker at work: what it knows at the end of each stage of a frame.
+"""Observing a tracker at work: the state and the results at the end of each step of a frame.
 
-A tracker without an observer pays nothing for the possibility; an observer that does not look pays for the call alone.
+A tracker without an observer pays nothing for the possibility; a view is made only for an observer that asks for it.
 """
 
 from __future__ import annotations
@@ -16,52 +16,82 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
-from saga_fg.tracking.columns import TrackColumns
-from saga_fg.tracking.observation import Observed
+from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.prediction import node_table
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
 
-Stage = Literal["predict", "observe", "associate", "update", "believe", "births", "deaths", "report"]
+Stage = Literal["predict", "measure", "associate", "update", "existence", "initiate", "delete", "report"]
 
 
 @dataclass(frozen=True, eq=False)
 class TrackerView:
-    """What a tracker knows of its n tracks, in order of birth.
+    """A tracker with n tracks at the end of a stage.
 
-    timestamp   s, of the state
-    sensor      that the frame is of
-    columns     existence, score, times and so on
-    nodes       as edge rules see them: the tracks, then the nodes of the roadside; positions are local, see `origin`
-    P           (n, 2, 2) covariance of the positions, m^2
-    origin      (2,) of the local positions in the world, m
-    graph       of the latest interval, None before the first
-    observed    the frame's detections, from the stage `observe` on
-    matching    rows of tracks and of detections, from the stage `associate` on
-    born        (b,) rows of the detections that the last b tracks were born from, at the stage `births`
-    boxes       of the tracks, in the world
-    running     the running graph, where factor providers take part; its positions are local
+    timestamp     s, of the state
+    sensor        of the frame
+    table         the tracks, with times in s as timestamps are
+    nodes         as edge rules see them: the tracks, the vehicle, the map; positions are local, see `origin`
+    P             (n, 2, 2) covariance of the positions, m^2
+    origin        (2,) of the local positions in the world, m
+    graph         scene graph of the latest interval, None before the first
+    measurements  of the frame, from the stage `measure` on
+    matching      rows of tracks and of measurements, from the stage `associate` on
+    initiated     (b,) rows of the measurements that initiated the last b tracks, at the stage `initiate`
+    boxes         of the tracks, in the world
+    running       the running graph, where factor providers take part; its positions are local
     """
 
     timestamp: float
     sensor: str
-    columns: TrackColumns
+    table: TrackTable
     nodes: NodeTable
     P: FloatArray
     origin: FloatArray
     graph: SceneGraph | None
-    observed: Observed | None
+    measurements: FrameMeasurements | None
     matching: Matching | None
-    born: IntArray
+    initiated: IntArray
     boxes: Boxes
     running: SceneFactorGraph | None
 
-    def places(self) -> FloatArray:
+    @classmethod
+    def of(
+        cls,
+        state: TrackerState,
+        sensor: str,
+        measurements: FrameMeasurements | None = None,
+        matching: Matching | None = None,
+        initiated: IntArray | None = None,
+    ) -> TrackerView:
+        """View a state and what is known of a frame so far."""
+        table, now = state.table.snapshot(), state.kinematics()
+        table.last_detected += state.start
+        table.last_in_view += state.start
+        return cls(
+            state.start + state.time,
+            sensor,
+            table,
+            node_table(state),
+            now.P,
+            state.origin,
+            state.graph,
+            measurements,
+            matching,
+            np.empty(0, dtype=np.int64) if initiated is None else initiated,
+            state.boxes(now.position, now.velocity),
+            state.joint.running_graph() if state.providers else None,
+        )
+
+    def positions(self) -> FloatArray:
         """(n, 2) positions of the tracks in the world, m."""
-        return np.asarray(self.nodes.position[: len(self.columns.id)] + self.origin)
+        return np.asarray(self.nodes.position[: len(self.table)] + self.origin)
 
 
 class Observer(Protocol):
-    """Whatever wants to know how a tracker comes to its tracks."""
+    """Anything that observes how a tracker comes to its tracks."""
 
     def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
-        """A stage of a frame is done; `view()` says how things stand, now and not later."""
+        """Take note of a stage; `view()` returns the tracker's view and is valid during this call only."""
         ...

@@ -77,7 +77,7 @@ class ClassSettings(Settings):
 
 @dataclass(frozen=True)
 class AssociationSettings(Settings):
-    """How detections are matched to tracks, see `saga_fg.tracking.matching`; gates and caps are the classes'."""
+    """How detections are matched to tracks, see `saga_fg.tracking.association`; gates and caps are the classes'."""
 
     method: AssociationName = setting(
         "hungarian", "least total cost, the cheapest pair first, or graph: what pairs say of each other counts too"
@@ -133,7 +133,7 @@ class FlowSettings(Settings):
 
 @dataclass(frozen=True)
 class StandingSettings(Settings):
-    """The belief that an object stands still, see `saga_fg.tracking.standing`."""
+    """The belief that an object stands still, see `saga_fg.tracking.stationarity`."""
 
     prior: Fraction = setting(0.0, "share of new objects that stand; 0: standing is no case of its own")
     depart: NonNegative = setting(0.02, "rate at which what stands starts to move, 1/s")

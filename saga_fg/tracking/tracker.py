@@ -1,8 +1,9 @@
-"""The graph-aware tracker: frames in, tracks out, whatever comes.
+"""The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
-One frame of one sensor at a time, from any sensor at any time. With no edge rules it is the classical tracker of
-independent Kalman filters, by the same code. What a frame does to the tracks is in `saga_fg.tracking.track_set`; here
-is what a tracker promises: time is kept, and a step is taken whole or not at all.
+    predict (with the graph) -> associate -> update -> existence -> initiate -> delete -> report
+
+(figure 2 of Sani and Anand, arXiv 2411.03702). Each step is a module of its own name. Without edge rules this is the
+classical tracker of independent Kalman filters, by the same code.
 """
 
 from __future__ import annotations
@@ -13,19 +14,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
-from saga_fg.tracking.clock import Clock, TimeVerdict
-from saga_fg.tracking.observer import Observer
+from saga_fg.tracking.association import associate
+from saga_fg.tracking.clock import TimeVerdict
+from saga_fg.tracking.deletion import delete_tracks
+from saga_fg.tracking.existence import update_existence
+from saga_fg.tracking.initiation import initiate_tracks
+from saga_fg.tracking.map_nodes import MapNodes
+from saga_fg.tracking.measurements import frame_measurements
+from saga_fg.tracking.observer import Observer, Stage, TrackerView
+from saga_fg.tracking.prediction import predict
 from saga_fg.tracking.provider_names import new_provider
-from saga_fg.tracking.roadside import Roadside
+from saga_fg.tracking.reporting import report_tracks
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
-from saga_fg.tracking.snapshot import Snapshot
-from saga_fg.tracking.track_set import TrackSet
+from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
+from saga_fg.tracking.update import update_tracks
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.sensor import Sensor, sensor_model
@@ -40,14 +50,13 @@ class Tracker:
     settings  the tracker's settings
     sensors   models by sensor name; the entry named "default" serves all others
     rules     edge rules, in place of `settings.edges`
-    observer  is told how things stand at the end of every stage
+    observer  is notified at the end of every step of a frame
     providers add factors of your own to the running graph of the tracks, once a frame (`saga_fg.graph`)
 
-    A frame older than the newest one by up to `max_delay` is used: the fixed-lag estimator puts its measurements where
-    they belong, a filter moves them to the present along the objects' own motion, and so does any estimator with
+    A frame older than the newest one by up to `max_delay` is used: the fixed-lag estimator puts its measurements at
+    their own time, a filter moves them to the present along the objects' own motion, and so does any estimator with
     `providers` or where objects move nonlinearly. An older one is left out and counted in `late_frames`; so is,
-    uncounted, one from another time until a second one confirms that the clock was set.
-    `time_verdict` tells of the latest frame (see `saga_fg.tracking.clock`).
+    uncounted, one far from the newest time until a second one confirms that the clock was set.
 
     A tracker can be pickled and copied; its copies have no observer.
     """
@@ -63,39 +72,96 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         self.sensors = dict(sensors or {})
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
-        self.late_frames = 0
-        self.assignment = Assignment.empty()  # of the latest frame
-        self.time_verdict: TimeVerdict = "accepted"  # of the latest frame
-        self._clock = Clock()
-        self._clock_settings = replace(self.settings.clock, max_jump=self.max_jump)
+        self.observer = observer
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        self._tracks = TrackSet(self.settings, self.rules, observer, self.providers)
+        self._clock_settings = replace(self.settings.clock, max_jump=self.max_jump)
+        self._state = TrackerState(self.settings, self.rules, self.providers)
         self._failed = False  # the latest step
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far.
 
         Raises `InputError` for a frame that can't be used. Whatever is raised, the tracker is as it was before. Where
-        the next frame fails as well, and would not without the tracks, these are deleted and it is taken in; what a
-        provider does wrong is raised every time.
+        the next frame fails as well, and would not without the tracks, these are deleted and it is taken in; errors of
+        a provider are raised every time.
         """
         if not isinstance(frame, Frame):
             raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
-        tracks = self._tracks
+        state = self._state.copied()
         try:
-            reported = self._step(frame, tracks.copied())
+            reported = self._step(state, frame)
         except BaseException as error:
             if self.providers and isinstance(error, ProviderError | UndeterminedError):  # tracks are not to blame
                 raise
             again, self._failed = self._failed, isinstance(error, Exception)
-            if not (again and self._failed and len(tracks)):
+            if not (again and self._failed and len(self._state)):
                 raise
-            bare = tracks.copied()
-            bare.forget()
-            reported = self._step(frame, bare)  # unless it is the frame that can't be used
-            log.warning("tracks %s are deleted, they can't go on: %s", tracks.ids, error)
-        self._failed = False
+            state = self._state.copied()
+            state.clear()
+            reported = self._step(state, frame)  # unless the frame is to blame
+            log.warning("tracks %s are deleted, they can't go on: %s", self._state.table.id.tolist(), error)
+        self._state, self._failed = state, False
         return reported
+
+    def _step(self, state: TrackerState, frame: Frame) -> Tracks:
+        """Take a frame into a state."""
+        sensor = self.sensor(frame.sensor)
+        timestamp = frame.timestamp + sensor.time_offset
+        if state.keep_time(timestamp, frame.sensor, self._clock_settings, self.max_delay):
+            state.assignment = self._take_in(state, frame, sensor, state.relative(timestamp))
+        else:
+            state.assignment = Assignment.empty()
+        return report_tracks(state, state.clock.newest)
+
+    def _take_in(self, state: TrackerState, frame: Frame, sensor: Sensor, time: float) -> Assignment:
+        """Predict to the `time` of a frame, s from the state's start, unless it is in the past, and use the frame."""
+        if state.joint.empty:
+            state.set_origin(frame)
+        before, delay = state.time, max(0.0, state.time - time)
+        for road_map in (self.settings.road_map, frame.road_map):
+            if road_map is not None:
+                state.map_nodes.add(road_map, state.origin, state.joint)
+        state.joint.set_frame(frame, state.origin)
+        predict(state, max(time, before))
+        frame = state.ego.located(frame, state.world_T_ego)
+        if delay == 0:
+            state.ego.update(frame, state.time, state.origin, state.joint)
+        self._notify("predict", state, frame.sensor)
+
+        measurements = frame_measurements(frame, sensor, self.settings.classes)
+        measurements = replace(
+            measurements,
+            delay=delay,
+            class_likelihood=state.class_groups.likelihood(measurements.boxes.label, sensor),
+            relative=state.ego.relative_positions(measurements, frame),
+        )
+        state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
+        self._notify("measure", state, frame.sensor, measurements)
+
+        matching = associate(state, measurements)
+        self._notify("associate", state, frame.sensor, measurements, matching)
+
+        update_tracks(state, measurements, matching)
+        self._notify("update", state, frame.sensor, measurements, matching)
+
+        update_existence(state, measurements, matching, state.time - before)
+        self._notify("existence", state, frame.sensor, measurements, matching)
+
+        rows = initiate_tracks(state, measurements, matching)
+        state.joint.ask_providers()
+        state.joint.set_frame(None, state.origin)
+        self._notify("initiate", state, frame.sensor, measurements, matching, rows)
+        ids = np.concatenate([state.table.id[matching.track], state.table.id[len(state) - len(rows) :]])
+
+        delete_tracks(state)
+        state.table.ready |= state.reported_kinematics().speed_deviation <= self.settings.report_speed_known
+        self._notify("delete", state, frame.sensor, measurements, matching)
+        self._notify("report", state, frame.sensor, measurements, matching)
+        return Assignment(ids, measurements.row[np.concatenate([matching.detection, rows])])
+
+    def _notify(self, stage: Stage, state: TrackerState, sensor: str, *results: Any) -> None:
+        if self.observer is not None:
+            self.observer.after(stage, lambda: TrackerView.of(state, sensor, *results))
 
     def tracks(self, timestamp: float) -> Tracks:
         """The tracks predicted to `timestamp` (s), without taking anything in; the present ones for an earlier time.
@@ -103,24 +169,22 @@ class Tracker:
         Left out are tracks that can't be predicted that far. Raises `InputError` for a timestamp that is not finite.
         """
         timestamp = finite_seconds(timestamp)
-        newest = self._clock.newest
+        newest = self._state.clock.newest
         if newest == -math.inf:
             return Tracks.empty(timestamp)
         if timestamp <= newest:
-            return self._tracks.report(timestamp)
-        ahead = self._tracks.copied()
-        ahead.predict(ahead.relative(min(timestamp, newest + LATEST)))
-        return ahead.report(timestamp)
+            return report_tracks(self._state, timestamp)
+        ahead = self._state.copied()
+        predict(ahead, ahead.relative(min(timestamp, newest + LATEST)))
+        return report_tracks(ahead, timestamp)
 
-    def snapshot(self) -> Snapshot:
-        """All that the tracker knows, as a value."""
-        return Snapshot(self._tracks.snapshot(), self._clock, self.time_verdict, self.late_frames, self.assignment)
+    def snapshot(self) -> TrackerSnapshot:
+        """Everything that the tracker knows, as a value."""
+        return self._state.snapshot()
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Go on from where a tracker of the same settings was; as often as wanted from one snapshot."""
-        self._tracks.restore(snapshot.tracks)
-        self._clock, self.time_verdict = snapshot.clock, snapshot.time_verdict
-        self.late_frames, self.assignment = snapshot.late_frames, snapshot.assignment
+    def restore(self, snapshot: TrackerSnapshot) -> None:
+        """Continue from a snapshot of a tracker of the same settings; one snapshot can be used many times."""
+        self._state.restore(snapshot)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), (self.settings, self.sensors, self.rules, None, self.providers), self.snapshot())
@@ -134,72 +198,56 @@ class Tracker:
         return class_settings(self.settings.classes, ClassSettings, label)
 
     @property
+    def assignment(self) -> Assignment:
+        """Tracks and detections of the latest frame that belong together."""
+        return self._state.assignment
+
+    @property
+    def time_verdict(self) -> TimeVerdict:
+        """The verdict on the timestamp of the latest frame, see `saga_fg.tracking.clock`."""
+        return self._state.time_verdict
+
+    @property
+    def late_frames(self) -> int:
+        """Number of frames left out because they came late."""
+        return self._state.late_frames
+
+    @property
     def graph(self) -> SceneGraph | None:
         """The scene graph of the latest interval."""
-        return self._tracks.graph
+        return self._state.graph
 
     @property
     def world_T_ego(self) -> FloatArray | None:
-        """The vehicle's pose (4, 4) as factor providers and the objects have it; None where it is not estimated."""
-        return self._tracks.world_T_ego
+        """The vehicle's pose (4, 4) as estimated in the running graph; None where it is not."""
+        return self._state.world_T_ego
 
     @property
     def running_graph(self) -> SceneFactorGraph:
         """The factor graph of the estimator: variables, factors, values; with `providers` the one that runs."""
-        return self._tracks.running_graph
+        return self._state.joint.running_graph()
 
     @property
-    def roadside(self) -> Roadside:
-        """What is known of the road."""
-        return self._tracks.roadside
+    def map_nodes(self) -> MapNodes:
+        """Lights, stop lines, lanes and walls known from maps."""
+        return self._state.map_nodes
 
     @property
     def max_jump(self) -> float:
-        """How far from the newest frame another has to be confirmed, s: a gap that tracks can outlive is no jump."""
+        """Distance from the newest frame from which another has to be confirmed, s; tracks can outlive shorter ones."""
         lives = [c.max_coasting for c in self.settings.classes.values() if math.isfinite(c.max_coasting)]
         return max(self.settings.clock.max_jump, *lives, 0.0)
 
     @property
     def max_delay(self) -> float:
-        """How late a frame may come and still be used, s."""
+        """Age up to which a late frame is used, s."""
         settings = self.settings
         if settings.ego is not None and settings.ego.estimated:
-            return 0.0  # nobody knows where the vehicle was
-        return max(settings.max_delay, self._tracks.window)
-
-    def _step(self, frame: Frame, tracks: TrackSet) -> Tracks:
-        """Take a frame in, into these tracks, or leave everything as it was."""
-        unchanged = self._tracks, self._clock, self.time_verdict
-        self._tracks = tracks
-        try:
-            sensor = self.sensor(frame.sensor)
-            timestamp = frame.timestamp + sensor.time_offset
-            used = self._keep_time(timestamp, frame.sensor)
-            self.assignment = tracks.take_in(frame, sensor, timestamp) if used else Assignment.empty()
-            return tracks.report(self._clock.newest)
-        except BaseException:
-            self._tracks, self._clock, self.time_verdict = unchanged
-            raise
-
-    def _keep_time(self, timestamp: float, sensor: str) -> bool:
-        """Whether a frame is to be used; where the clock was set, the tracks are prepared for it."""
-        before = self._clock.newest
-        self.time_verdict, self._clock = self._clock.judged(timestamp, sensor, self._clock_settings, self.max_delay)
-        if self.time_verdict in ("late", "unconfirmed"):
-            self.late_frames += self.time_verdict == "late"
-            text = "frame of %s at %.3f s is left out: %s, %+.3f s from the newest one"
-            log.warning(text, sensor, timestamp, self.time_verdict, timestamp - before)
-            return False
-        if before == -math.inf or self.time_verdict == "set_back":
-            self._tracks.restart(timestamp)
-        elif self.time_verdict == "set_ahead":
-            self._tracks.outlive(timestamp)
-        if self.time_verdict != "accepted":
-            log.warning("the clock was set from %.3f s to %.3f s by %s", before, timestamp, sensor)
-        return True
+            return 0.0  # the vehicle's earlier poses are not kept
+        return max(settings.max_delay, self._state.joint.window)
 
 
-def _restored(kind: type[Tracker], arguments: tuple[Any, ...], snapshot: Snapshot) -> Tracker:
+def _restored(kind: type[Tracker], arguments: tuple[Any, ...], snapshot: TrackerSnapshot) -> Tracker:
     tracker = kind(*arguments)
     tracker.restore(snapshot)
     return tracker

@@ -1,16 +1,16 @@
-r"""How fast traffic goes here: the speed of a new track from tracks of its class that head, or headed, the same way.
+r"""Prior of the speed of a new track, from tracks of its class that head, or headed, the same way.
 
-    k_j = weight * max over where j passed of
+    k_j = weight * max over the passages of j of
               exp( -ahead^2 / (2 ahead_scale^2) - lateral^2 / (2 lateral_scale^2) - turn^2 / (2 heading_scale^2) )
     p(speed) ~ N(0, initial_speed_deviation^2) + sum_j k_j N(s_j, sigma_j^2 + spread^2)
 
-Every neighbour j counts once, by the nearest place it passed within `memory`, with its speed s_j along its heading
-there (parked ones with a speed near 0). The new track takes the mean and the variance of the mixture, which is as wide
-as the neighbours disagree, and that of knowing nothing where nobody was.
+Every neighbour j counts once, by its nearest passage within `memory`, with its speed s_j along its heading there
+(parked ones with a speed near 0). The new track takes the mean and the variance of the mixture: as wide as the
+neighbours disagree, and the prior of the class where there are none.
 
-Where standing is a case of its own (`saga_fg.tracking.standing`), neighbour j stands with the belief b_j and an object
-of which nothing is known with b_0. The new one stands with the mean of these, weighted by k, and the mixture is that of
-those that move, with the weights 1 - b_0 and k_j (1 - b_j).
+Where stationary objects are modelled (`saga_fg.tracking.stationarity`), neighbour j is stationary with probability b_j
+and an unknown object with b_0. The new one is stationary with the mean of these, weighted by k, and the mixture is that
+of the moving ones, with the weights 1 - b_0 and k_j (1 - b_j).
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ import numpy as np
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.settings import FlowSettings
+from saga_fg.tracking.track_table import TrackTable
 
 
 @dataclass(frozen=True, eq=False)
 class Passages(Columns):
-    """n places where tracks were: track id, class, position (n, 2), heading, speed along it if it moves, its variance,
-    the belief that it stands, time."""
+    """n passages of tracks: id, class, position (n, 2), world, m, heading, rad, speed along it if moving, m/s, its
+    variance, probability of being stationary, time, s."""
 
     id: IntArray
     label: StrArray
@@ -37,32 +39,39 @@ class Passages(Columns):
     heading: FloatArray
     speed: FloatArray
     variance: FloatArray
-    standing: FloatArray
+    stationary: FloatArray
     time: FloatArray
 
+    @classmethod
+    def of(cls, table: TrackTable, position: FloatArray, now: Kinematics, time: float) -> Passages:
+        """Return the passages of tracks at positions (n, 2), world, at a time, s."""
+        ahead = np.nan_to_num(np.stack([np.cos(table.box.yaw), np.sin(table.box.yaw)], axis=-1))
+        speed = np.einsum("ni,ni->n", ahead, now.velocity)
+        variance = np.einsum("ni,nij,nj->n", ahead, now.P_velocity, ahead)
+        stationary, times = table.stationarity.probability, np.full(len(table), time)
+        return cls(table.id, table.label, position, table.box.yaw, speed, variance, stationary, times)
 
-class Expected(NamedTuple):
-    """Of k new tracks, each (k,): the belief that they stand; if they move, their speed ahead, and its variance."""
 
-    standing: FloatArray
+class SpeedPrior(NamedTuple):
+    """Of k new tracks, each (k,): probability of being stationary; if moving, their speed ahead, and its variance."""
+
+    stationary: FloatArray
     speed: FloatArray
     variance: FloatArray
 
 
 @dataclass(eq=False)
-class TrafficFlow:
+class TrafficFlowPrior:
     """The passages of the last `memory` seconds."""
 
     settings: FlowSettings
     passages: Passages | None = None
 
-    def pass_by(self, passages: Passages) -> None:
-        """Remember where tracks are now; those of unknown heading or speed are left out."""
+    def update(self, passages: Passages) -> None:
+        """Remember passages of the present; those of unknown heading or speed are left out."""
         settings = self.settings
-        if settings.weight == 0:
-            return
         known = np.isfinite(passages.heading) & (passages.variance < settings.known_speed**2)
-        if len(known) == 0:
+        if settings.weight == 0 or len(known) == 0:
             return
         new = passages.select(known)
         if self.passages is not None:
@@ -70,15 +79,15 @@ class TrafficFlow:
         self.passages = new
 
     def expected(
-        self, label: StrArray, position: FloatArray, heading: FloatArray, variance: FloatArray, standing: float = 0.0
-    ) -> Expected:
-        """What is to be expected of new tracks at `position` (k, 2).
+        self, label: StrArray, position: FloatArray, heading: FloatArray, variance: FloatArray, stationary: float = 0.0
+    ) -> SpeedPrior:
+        """The prior of new tracks at `position` (k, 2).
 
-        variance, standing  (k,) of the speed of one of which nothing is known, and the belief that it stands
+        variance (k,) and probability `stationary` of objects without neighbours
         """
         passages, settings = self.passages, self.settings
         if passages is None or len(passages.id) == 0 or len(label) == 0:
-            return Expected(np.full(len(label), standing), np.zeros(len(label)), variance.copy())
+            return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
         offset = passages.position - position[:, None]
         c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
         ahead, lateral = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
@@ -91,12 +100,12 @@ class TrafficFlow:
         k = settings.weight * np.exp(-exponent / 2)
         k = np.where((passages.label == label[:, None]) & np.isfinite(heading)[:, None], k, 0.0)
         k = _nearest_of_each(k, passages.id)
-        stands = (standing + k @ passages.standing) / (1 + k.sum(axis=1))
-        k = k * (1 - passages.standing)
-        norm = 1 - standing + k.sum(axis=1)
+        still = (stationary + k @ passages.stationary) / (1 + k.sum(axis=1))
+        k = k * (1 - passages.stationary)
+        norm = 1 - stationary + k.sum(axis=1)
         mean = k @ passages.speed / norm
         square = passages.speed**2 + passages.variance + settings.spread**2
-        return Expected(stands, mean, ((1 - standing) * variance + k @ square) / norm - mean**2)
+        return SpeedPrior(still, mean, ((1 - stationary) * variance + k @ square) / norm - mean**2)
 
 
 def _nearest_of_each(k: FloatArray, ids: IntArray) -> FloatArray:

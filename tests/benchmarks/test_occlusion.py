@@ -44,7 +44,7 @@ def test_the_command_prints_both_methods_and_writes_its_figures(tmp_path: Path) 
     arguments = ["occlusion", "--scenes", "2", "--fit-scenes", "1", "--json", str(file)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    assert "saga against kf" in result.output
+    assert "saga / kf - 1" in result.output
     figures = json.loads(file.read_text())
     kf, saga = figures["hidden_rmse"]["kf"], figures["hidden_rmse"]["saga"]
     assert figures["hidden_change"]["estimate"] == pytest.approx(saga / kf - 1)

@@ -1,29 +1,15 @@
-"""The benchmark of the smoother: covariances against errors, and hidden objects."""
+"""The benchmark of the smoother on hidden objects: detections are given to their true objects."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from benchmarks.drawn_recordings import drawn_fit
-from benchmarks.hidden_objects import true_objects
+from benchmarks.smoothing import true_objects
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.smoothing import load_smooth_config, smooth_known_objects
 from saga_fg.smoothing import gather_evidence
-
-
-def test_errors_are_as_large_as_the_covariances_say() -> None:
-    fit = drawn_fit(samples=1000, seed=0)  # 2000 components: the ratio's standard deviation is 1.6 %
-    assert fit.samples == 1000
-    assert fit.ratio == pytest.approx(1.0, abs=0.05)
-
-
-def test_what_is_drawn_follows_from_the_seed() -> None:
-    fits = [drawn_fit(samples=50, seed=seed) for seed in (1, 1)]
-    assert fits[0] == fits[1]  # drawn anew from the same seed
-    assert fits[0].measured != drawn_fit(samples=50, seed=2).measured
 
 
 def test_detections_find_their_true_objects() -> None:

@@ -1,4 +1,6 @@
-"""`bench streaming` on a short recording: what it counts is what was put in."""
+"""`python -m benchmarks streaming` on a short recording: it counts what was put in, and compares with the whole."""
+
+from __future__ import annotations
 
 import json
 from pathlib import Path
@@ -7,38 +9,33 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.app import app
-from benchmarks.streaming import StreamingBenchSettings, bench_streaming, traffic
+from benchmarks.streaming import StreamingBenchSettings, bench_streaming, write_traffic
+from data_tools.datasets.detection_files import read_detections
 from saga_fg.errors import InputError
 
 
-def test_objects_come_and_go_in_platoons() -> None:
-    settings = StreamingBenchSettings(objects=20, seed=1)
-    present: set[int] = set()
-    born = gone = seen = 0
-    for instant in traffic(settings, 600):
-        present -= set(instant.gone.tolist())
-        present |= set(instant.born.tolist())
-        assert set(instant.transition.nodes.tolist()) == present
-        assert len(present) == len(instant.truth) == 20
-        born, gone, seen = born + len(instant.born), gone + len(instant.gone), seen + len(instant.measurements)
-    assert born == gone + 20
-    assert gone % 5 == 0
-    assert 5 <= gone <= 60
-    assert 0.85 < seen / (600 * 20) < 0.99  # the others are hidden
+def test_cars_come_in_platoons_and_are_hidden_at_times(tmp_path: Path) -> None:
+    settings = StreamingBenchSettings(objects=20, seconds=60.0, seed=1)
+    write_traffic(tmp_path / "table.csv", settings)
+    dataset = read_detections(tmp_path / "table.csv")
+    frames = dataset.scene(dataset.scenes[0]).frames
+    assert len(frames) == settings.frames == 600
+    assert 0.85 < sum(len(frame) for frame in frames) / (600 * 20) < 0.99  # the others are hidden
+    roads = {round(y / 1000) for frame in frames for y in frame.detections.boxes.position[:, 1].tolist()}
+    assert len(roads) > 4  # a new platoon takes another road
 
 
-def test_every_moment_is_smoothed_once_and_as_the_batch_smoother_does(tmp_path: Path) -> None:
-    result = CliRunner().invoke(
-        app, ["streaming", "--objects", "10", "--seconds", "40", "--json", str(tmp_path / "figures.json")]
-    )
-    assert result.exit_code == 0, result.output
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    assert figures["moments"] == 400
-    assert len(figures["rows"]) == 10
-    assert all(0 < row["held"] < 250 for row in figures["rows"])
-    assert figures["largest_difference"] < 1e-3
-    assert 0.8 < figures["anees"] < 1.25
-    assert "400 moments; peak memory" in result.stdout
+def test_memory_is_read_and_the_labels_are_those_of_the_whole(tmp_path: Path) -> None:
+    arguments = "streaming --objects 5 --seconds 12 --rate 4 --compared 12 --json"
+    done = CliRunner().invoke(app, [*arguments.split(), str(tmp_path / "figures.json")])
+    assert done.exit_code == 0, done.output
+    result = json.loads((tmp_path / "figures.json").read_text())["result"]
+    assert result["boxes"] > 100
+    assert result["largest_difference"] < 1e-3
+    assert result["differing"] <= result["compared"] / 50
+    assert result["rows"][-1]["recorded"] == 12.0
+    assert result["peak"] == max(row["peak"] for row in result["rows"])
+    assert result["growth"] == pytest.approx(result["peak"] / result["rows"][0]["peak"])
 
 
 def test_settings_are_checked() -> None:

@@ -80,7 +80,7 @@ PLAZA = {
     "TL": "7 20 30\n3 -1 -2\n",
 }
 OBSMAT = "780 1 8.0 0 3.0 1.0 0 0.0\n786 1 8.4 0 3.0 1.0 0 0.0\n786 2 1.0 0 2.0 0.0 0 -0.5\n"
-JOURNAL = '{"event": "born", "track": 1, "scene": "a"}\n{"event": "ended", "track": 1, "scene": "a"}\n'
+JOURNAL = '{"event": "initiated", "track": 1, "scene": "a"}\n{"event": "deleted", "track": 1, "scene": "a"}\n'
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer import Typer
 from typer.testing import CliRunner
 
-from benchmarks.app import app as benchmarks
 from data_tools.metrics import ErrorSample, Interval, LabelErrors
 from data_tools.simulator import SimulatorSettings, simulate_scene
-from pipelines.bench import learned_folds
+from pipelines.bench import tracking
 from pipelines.bench.coasting import HIDDEN, NEVER_GIVEN_UP, coasting_errors, kept_alive
 from pipelines.bench.recordings import NuScenesSet, Score, SimulatedSet
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
@@ -112,10 +110,10 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
     def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
         return LearnedInteractions(learned_from=" ".join(recordings))
 
-    monkeypatch.setattr(learned_folds, "learn_interactions", learn)
+    monkeypatch.setattr(tracking, "learn_interactions", learn)
     recordings = SimulatedSet(3, settings=replace(SHORT, duration=1.0))
     first, second, third = recordings.dataset.scenes
-    learned = learned_folds.learn_by_folds(recordings.dataset)
+    learned = tracking.learn_by_folds(recordings.dataset)
     assert {name: found.learned_from for name, found in learned.items()} == {
         first: second,
         second: f"{first} {third}",
@@ -126,7 +124,7 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
     assert list(result.variants) == ["saga", "kf", "centerpoint", "graph matching", "learned interactions"]
     assert result.variants["learned interactions"].figures == pytest.approx(result.variants["kf"].figures, nan_ok=True)
     with pytest.raises(InputError, match="scenes to learn from beside it"):
-        learned_folds.learn_by_folds(SimulatedSet(1, settings=SHORT).dataset)
+        tracking.learn_by_folds(SimulatedSet(1, settings=SHORT).dataset)
 
 
 def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:
@@ -144,11 +142,7 @@ def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:
 
 
 def saga_fg(*arguments: str | Path) -> str:
-    return run(app, *arguments)
-
-
-def run(command: Typer, *arguments: str | Path) -> str:
-    result = CliRunner().invoke(command, [str(argument) for argument in arguments])
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == 0, result.output
     return result.stdout
 
@@ -175,14 +169,6 @@ def test_the_commands_on_recordings_in_the_nuscenes_layout(tmp_path: Path) -> No
     assert figures["variants"]["saga"]["figures"]["AMOTA"] > 0.2
     assert figures["saga_against_kf"]["AMOTA"]["verdict"] in ("better", "worse", "no difference")
     assert figures["coasting_rmse"]["kf"] > 0
-
-    detections = root / "detections"
-    files = ("--camera", detections / "camera.json", "--lidar", detections / "centerpoint_lidar.json")
-    printed = run(benchmarks, "paper", "--dataroot", root, "--split", "lidar_centerpoint", *files, "--json", json_file)
-    figures = json.loads(json_file.read_text())
-    assert set(figures["measured"]) == set(figures["paper"]) == {"camera", "lidar", "fusion"}
-    assert figures["measured"]["fusion"]["saga"]["amota"] > 0.2
-    assert "53.82" in printed  # SAGA-KF on LiDAR, as published
 
 
 def test_mistakes_are_one_line() -> None:

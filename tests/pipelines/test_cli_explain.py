@@ -37,13 +37,13 @@ def test_the_life_of_a_track_is_told_from_birth_to_end(folder: Path, tmp_path: P
     assert result.exit_code == 0, result.output
     first, *lines = result.stdout.splitlines()
     assert first.startswith("track 2 of b, car: ")
-    assert "born from detection" in lines[0]
+    assert "initiated by detection" in lines[0]
     assert any("kept: detection 1" in line for line in lines)
-    assert any("missed, unseen for" in line for line in lines)
-    assert "ended: unseen for longer than" in lines[-1]
+    assert any("missed, not detected for" in line for line in lines)
+    assert "deleted: not detected for longer than" in lines[-1]
     events = json.loads(file.read_text())
-    assert [event["event"] for event in events][:2] == ["born", "matched"]
-    assert events[-1]["event"] == "ended"
+    assert [event["event"] for event in events][:2] == ["initiated", "matched"]
+    assert events[-1]["event"] == "deleted"
     assert {event["scene"] for event in events} == {"b"}
 
 

@@ -15,7 +15,7 @@ import pytest
 from page_in_browser import tried_in_browser
 from typer.testing import CliRunner
 
-from data_tools.metrics import TrackTable, label_errors
+from data_tools.metrics import SceneBoxes, label_errors
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import load_config
@@ -30,9 +30,8 @@ from pipelines.report import (
     scene_of_run,
 )
 from pipelines.report.charts import SHARES
-from pipelines.report.edges import edges_of_moments
 from pipelines.report.run_record import record_path, write_run_record
-from pipelines.report.scenes import scene_data
+from pipelines.report.scenes import edges_of_moments, scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
 
@@ -86,7 +85,7 @@ def test_rows_are_the_tracks_in_centimetres_about_the_start(runs):
 def test_edges_lead_from_a_leader_to_its_follower():
     rule = CONFIG.tracker.edges[0]
     boxes = Boxes.of(["car"] * 3, [[0, 0, 0], [10, 0, 0], [0, 30, 0]], [[4, 2, 1.5]] * 3, [0.0] * 3, [[8, 0]] * 3)
-    table = TrackTable(np.zeros(3, dtype=np.int64), np.array(["behind", "ahead", "aside"]), boxes, np.ones(3))
+    table = SceneBoxes(np.zeros(3, dtype=np.int64), np.array(["behind", "ahead", "aside"]), boxes, np.ones(3))
     ((target, source, rate),) = edges_of_moments(table, 1, (rule,))
     assert [(table.id[t], table.id[s]) for t, s in zip(target, source, strict=True)] == [("behind", "ahead")]
     assert rate[0] > 0
@@ -94,7 +93,7 @@ def test_edges_lead_from_a_leader_to_its_follower():
 
 def test_what_is_not_known_is_null():
     boxes = Boxes.of(["car"], [[1, 2, 0]])
-    table = TrackTable(np.zeros(1, dtype=np.int64), np.array(["a"]), boxes, np.ones(1))
+    table = SceneBoxes(np.zeros(1, dtype=np.int64), np.array(["a"]), boxes, np.ones(1))
     scene = SimulatedTraffic(SHORT, scenes=1, seed=1).scene("scene-0001")
     from pipelines.report import ReportScene
 
@@ -126,8 +125,8 @@ def test_charts_say_what_the_errors_are():
     error = rng.normal(0, 0.3, (n, 2))
     found_boxes = Boxes.of(["car"] * n, np.column_stack([error, np.zeros(n)]), [[4, 2, 1.5]] * n, np.zeros(n), error)
     covariance = np.tile(0.09 * np.eye(2), (n, 1, 1))
-    truth = TrackTable(moment, np.full(n, "a"), truth_boxes, np.zeros(n))
-    found = TrackTable(moment, np.full(n, "t"), found_boxes, np.ones(n), covariance)
+    truth = SceneBoxes(moment, np.full(n, "a"), truth_boxes, np.zeros(n))
+    found = SceneBoxes(moment, np.full(n, "t"), found_boxes, np.ones(n), covariance)
     position, velocity, heading, held = accuracy_charts(label_errors(truth, found, np.zeros((n, 2))))
     series = position.series[0]
     assert np.interp(0.5, series.y, series.x) == pytest.approx(np.median(np.hypot(*error.T)), abs=0.01)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from page_in_browser import tried_in_browser
 
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.scenes import scene_data
 from saga_fg import Boxes, Frame, Scene
@@ -37,7 +37,7 @@ def frame(time: float, *seen: tuple[str, float, float], road_map: RoadMap | None
 def report(*frames: Frame) -> ReportScene:
     """A scene of five moments, each second, without tracks."""
     scene = Scene("s", np.arange(5.0), np.tile(yaw_transform(*ORIGIN), (5, 1, 1)), ("",) * 5, frames)
-    none = TrackTable(np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), Boxes.of([], []), np.empty(0))
+    none = SceneBoxes(np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), Boxes.of([], []), np.empty(0))
     return ReportScene(scene, {"saga": none}, {})
 
 

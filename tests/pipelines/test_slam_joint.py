@@ -1,4 +1,4 @@
-"""`saga-fg slam simulated` and `saga-fg bench joint`: the vehicle and the objects around it together."""
+"""`saga-fg slam simulated`: the vehicle and the objects around it together."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from typer.testing import CliRunner
 
 from data_tools.simulator import simulate_scene
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
-from pipelines.bench.joint import JointBench, bench_joint
-from pipelines.bench.joint_online import bench_online
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.slam.joint import keyframes, run_joint, street
@@ -55,25 +53,6 @@ def test_a_window_without_the_online_estimate_is_refused(tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
-def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None:
-    scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
-    settings = JointSettings(rounds=1, keyframe_period=0.15)
-    config = load_config("simulated")
-    told: list[JointBench] = []
-    result = bench_joint(scenes, config, [0], settings, poles=True, so_far=told.append)
-    assert [len(part.rows) for part in told] == [1, 2]
-    assert told[-1] == result
-    assert [row.scene for row in result.rows] == ["street 1", "street 2"]
-    for scene, row in zip(scenes, result.rows, strict=True):
-        errors = run_joint(scene, config, settings, "lidar", 0).errors()
-        assert (row.decoupled_ate, row.joint_ate) == (errors["odometry"].ate, errors["joint"].ate)
-    square = [(row.joint_ate**2, row.decoupled_ate**2) for row in result.rows]
-    joint_square, decoupled_square = np.sum(square, axis=0)
-    assert result.landmarks is not None
-    assert all(np.isfinite(row.landmarks_ate) for row in result.rows)
-    assert result.change.estimate == pytest.approx(np.sqrt(joint_square / decoupled_square) - 1)
-
-
 def test_keyframes_lie_apart_in_time() -> None:
     frames = [frame for frame in simulate_scene(SHORT, 1).frames if frame.sensor == "lidar"]
     chosen = keyframes(frames, 0.25)
@@ -84,12 +63,6 @@ def test_keyframes_lie_apart_in_time() -> None:
 def test_a_sensor_without_frames_is_named() -> None:
     with pytest.raises(InputError, match="expected frames of radar, there are those of"):
         run_joint(simulate_scene(SHORT, 1, "s"), load_config("simulated"), JointSettings(), "radar", 0)
-
-
-def test_options_of_the_benchmark_go_together() -> None:
-    done = CliRunner().invoke(app, ["bench", "joint", "--dataroot", "somewhere"])
-    assert done.exit_code != 0
-    assert "expected both --dataroot and --detections" in done.output
 
 
 def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
@@ -103,25 +76,3 @@ def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
     assert 0.05 < first.std(axis=0).mean() < 0.2
     again = observe_poles(poses, 1, settings)
     assert [len(now) for now in seen] == [len(now) for now in again]
-
-
-def test_online_objects_are_scored_where_both_report_them() -> None:
-    scenes = [simulate_scene(replace(SHORT, duration=3.0), seed, f"street {seed}") for seed in (1, 2)]
-    config = load_config("simulated")
-    result = bench_online(scenes, config, [0], lag=1.0)
-    for scene, row in zip(scenes, result.rows, strict=True):
-        run = run_joint(scene, config, JointSettings(), "lidar", 0, lag=1.0)
-        assert row.ate == (run.errors()["odometry"].ate, run.errors()["online"].ate)
-        assert row.pairs > 20
-        assert 0 < row.median_velocity[1] < row.velocity[1] < 5
-        assert 0 < row.position[1] < 2
-    squares = np.array([np.square(row.position) * row.pairs for row in result.rows]).sum(axis=0)
-    assert result.position.estimate == pytest.approx(np.sqrt(squares[1] / squares[0]) - 1)
-
-
-def test_the_online_benchmark_prints_both_and_wants_the_truth() -> None:
-    scene = replace(simulate_scene(SHORT, 1), ground_truth=None)
-    with pytest.raises(InputError, match="expected ground truth"):
-        bench_online([scene], load_config("simulated"), [0], lag=1.0)
-    done = CliRunner().invoke(app, ["bench", "joint", "--online", "--poles"])
-    assert "--online: expected neither --poles nor --lanes" in done.output

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.streamed_files import bench_files
-from benchmarks.streaming import StreamingBenchSettings
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
 from data_tools.export.labels import read_label_table
 from pipelines.cli import app
@@ -202,13 +200,3 @@ def test_many_values_are_kept_by_their_weights() -> None:
         lifetimes.seen(0, np.ones(1000), part, np.ones(1000))
     lifetimes.retire(np.array([], dtype=np.int64))
     np.testing.assert_allclose(lifetimes.lasting(0, 1.0).size, np.median(sizes, axis=0), atol=1e-3)
-
-
-def test_the_bench_counts_and_compares() -> None:
-    result = bench_files(StreamingBenchSettings(objects=5, seconds=12.0, rate=4.0, compared=12.0))
-    assert result.boxes > 100
-    assert result.largest_difference < 1e-3
-    assert result.differing <= result.compared / 50
-    assert result.rows[-1].recorded == 12.0
-    assert result.peak == max(row.peak for row in result.rows)
-    assert result.growth == pytest.approx(result.peak / result.rows[0].peak)

@@ -18,7 +18,7 @@ from pipelines.serving.value_tree import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, InputError
 from saga_fg.model.node import ConstantVelocity
 from saga_fg.tracking.settings import TrackerSettings
-from saga_fg.tracking.traffic_flow import Expected
+from saga_fg.tracking.traffic_flow import SpeedPrior
 
 
 def again(value: Any) -> Any:
@@ -93,8 +93,8 @@ def test_objects_are_made_again_by_their_constructors():
     settings = TrackerSettings(estimator="fixed-lag")
     assert again(settings.classes) == settings.classes
     assert again(ConstantVelocity(3.0)) == ConstantVelocity(3.0)
-    expected = Expected(np.zeros(1), np.ones(1), np.ones(1))
-    assert type(again(expected)) is Expected
+    expected = SpeedPrior(np.zeros(1), np.ones(1), np.ones(1))
+    assert type(again(expected)) is SpeedPrior
     tree = TreeWriter(ConstantVelocity(3.0))
     tree.nodes[0] = -1.0
     with pytest.raises(InputError, match="acceleration_noise"):

@@ -78,9 +78,9 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
         [str(id_), label] for id_, label in zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
     ]
     assert len(at("saga/ellipses", "Ellipsoids3D:half_sizes")) == len(tracks)
-    trails = at("saga/trails", "LineStrips3D:strips")
-    np.testing.assert_allclose([trail[-1] for trail in trails], tracks.boxes.position - origin, atol=1e-3)
-    assert max(map(len, trails)) == k + 1
+    paths = at("saga/trajectories", "LineStrips3D:strips")
+    np.testing.assert_allclose([path[-1] for path in paths], tracks.boxes.position - origin, atol=1e-3)
+    assert max(map(len, paths)) == k + 1
     strips = np.array(at("saga/edges", "LineStrips3D:strips"))
     assert strips.shape[1:] == (2, 3)  # from the place of one track to that of another
     places = tracks.boxes.position - origin

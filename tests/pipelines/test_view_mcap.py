@@ -145,8 +145,8 @@ def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path: Path, show
     lengths = [arrow.shaft_length + arrow.head_length for arrow in arrows]
     np.testing.assert_allclose(lengths, np.hypot(*velocity.T), atol=2e-3)
     assert [rgb(arrow) for arrow in arrows] == colours
-    trails = layer("trails", "lines")
-    ends = [xyz(trail.points[-1]) for trail in trails]
+    paths = layer("trajectories", "lines")
+    ends = [xyz(path.points[-1]) for path in paths]
     np.testing.assert_allclose(ends, table.boxes.position[rows] - origin, atol=1e-3)
     spread = [sphere.size.x * sphere.size.y for sphere in layer("ellipses", "spheres")]
     determinant = np.linalg.det(table.position_covariance[rows])

@@ -17,7 +17,7 @@ from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
 from data_tools.files.located import located
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
@@ -34,8 +34,8 @@ class ScoredSequence:
     labels: KittiObjects
     result: KittiObjects
     scene: Scene
-    truth: TrackTable
-    found: TrackTable
+    truth: SceneBoxes
+    found: SceneBoxes
 
 
 def read_scored_sequences(
@@ -71,18 +71,18 @@ def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | No
     if table is not None:
         found = _with_motion(found, table, name)
     assert scene.ground_truth is not None
-    return ScoredSequence(dataset.labels(name), result, scene, TrackTable.of_annotations(scene.ground_truth), found)
+    return ScoredSequence(dataset.labels(name), result, scene, SceneBoxes.of_annotations(scene.ground_truth), found)
 
 
-def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> TrackTable:
+def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:
     """Objects with a 3D box; `world_T_camera` (K, 4, 4) of the frames."""
     objects = objects.select(has_box(objects) & (objects.track_id >= 0))
     objects = objects.select(np.argsort(objects.frame, kind="stable"))
     boxes = camera_boxes_to_world(objects.boxes, np.strings.lower(objects.type), world_T_camera[objects.frame])
-    return TrackTable(objects.frame, objects.track_id.astype(np.str_), boxes, np.nan_to_num(objects.score))
+    return SceneBoxes(objects.frame, objects.track_id.astype(np.str_), boxes, np.nan_to_num(objects.score))
 
 
-def _with_motion(found: TrackTable, table: TrackRows, scene: str) -> TrackTable:
+def _with_motion(found: SceneBoxes, table: TrackRows, scene: str) -> SceneBoxes:
     """The boxes with velocities and covariances of the rows of the same frame and track."""
     rows = np.flatnonzero(table.scene == scene)
     frame = np.rint(table.timestamp[rows] / FRAME_PERIOD).astype(np.int64)

@@ -13,7 +13,7 @@ from data_tools.datasets.nuscenes.dataset import NuScenes
 from data_tools.datasets.nuscenes.scenes import SceneRecord
 from data_tools.datasets.nuscenes.tracking_results import MAX_BOXES, TrackingResults, read_tracking_results
 from data_tools.metrics.nuscenes_tracking import NuScenesTrackingScene
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
@@ -65,8 +65,8 @@ def _scored(
     return NuScenesTrackingScene(
         timestamps=record.timestamps,
         ego_position=record.world_T_ego[:, :2, 3],
-        truth=TrackTable.of_annotations(truth, hidden=False),
-        found=TrackTable(
+        truth=SceneBoxes.of_annotations(truth, hidden=False),
+        found=SceneBoxes(
             np.repeat(np.arange(len(samples)), [len(sample) for sample in samples]),
             np.concatenate([sample.id for sample in samples]),
             Boxes.concatenate([sample.boxes for sample in samples]),

@@ -11,7 +11,7 @@ among those the largest sum of IoU. Thresholds on the mean score of a track are 
 
 and the CLEAR figures at the threshold with the highest MOTA. Written anew from the paper and made to agree with its
 authors' evaluation, whose peculiarity it keeps: thresholds are run from few tracks to many, after a run with all, and a
-found box that matched in any of these runs is never let pass (`class_rows`) in a later one.
+found box that matched in any of these runs is never let pass (`class_boxes`) in a later one.
 
 Source: Weng et al., 3D Multi-Object Tracking: A Baseline and New Evaluation Metrics, IROS 2020, section IV.
 """
@@ -24,15 +24,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.metrics.assignment import Candidates, optimal_pairs
-from data_tools.metrics.kitti_tracking.class_rows import (
-    ClassRows,
+from data_tools.metrics.kitti_tracking.class_boxes import (
+    ClassBoxes,
     KittiTrackingSequence,
     found_rows,
     joined_ranges,
     true_rows,
 )
 from data_tools.metrics.kitti_tracking.track_scores import track_scores
-from data_tools.metrics.kitti_tracking.trajectories import TrajectoryFigures, trajectory_figures
+from data_tools.metrics.kitti_tracking.trajectory_counts import TrajectoryCounts, trajectory_counts
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.overlap import paired_iou_3d
 
@@ -40,7 +40,7 @@ RECALLS = 40
 
 
 @dataclass(frozen=True)
-class KittiTrackingFigures:
+class KittiTrackingMetrics:
     """Figures of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
 
     gt: true boxes that count; mt, ml: shares of trajectories mostly tracked, mostly lost; tp, recall and precision
@@ -66,9 +66,9 @@ class KittiTrackingFigures:
     threshold: float
 
 
-def kitti_tracking_figures(
+def kitti_tracking_metrics(
     sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float
-) -> KittiTrackingFigures | None:
+) -> KittiTrackingMetrics | None:
     """Figures of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
 
     Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. Raises `InputError` for objects
@@ -91,7 +91,7 @@ def kitti_tracking_figures(
 
     smota = 1.0 - (runs.errors[1:] - (1.0 - recalls) * gt) / (recalls * gt)
     tp, fn, fp = int(final.tp[0]), int(final.fn[0]), int(final.fp[0])
-    return KittiTrackingFigures(
+    return KittiTrackingMetrics(
         samota=float(np.clip(smota, 0.0, 1.0).sum() / RECALLS),
         amota=float(runs.mota[1:].sum() / RECALLS),
         amotp=float(runs.motp[1:].sum() / RECALLS),
@@ -123,7 +123,7 @@ class _Runs:
     tp: IntArray
     fn: IntArray
     fp: IntArray
-    trajectories: TrajectoryFigures
+    trajectories: TrajectoryCounts
     overlap: FloatArray
     matched: BoolArray
 
@@ -140,7 +140,7 @@ class _Runs:
         return np.asarray(self.overlap / np.maximum(self.tp, 1))
 
 
-def _candidates(true: ClassRows, found: ClassRows, min_iou: float) -> Candidates:
+def _candidates(true: ClassBoxes, found: ClassBoxes, min_iou: float) -> Candidates:
     """All pairs in the same frame with enough 3D IoU; cost 1 - IoU."""
     first = np.searchsorted(found.frame_key, true.frame_key)
     last = np.searchsorted(found.frame_key, true.frame_key, side="right")
@@ -157,7 +157,7 @@ def _candidates(true: ClassRows, found: ClassRows, min_iou: float) -> Candidates
 
 
 def _thresholds(
-    true: ClassRows, candidates: Candidates, chosen: BoolArray, score: FloatArray
+    true: ClassBoxes, candidates: Candidates, chosen: BoolArray, score: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Score thresholds and the recalls they are for, from the pairs of the run with all tracks.
 
@@ -180,7 +180,7 @@ def _thresholds(
 
 
 def _runs(
-    true: ClassRows, found: ClassRows, candidates: Candidates, present: BoolArray, matched_before: BoolArray
+    true: ClassBoxes, found: ClassBoxes, candidates: Candidates, present: BoolArray, matched_before: BoolArray
 ) -> _Runs:
     """Match and count with the found boxes `present` (M, R) in each run; `matched_before` (M,) in earlier runs."""
     pairs = optimal_pairs(candidates, present[candidates.column])
@@ -197,7 +197,7 @@ def _runs(
         tp=tp,
         fn=len(true) - tp - (true.exempt[:, None] & (track < 0)).sum(axis=0),
         fp=present.sum(axis=0) - tp - (present & found.exempt[:, None] & ~matched).sum(axis=0),
-        trajectories=trajectory_figures(track[order], true.identity[order], true.exempt[order]),
+        trajectories=trajectory_counts(track[order], true.identity[order], true.exempt[order]),
         overlap=(1.0 - candidates.cost) @ pairs,
         matched=matched[:, -1],
     )

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -54,7 +54,7 @@ class PrecisionRecall:
         return float(self.recall[self.precision >= precision].max(initial=0.0))
 
 
-def scored_pairs(truth: TrackTable, visible: BoolArray, found: TrackTable, distance: float) -> ScoredPairs:
+def scored_pairs(truth: SceneBoxes, visible: BoolArray, found: SceneBoxes, distance: float) -> ScoredPairs:
     """Match the boxes of one scene within `distance`, m; visible (N,) of the true boxes."""
     object_, box = _candidates(truth, found, distance)
     taken = np.zeros(len(truth), dtype=np.bool_)
@@ -79,7 +79,7 @@ def precision_recall(scenes: list[ScoredPairs]) -> PrecisionRecall:
     return PrecisionRecall(hits[last] / (last + 1), hits[last] / max(objects, 1))
 
 
-def _candidates(truth: TrackTable, found: TrackTable, distance: float) -> tuple[IntArray, IntArray]:
+def _candidates(truth: SceneBoxes, found: SceneBoxes, distance: float) -> tuple[IntArray, IntArray]:
     """Rows of objects and boxes of one moment and class within the distance, by falling score, then by distance."""
     if len(truth) == 0 or len(found) == 0:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.metrics.nearest_pairs import nearest_pairs
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.types.boxes import Boxes
@@ -39,7 +39,7 @@ class SelfConsistency:
 
 
 def self_consistency(
-    found: TrackTable, timestamps: FloatArray, detections: tuple[IntArray, Boxes, FloatArray] | None = None
+    found: SceneBoxes, timestamps: FloatArray, detections: tuple[IntArray, Boxes, FloatArray] | None = None
 ) -> SelfConsistency:
     """Judge the boxes of one scene, or of several whose moments follow each other and whose ids differ.
 
@@ -69,7 +69,7 @@ def self_consistency(
     )
 
 
-def _residual(found: TrackTable, moment: IntArray, boxes: Boxes, R: FloatArray) -> float:
+def _residual(found: SceneBoxes, moment: IntArray, boxes: Boxes, R: FloatArray) -> float:
     row, column, _ = nearest_pairs((found.moment, found.boxes), (moment, boxes), GATE)
     r = (boxes.position[column] - found.boxes.position[row])[:, :2]
     return _mean(np.einsum("ni,ni->n", r, np.linalg.solve(R[column], r[..., None])[..., 0]) / 2)

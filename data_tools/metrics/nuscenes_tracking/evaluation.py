@@ -15,12 +15,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from data_tools.metrics.nuscenes_tracking.figures import RecallCurves, TrackingFigures
+from data_tools.metrics.nuscenes_tracking.class_metrics import NuScenesClassMetrics, RecallCurves
+from data_tools.metrics.nuscenes_tracking.coverage import track_coverage
+from data_tools.metrics.nuscenes_tracking.scored_boxes import scored_boxes
 from data_tools.metrics.nuscenes_tracking.settings import NuScenesTrackingSettings
-from data_tools.metrics.nuscenes_tracking.sightings import sightings
-from data_tools.metrics.nuscenes_tracking.spans import span_figures
 from data_tools.metrics.nuscenes_tracking.sweep import Rows, Sweep, candidate_pairs, sweep
-from data_tools.metrics.track_table import TrackTable
+from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.types.boxes import Boxes
@@ -39,8 +39,8 @@ class NuScenesTrackingScene:
 
     timestamps: FloatArray
     ego_position: FloatArray
-    truth: TrackTable
-    found: TrackTable
+    truth: SceneBoxes
+    found: SceneBoxes
     racks: Sequence[Boxes] = ()
 
     def __post_init__(self) -> None:
@@ -62,8 +62,8 @@ class NuScenesTrackingScene:
 class NuScenesTrackingMetrics:
     """The result: `overall` figures, figures `per_class`, and the `curves` they are drawn from (scored classes)."""
 
-    overall: TrackingFigures
-    per_class: Mapping[str, TrackingFigures]
+    overall: NuScenesClassMetrics
+    per_class: Mapping[str, NuScenesClassMetrics]
     curves: Mapping[str, RecallCurves]
 
 
@@ -76,7 +76,7 @@ def nuscenes_tracking_metrics(
     true, found = (
         Rows.of(
             [
-                sightings(getattr(scene, name), scene.ego_position, scene.racks, scene.timestamps, class_range)
+                scored_boxes(getattr(scene, name), scene.ego_position, scene.racks, scene.timestamps, class_range)
                 for scene in scenes
             ]
         )
@@ -91,20 +91,20 @@ def nuscenes_tracking_metrics(
     matched = sweep(true, found, pairs, _without_repeats(wanted))
     per_class, curves = {}, {}
     for label, name in enumerate(class_range):
-        if (true.sightings.label == label).any():
+        if (true.boxes.label == label).any():
             columns = _columns(true, found, matched, wanted[label], label, settings)
             per_class[name] = _summary(columns, settings)
             curves[name] = _curves(columns, recalls[::-1], wanted[label])
         else:
-            per_class[name] = TrackingFigures.undefined()
-    return NuScenesTrackingMetrics(TrackingFigures.over_classes(per_class.values()), per_class, curves)
+            per_class[name] = NuScenesClassMetrics.undefined()
+    return NuScenesTrackingMetrics(NuScenesClassMetrics.over_classes(per_class.values()), per_class, curves)
 
 
 def _thresholds(true: Rows, found: Rows, everything: Sweep, label: int, recalls: FloatArray) -> FloatArray:
     """Score thresholds (T,) of a class for the recalls from high to low, NaN where a recall is not reached."""
-    rows = true.sightings.label == label
+    rows = true.boxes.label == label
     matches = rows & (everything.partner[:, 0] >= 0) & ~everything.switched[:, 0]
-    scores = np.sort(found.sightings.score[everything.partner[matches, 0]])[::-1]
+    scores = np.sort(found.boxes.score[everything.partner[matches, 0]])[::-1]
     if len(scores) == 0:
         return np.full(len(recalls), np.nan)
     reached = np.arange(1, len(scores) + 1) / int(rows.sum())
@@ -123,15 +123,15 @@ def _columns(
     true: Rows, found: Rows, matched: Sweep, thresholds: FloatArray, label: int, settings: NuScenesTrackingSettings
 ) -> dict[str, FloatArray]:
     """The figures of one class at each threshold (T,), NaN where the recall is not reached; a repeat like its first."""
-    rows = np.flatnonzero(true.sightings.label == label)
-    rows = rows[np.lexsort((true.sightings.moment[rows], true.sightings.identity[rows]))]
+    rows = np.flatnonzero(true.boxes.label == label)
+    rows = rows[np.lexsort((true.boxes.moment[rows], true.boxes.identity[rows]))]
     partner, switched = matched.partner[rows], matched.switched[rows]
     tracked = partner >= 0
     detections, ids = tracked.sum(axis=0), switched.sum(axis=0)
     tp, fn = detections - ids, len(rows) - detections
     frames, present = _frames_and_boxes(true, found, thresholds, label)
     fp = present - detections
-    spans = span_figures(tracked, true.sightings.identity[rows], settings.sample_period)
+    spans = track_coverage(tracked, true.boxes.identity[rows], settings.sample_period)
     gt = len(rows)
     recall = tp / gt
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -154,7 +154,7 @@ def _columns(
             "lgd": spans.longest_gap,
         }
     if np.isnan(thresholds).all():
-        worst = _never_matched(gt, len(np.unique(true.sightings.identity[rows])), settings)
+        worst = _never_matched(gt, len(np.unique(true.boxes.identity[rows])), settings)
         return {name: np.full(len(thresholds), worst[name]) for name in columns}
     source = np.maximum.accumulate(
         np.where(np.diff(thresholds, prepend=np.nan) == 0, 0, np.arange(len(thresholds)))
@@ -166,10 +166,10 @@ def _columns(
 def _frames_and_boxes(true: Rows, found: Rows, thresholds: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
     """At each threshold (T,): frames with a true or found box of the class, and found boxes."""
     scenes = int(max(true.scene.max(initial=0), found.scene.max(initial=0))) + 1
-    frame_of = [rows.sightings.moment * scenes + rows.scene for rows in (true, found)]
-    with_truth = np.unique(frame_of[0][true.sightings.label == label])
-    rows = np.flatnonzero(found.sightings.label == label)
-    present = found.sightings.score[rows][:, None] >= thresholds
+    frame_of = [rows.boxes.moment * scenes + rows.scene for rows in (true, found)]
+    with_truth = np.unique(frame_of[0][true.boxes.label == label])
+    rows = np.flatnonzero(found.boxes.label == label)
+    present = found.boxes.score[rows][:, None] >= thresholds
     elsewhere = ~np.isin(frame_of[1][rows], with_truth)
     frames = np.full(len(thresholds), float(len(with_truth)))
     if elsewhere.any():
@@ -187,10 +187,10 @@ def _never_matched(gt: int, objects: int, settings: NuScenesTrackingSettings) ->
     return {**unknown, **nothing, **duration, **totals, "motp": settings.worst_motp, "faf": settings.worst_faf}
 
 
-def _summary(columns: Mapping[str, FloatArray], settings: NuScenesTrackingSettings) -> TrackingFigures:
+def _summary(columns: Mapping[str, FloatArray], settings: NuScenesTrackingSettings) -> NuScenesClassMetrics:
     """The figures at the first threshold with the highest MOTA, and the means over the sweep."""
     best = int(np.nanargmax(columns["mota"]))
-    return TrackingFigures(
+    return NuScenesClassMetrics(
         amota=float(np.mean(np.nan_to_num(columns["motar"], nan=0.0))),
         amotp=float(np.mean(np.nan_to_num(columns["motp"], nan=settings.worst_motp))),
         **{name: float(column[best]) for name, column in columns.items()},

@@ -18,23 +18,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.metrics.assignment import Candidates, optimal_pairs
-from data_tools.metrics.nuscenes_tracking.sightings import Sightings
+from data_tools.metrics.nuscenes_tracking.scored_boxes import ScoredBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """`Sightings` of all scenes, in order of moment, then scene; identities are unique over all scenes."""
+    """`ScoredBoxes` of all scenes, in order of moment, then scene; identities are unique over all scenes."""
 
     scene: IntArray
-    sightings: Sightings
+    boxes: ScoredBoxes
     identities: int
 
     @classmethod
-    def of(cls, scenes: Sequence[Sightings]) -> Rows:
+    def of(cls, scenes: Sequence[ScoredBoxes]) -> Rows:
         counts = [int(s.identity.max(initial=-1)) + 1 for s in scenes]
         offset = np.cumsum([0, *counts])
-        joined = Sightings(
+        joined = ScoredBoxes(
             np.concatenate([s.moment for s in scenes]),
             np.concatenate([s.identity + first for s, first in zip(scenes, offset, strict=False)]),
             *(np.concatenate([getattr(s, name) for s in scenes]) for name in ("label", "xy", "score")),
@@ -74,19 +74,19 @@ def candidate_pairs(true: Rows, found: Rows, gate: float) -> Pairs:
     1e-5 m in a distance near zero, in the official figures as in these (there it also depends on the processor).
     """
     scenes = int(max(true.scene.max(initial=0), found.scene.max(initial=0))) + 1
-    true_frame = true.sightings.moment * scenes + true.scene
-    found_frame = found.sightings.moment * scenes + found.scene
+    true_frame = true.boxes.moment * scenes + true.scene
+    found_frame = found.boxes.moment * scenes + found.scene
     frames = np.intersect1d(true_frame, found_frame)
     t0, t1 = np.searchsorted(true_frame, frames), np.searchsorted(true_frame, frames, side="right")
     f0, f1 = np.searchsorted(found_frame, frames), np.searchsorted(found_frame, frames, side="right")
     parts = [(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))]
     for a0, a1, b0, b1 in zip(t0.tolist(), t1.tolist(), f0.tolist(), f1.tolist(), strict=True):
-        a, b = true.sightings.xy[a0:a1], found.sightings.xy[b0:b1]
+        a, b = true.boxes.xy[a0:a1], found.boxes.xy[b0:b1]
         square = -2.0 * (a[:, None, 0] * b[None, :, 0] + a[:, None, 1] * b[None, :, 1])
         square += (a[:, 0] ** 2 + a[:, 1] ** 2)[:, None]
         square += (b[:, 0] ** 2 + b[:, 1] ** 2)[None, :]
         distance = np.sqrt(np.maximum(square, 0.0))
-        near = (distance < gate) & (true.sightings.label[a0:a1, None] == found.sightings.label[None, b0:b1])
+        near = (distance < gate) & (true.boxes.label[a0:a1, None] == found.boxes.label[None, b0:b1])
         column, row = np.nonzero(near.T)
         parts.append((row + a0, column + b0, distance[row, column]))
     return Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -99,9 +99,9 @@ def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Swee
     switched = np.zeros((len(true.scene), T), dtype=np.bool_)
     total = np.zeros(classes * T)
     last = np.full((true.identities, T), -1, dtype=np.int64)
-    label, identity = true.sightings.label, true.sightings.identity
-    track, score = found.sightings.identity, found.sightings.score
-    bounds = np.searchsorted(true.sightings.moment[pairs.true], np.arange(true.sightings.moment.max(initial=-1) + 2))
+    label, identity = true.boxes.label, true.boxes.identity
+    track, score = found.boxes.identity, found.boxes.score
+    bounds = np.searchsorted(true.boxes.moment[pairs.true], np.arange(true.boxes.moment.max(initial=-1) + 2))
     for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         if start == stop:
             continue

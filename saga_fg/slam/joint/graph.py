@@ -31,9 +31,9 @@ from factors import (
     relative_detection_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators.factor_graph import motion_factors
+from saga_fg.estimators.factor_graph import interval_factors
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.motion import Motion
 from saga_fg.graph import EGO_ERROR, OBJECT, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.node import NodeType
@@ -112,10 +112,10 @@ def _motions(k: int, transition: Transition) -> list[gtsam.JacobianFactor]:
     nodes = transition.nodes.tolist()
     layout = Layout(nodes, transition.graph.dims)
     before, now = ({name: object_key(at, name) for name in nodes} for at in (k - 1, k))
-    motion = Motion(transition)
-    if not motion.linear:
+    interval = IntervalDynamics(transition)
+    if not interval.linear:
         raise InputError("motion: expected linear motion and interactions of objects beside a vehicle's path")
-    return motion_factors(motion, layout, np.zeros(layout.size), before, now)[0]
+    return interval_factors(interval, layout, np.zeros(layout.size), before, now)[0]
 
 
 def detections(record: Record, settings: JointSettings) -> list[Linearisable]:

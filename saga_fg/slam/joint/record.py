@@ -21,7 +21,7 @@ from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.tracking import Tracker
-from saga_fg.tracking.observation import observe
+from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.types.frame import Detections, Frame
 from saga_fg.types.sensor import Sensor
 
@@ -110,13 +110,13 @@ class EpochRecorder:
         """The assigned detections, in order of ids, and their classes."""
         here = Frame(frame.timestamp, frame.sensor, detections, np.eye(4), "ego")
         tracker = self._tracker
-        observed = observe(here, tracker.sensor(frame.sensor), tracker.settings.classes)
-        _, mine, rows = np.intersect1d(tracker.assignment.detection, observed.row, return_indices=True)
+        measurements = frame_measurements(here, tracker.sensor(frame.sensor), tracker.settings.classes)
+        _, mine, rows = np.intersect1d(tracker.assignment.detection, measurements.row, return_indices=True)
         ids = tracker.assignment.id[mine]
         order = np.argsort(ids)
         rows = rows[order]
-        seen = RecordedDetections(ids[order], observed.boxes.position[rows], observed.R[rows, :2, :2])
-        return seen, observed.boxes.label[rows].tolist()
+        seen = RecordedDetections(ids[order], measurements.boxes.position[rows], measurements.R[rows, :2, :2])
+        return seen, measurements.boxes.label[rows].tolist()
 
     def _objects(self, seen: RecordedDetections, label: list[str]) -> RecordedObjects:
         for name in label:

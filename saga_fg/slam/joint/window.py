@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 import gtsam
 import numpy as np
 
-from saga_fg.estimators.graph_engine import RelinearisationSettings
 from saga_fg.estimators.graph_solution import GraphSolution
-from saga_fg.estimators.incremental_graph import IncrementalSmoother
+from saga_fg.estimators.incremental_smoother import IncrementalSmoother
+from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.graph import FactorProvider, GraphError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform

@@ -21,9 +21,9 @@ from typing import Annotated, Any
 import numpy as np
 
 from factors import ResidualFactor, SolverSettings, Variable
-from saga_fg.estimators.batch_graph import BatchSolver
-from saga_fg.estimators.graph_engine import RelinearisationSettings
-from saga_fg.estimators.incremental_graph import IncrementalSmoother
+from saga_fg.estimators.batch_solver import BatchSolver
+from saga_fg.estimators.incremental_smoother import IncrementalSmoother
+from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Range, Settings, setting

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_tools.metrics import TrackTable
+from data_tools.metrics import SceneBoxes
 from data_tools.metrics.labels import (
+    CommonBoxes,
     LabelledScene,
-    SameBoxes,
+    common_boxes,
     precision_recall,
-    same_boxes,
     scored_pairs,
     self_consistency,
 )
@@ -24,13 +24,13 @@ def table(
     score: list[float] | None = None,
     variance: float | None = None,
     yaw: list[float] | None = None,
-) -> TrackTable:
+) -> SceneBoxes:
     """Cars at (x, 0)."""
     n = len(ids)
     position = np.column_stack([x, np.zeros(n), np.zeros(n)])
     boxes = Boxes.of(["car"] * n, position, np.tile([4.0, 2.0, 1.5], (n, 1)), yaw or np.zeros(n), np.zeros((n, 2)))
     P = np.empty((0, 2, 2)) if variance is None else np.tile(variance * np.eye(2), (n, 1, 1))
-    return TrackTable(np.array(moment), np.array(ids), boxes, np.array(score or [0.0] * n), P)
+    return SceneBoxes(np.array(moment), np.array(ids), boxes, np.array(score or [0.0] * n), P)
 
 
 TRUTH = table([0, 0, 1], ["a", "b", "a"], [0.0, 10.0, 1.0])
@@ -70,12 +70,12 @@ def test_systems_are_compared_where_all_have_a_box() -> None:
         "other": table([0, 1], ["1", "1"], [0.1, 1.0], variance=0.09),
     }
     scene = LabelledScene(TRUTH, np.array([True, True, False]), np.zeros((3, 2)), np.array([5.0, 15.0, 6.0]), systems)
-    same = same_boxes(scene, 2.0)
+    same = common_boxes(scene, 2.0)
     assert same.distance.tolist() == [5.0, 6.0]
     assert same.visible.tolist() == [True, False]
     assert same.errors["one"]["position"].tolist() == pytest.approx([0.3, 0.0])
     assert same.errors["one"]["nees"].tolist() == pytest.approx([1.0, 0.0])
-    pooled = SameBoxes.pool([same, same])
+    pooled = CommonBoxes.pool([same, same])
     assert len(pooled) == 4
     assert pooled.rmse("one", "position") == pytest.approx(0.3 / np.sqrt(2))
     assert np.isnan(pooled.select(pooled.distance > 100).rmse("one", "position"))
@@ -84,7 +84,7 @@ def test_systems_are_compared_where_all_have_a_box() -> None:
 def test_a_box_stays_with_the_visible_object() -> None:
     truth = table([0, 0], ["a", "b"], [0.0, 0.5])
     systems = {"one": table([0], ["1"], [0.4])}
-    same = same_boxes(LabelledScene(truth, np.array([True, False]), np.zeros((2, 2)), np.zeros(2), systems), 2.0)
+    same = common_boxes(LabelledScene(truth, np.array([True, False]), np.zeros((2, 2)), np.zeros(2), systems), 2.0)
     assert same.errors["one"]["position"].tolist() == pytest.approx([0.4])
     assert same.visible.all()
 

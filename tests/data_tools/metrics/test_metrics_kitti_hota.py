@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.kitti.labels import read_kitti_labels
-from data_tools.metrics import HotaFigures, KittiTrackingSequence, kitti_hota_figures
+from data_tools.metrics import HotaMetrics, KittiTrackingSequence, kitti_hota_metrics
 
 trackeval = pytest.importorskip("trackeval")
 
@@ -30,9 +30,9 @@ def sequence(folder: Path, truth: list[str], found: list[str]) -> KittiTrackingS
     return KittiTrackingSequence(*objects)
 
 
-def figures(folder: Path, truth: list[str], found: list[str], label: str = "car") -> HotaFigures:
+def figures(folder: Path, truth: list[str], found: list[str], label: str = "car") -> HotaMetrics:
     cars = [line(k, 1, label.capitalize(), CAR) for k in range(4)]
-    return kitti_hota_figures([sequence(folder, cars + truth, cars + found)], label)
+    return kitti_hota_metrics([sequence(folder, cars + truth, cars + found)], label)
 
 
 ELSEWHERE = (400.0, 100.0, 480.0, 150.0)
@@ -82,7 +82,7 @@ def test_in_space_the_same_objects_are_judged(tmp_path: Path) -> None:
     found = [line(0, 7, "Car", CAR, x=1.0), line(0, 9, "Car", ELSEWHERE, x=14.0)]
     both = sequence(tmp_path, truth, found)
     for similarity in ("bev_iou", "iou_3d"):
-        result = kitti_hota_figures([both], "car", similarity)
+        result = kitti_hota_metrics([both], "car", similarity)
         assert result.fp + result.fn == 0
         assert result.motp == pytest.approx(3.2 / 5.2)
 
@@ -135,7 +135,7 @@ def test_figures_are_those_of_trackeval_itself(tmp_path: Path) -> None:
         for name in ("0000", "0001"):
             data = dataset.get_preprocessed_seq_data(dataset.get_raw_seq_data("t", name), label)
             each[name] = metric.eval_sequence(data)
-        expected, mine = metric.combine_sequences(each), kitti_hota_figures(sequences, label)
+        expected, mine = metric.combine_sequences(each), kitti_hota_metrics(sequences, label)
         assert 0.1 < mine.hota < 0.95
         np.testing.assert_allclose(mine.hota_at, expected["HOTA"], rtol=1e-12)
         for name, value in (("DetA", mine.deta), ("AssA", mine.assa), ("LocA", mine.loca)):

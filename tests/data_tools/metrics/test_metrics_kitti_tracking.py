@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.kitti_objects import CameraBoxes, KittiObjects
-from data_tools.metrics import KittiTrackingSequence, kitti_tracking_figures
+from data_tools.metrics import KittiTrackingSequence, kitti_tracking_metrics
 from data_tools.metrics.kitti_tracking.track_scores import track_scores
-from data_tools.metrics.kitti_tracking.trajectories import trajectory_figures
+from data_tools.metrics.kitti_tracking.trajectory_counts import trajectory_counts
 
 BOX = {"type": "Car", "z": 10.0, "score": math.nan, "truncated": 0, "occluded": 0, "bbox": (100, 100, 200, 200)}
 LOW = {"bbox": (100, 100, 200, 120)}
@@ -47,7 +47,7 @@ def objects(*rows):
 
 
 def figures(truth, found, label="car", min_iou=0.25):
-    return kitti_tracking_figures([KittiTrackingSequence(objects(*truth), objects(*found))], label, min_iou)
+    return kitti_tracking_metrics([KittiTrackingSequence(objects(*truth), objects(*found))], label, min_iou)
 
 
 CARS = [(f, n, 10.0 * n) for f in range(25) for n in range(4)]  # 100 boxes
@@ -150,7 +150,7 @@ def test_nothing_found():
 def test_sequences_are_counted_together_and_identities_are_apart():
     sequence = KittiTrackingSequence(objects(*CARS), objects(*PERFECT))
     other = KittiTrackingSequence(objects(*CARS), objects(*((f, n + 7, x, o) for f, n, x, o in PERFECT)))
-    f = kitti_tracking_figures([sequence, other], "car", 0.5)
+    f = kitti_tracking_metrics([sequence, other], "car", 0.5)
     assert (f.gt, f.tp, f.ids) == (200, 200, 0)
 
 
@@ -204,7 +204,7 @@ def test_trajectories_equal_a_plain_reading(trajectories):
     track = np.array([t for rows in trajectories for t, _ in rows])[:, None]
     exempt = np.array([e for rows in trajectories for _, e in rows])
     identity = np.repeat(np.arange(len(trajectories)), [len(rows) for rows in trajectories])
-    result = trajectory_figures(np.concatenate([track, np.full_like(track, -1)], axis=1), identity, exempt)
+    result = trajectory_counts(np.concatenate([track, np.full_like(track, -1)], axis=1), identity, exempt)
     assert result.switches.tolist() == [sum(s for s, _, _ in expected), 0]
     assert result.fragments.tolist() == [sum(f for _, f, _ in expected), 0]
     known = [state for _, _, state in expected if state is not None]
@@ -224,7 +224,7 @@ def test_agrees_with_the_reference_evaluation(recordings):
     ]
     for label, by_iou in json.loads((golden / "expected.json").read_text()).items():
         for min_iou, expected in by_iou.items():
-            f = kitti_tracking_figures(sequences, label, float(min_iou))
+            f = kitti_tracking_metrics(sequences, label, float(min_iou))
             for name, value in expected.items():
                 got = getattr(f, name.lower())
                 if isinstance(value, float):

@@ -13,9 +13,9 @@ from scipy.stats import chi2
 
 from data_tools.metrics import (
     LabelErrors,
-    TrackTable,
+    SceneBoxes,
     calibration,
-    error_figures,
+    error_summary,
     errors_by_class,
     label_errors,
     label_velocities,
@@ -36,7 +36,7 @@ def table(rows, covariance=None):
     )
     moment, names = np.array([row[0] for row in full]), np.array([row[1] for row in full], dtype=str)
     given = {} if covariance is None else {"position_covariance": np.tile(covariance, (len(full), 1, 1))}
-    return TrackTable(moment, names, boxes, np.ones(len(full)), **given)
+    return SceneBoxes(moment, names, boxes, np.ones(len(full)), **given)
 
 
 def errors(truth, found, detections=None, covariance=None, reach=1):
@@ -61,7 +61,7 @@ def test_velocities_of_labels_need_a_label_on_either_side() -> None:
 def test_errors_by_hand() -> None:
     found = [(k, "7", 2.0 * k, 0.3, {"v": (4.0, 0.5), "yaw": 0.2 if k else np.pi - 0.1}) for k in range(5)]
     e = errors(DRIVE, found)
-    f = error_figures(e)
+    f = error_summary(e)
     assert (f.labels, f.tracked) == (5, 5)
     assert f.position == pytest.approx(0.3)
     assert f.velocity == f.velocity_moving == pytest.approx(0.5)
@@ -74,7 +74,7 @@ def test_errors_by_hand() -> None:
 def test_parked_and_moving_are_told_apart() -> None:
     truth = sorted([*DRIVE, *PARKED], key=lambda row: row[0])
     found = [(k, name, x, y, {"v": (1.0, 0.0)}) for k, name, x, y in truth]
-    f = error_figures(errors(truth, found))
+    f = error_summary(errors(truth, found))
     assert f.velocity_parked == pytest.approx(1.0)
     assert f.velocity_moving == pytest.approx(3.0)
     assert f.velocity == pytest.approx(math.sqrt(5.0))
@@ -83,7 +83,7 @@ def test_parked_and_moving_are_told_apart() -> None:
 def test_only_labels_that_a_detection_matches_count() -> None:
     found = [(k, "7", 2.0 * k + 0.2, 0.0) for k in range(4)]  # none at the last
     seen = [(k, "d", 2.0 * k, 0.1 if k != 2 else 5.0) for k in range(5)]  # not at the third
-    f = error_figures(errors(DRIVE, found, seen))
+    f = error_summary(errors(DRIVE, found, seen))
     assert (f.labels, f.tracked) == (4, 3)
     assert f.position == pytest.approx(0.2)
     assert f.detection == pytest.approx(0.1)

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from nuscenes_random_drive import VERSION, write_random_drive
 
-from benchmarks.devkit import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
+from benchmarks.metrics import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
 from data_tools.datasets.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.scored_scenes import read_scored_scenes
-from data_tools.metrics import NuScenesTrackingMetrics, TrackingFigures, nuscenes_tracking_metrics
+from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from saga_fg import Annotations, Boxes, InputError, Tracks
 
 
@@ -57,8 +57,8 @@ def test_a_simulated_scene(devkit: str, tmp_path: Path) -> None:
 
 
 def test_a_difference_is_found() -> None:
-    ours = NuScenesTrackingMetrics(TrackingFigures(*np.arange(17.0)), per_class={}, curves={})
-    names = [field.name for field in fields(TrackingFigures)]
+    ours = NuScenesTrackingMetrics(NuScenesClassMetrics(*np.arange(17.0)), per_class={}, curves={})
+    names = [field.name for field in fields(NuScenesClassMetrics)]
     theirs = dict(zip(names, np.arange(17.0), strict=True)) | {"label_metrics": {name: {} for name in names}}
     assert max(value for _, value in differences(ours, theirs)) == 0
     assert dict(differences(ours, theirs | {"ids": 12.5}))["ids"] == 0.5

@@ -10,20 +10,20 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from data_tools.metrics import (
+    NuScenesClassMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
-    TrackingFigures,
-    TrackTable,
+    SceneBoxes,
     nuscenes_tracking_metrics,
 )
 from saga_fg import Annotations, Boxes, InputError, Tracks
 
 
 def table(rows):
-    """TrackTable from (moment, id, label, x, y, score), in order of moment."""
+    """SceneBoxes from (moment, id, label, x, y, score), in order of moment."""
     moment, names, label, x, y, score = zip(*rows, strict=True) if rows else ((),) * 6
     position = np.stack([x, y, np.zeros(len(x))], axis=1) if rows else np.empty((0, 3))
-    return TrackTable(
+    return SceneBoxes(
         np.array(moment, dtype=np.int64), np.array(names, dtype=str), Boxes.of(label, position), np.array(score, float)
     )
 
@@ -162,17 +162,17 @@ def test_nothing_at_all():
 
 def test_tables_from_annotations_and_tracks():
     boxes = Boxes.of(["car", "car"], [(1, 2, 0), (3, 4, 0)])
-    truth = TrackTable.of_annotations(
+    truth = SceneBoxes.of_annotations(
         [Annotations(np.array(["a", "b"]), boxes, np.array([True, False]))] * 2, hidden=False
     )
     assert truth.id.tolist() == ["a", "a"]
     assert truth.moment.tolist() == [0, 1]
     covariance = np.tile(np.eye(2), (2, 1, 1))
     tracks = Tracks(0.0, np.array([4, 5]), boxes, np.array([0.5, 0.7]), covariance, covariance, np.zeros(2))
-    found = TrackTable.of_tracks([tracks, Tracks.empty(1.0), tracks])
+    found = SceneBoxes.of_tracks([tracks, Tracks.empty(1.0), tracks])
     assert found.id.tolist() == ["4", "5", "4", "5"]
     assert found.moment.tolist() == [0, 0, 2, 2]
-    assert len(TrackTable.of_tracks([])) == len(TrackTable.of_annotations([])) == 0
+    assert len(SceneBoxes.of_tracks([])) == len(SceneBoxes.of_annotations([])) == 0
 
 
 @pytest.mark.parametrize(
@@ -285,7 +285,7 @@ def plain_figures(truth, found):
     best = max(run, key=lambda row: row["mota"])
     amota = np.mean([0.0 if row is None or math.isnan(row["motar"]) else row["motar"] for row in rows])
     amotp = np.mean([2.0 if row is None or math.isnan(row["motp"]) else row["motp"] for row in rows])
-    return TrackingFigures(amota=float(amota), amotp=float(amotp), **best)
+    return NuScenesClassMetrics(amota=float(amota), amotp=float(amotp), **best)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -312,7 +312,7 @@ def test_equals_a_plain_reading_of_the_definition(seed):
         assert f.amota == 0
         assert f.amotp == 2
         return
-    for field in fields(TrackingFigures):
+    for field in fields(NuScenesClassMetrics):
         assert getattr(f, field.name) == pytest.approx(getattr(expected, field.name), abs=1e-6, nan_ok=True), field.name
 
 

@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.affected import affected
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.scenarios import SCENARIOS, ScenarioName, scenario_settings
 from data_tools.simulator.scene import scene_from_world
@@ -140,20 +139,6 @@ def test_riders_sit_on_their_bicycles() -> None:
     assert np.linalg.norm(bicycles.position - riders.position, axis=-1).max() < 0.1
     moved = np.diff(bicycles.position, axis=0) / 0.05
     assert np.abs(moved - bicycles.velocity[:-1]).max() < 0.6
-
-
-def test_who_is_affected() -> None:
-    """Nobody while all lights are open; somebody while one is closed."""
-    counts = []
-    for seed in (3, 4, 5):
-        here = world("red-light", seed)
-        for time in here.history.time[::20].tolist():
-            closed = any(line.closed(time) for line in here.layout.stop_lines if len(line.lanes))
-            counts.append(len(affected(here, time)))
-            assert closed or counts[-1] == 0
-    assert max(counts) > 3
-    names = affected(world("towing"), world("towing").start + 1.0).tolist()
-    assert any(name.startswith("trailer") for name in names)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

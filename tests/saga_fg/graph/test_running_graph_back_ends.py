@@ -89,8 +89,8 @@ def test_linear_factors_of_providers_lead_to_one_estimate(seed, name):
             operation.run(estimator)
         if not isinstance(operation, Add | Marginalise):
             for estimator in (kalman, other):
-                estimator.hear(None, ORIGIN)
-                estimator.ask()
+                estimator.set_frame(None, ORIGIN)
+                estimator.ask_providers()
         nodes = apart.nodes
         assert kalman.nodes.tolist() == other.nodes.tolist()
         P = kalman.joint_covariance(nodes)
@@ -167,8 +167,8 @@ def test_the_graph_says_what_the_estimator_knows(name):
     estimator = BACK_ENDS[name]([Surroundings()])
     for operation in random_program(np.random.default_rng(7), moments=4, kinds=(CAR,)):
         operation.run(estimator)
-        estimator.hear(None, ORIGIN)
-        estimator.ask()
+        estimator.set_frame(None, ORIGIN)
+        estimator.ask_providers()
     graph = estimator.graph().copy()
     nodes = estimator.nodes.tolist()
     newest = graph.of(OBJECT, graph.epoch)

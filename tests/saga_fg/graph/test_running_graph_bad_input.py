@@ -250,13 +250,13 @@ def in_the_tracker(back_end, function, message):
     estimator = back_end([given])
     estimator.add([7, 12], np.ones((2, 4)), np.stack([np.eye(4)] * 2), {7: "car", 12: "car"})
     estimator.predict(discretise(SceneGraph.of([7, 12], CAR), 3.4))
-    estimator.ask()
+    estimator.ask_providers()
     before = estimator.joint_mean([7, 12]), estimator.joint_covariance([7, 12])
     harmless, given.function = given.function, function
     with pytest.raises(GraphError, match=message):
-        estimator.ask()
+        estimator.ask_providers()
     given.function = harmless
-    estimator.ask()
+    estimator.ask_providers()
     np.testing.assert_allclose(estimator.joint_mean([7, 12]), before[0], atol=1e-12)
     np.testing.assert_allclose(estimator.joint_covariance([7, 12]), before[1], atol=1e-10)
 

@@ -9,7 +9,7 @@ from graph_estimator import GraphEstimator
 from random_graphs import CAR, CONE
 
 from factors import ResidualFactors, prior_factor
-from pipelines.bench.drawn_traffic import Detections, Objects, Vehicle, draw_traffic, providers
+from pipelines.bench.sampled_traffic import Detections, Objects, Vehicle, providers, sample_traffic
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraduatedNonConvexity, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphError, NewVariable, UndeterminedError, key_of
@@ -57,7 +57,7 @@ def driven(estimator, scene):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_is_nonlinear_is_where_isam2_is_that_keeps_everything(seed):
-    scene = draw_traffic(np.random.default_rng(seed), frames=10)
+    scene = sample_traffic(np.random.default_rng(seed), frames=10)
     batch = driven(BatchSolver(providers(scene)), scene)
     isam2 = driven(IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e-4)), scene)
     handed = BatchSolver(graph=isam2.graph())
@@ -72,7 +72,7 @@ def test_what_is_nonlinear_is_where_isam2_is_that_keeps_everything(seed):
 
 def test_what_goes_in_acts():
     """Without interactions the estimate is another one."""
-    scene, alone = (draw_traffic(np.random.default_rng(3), frames=8) for _ in range(2))
+    scene, alone = (sample_traffic(np.random.default_rng(3), frames=8) for _ in range(2))
     alone.leaders, alone.neighbours = {}, lambda node, present: []
     together = driven(BatchSolver([Vehicle(scene), Objects(scene), Detections(scene)]), scene)
     by_themselves = driven(BatchSolver([Vehicle(alone), Objects(alone), Detections(alone)]), scene)
@@ -83,7 +83,7 @@ def test_what_goes_in_acts():
 def test_graduated_non_convexity_does_not_care_for_outliers(seed, loss):
     """A fifth, or a tenth, of the detections far off: all is where it is without these."""
     rng = np.random.default_rng(seed)
-    clean = draw_traffic(rng, frames=8, cars=3, pedestrians=2)
+    clean = sample_traffic(rng, frames=8, cars=3, pedestrians=2)
     spoilt, wrong = copy.deepcopy(clean), 0
     for moment, without in zip(spoilt.moments, clean.moments, strict=True):
         for node in list(without.seen):
@@ -168,7 +168,7 @@ class Curious:
 
 
 def test_a_provider_sees_what_was_known_before_its_epoch():
-    scene, curious = draw_traffic(np.random.default_rng(4), frames=5), Curious()
+    scene, curious = sample_traffic(np.random.default_rng(4), frames=5), Curious()
     estimators = [make([*providers(scene), curious]) for make in (BatchSolver, lambda p: IncrementalSmoother(p, None))]
     for k, moment in enumerate(scene.moments):
         answers = []
@@ -186,7 +186,7 @@ def test_a_provider_sees_what_was_known_before_its_epoch():
 
 def test_what_is_marginalised_stays_known():
     """The same at the end as of a whole graph, and after a pickle."""
-    scene = draw_traffic(np.random.default_rng(1), frames=6)
+    scene = sample_traffic(np.random.default_rng(1), frames=6)
     whole, shorter = (driven(BatchSolver(providers(scene)), scene) for _ in range(2))
     shorter.marginalise([key for key, one in shorter.graph().variables.items() if one.epoch < 3])
     snapshot = shorter.snapshot()

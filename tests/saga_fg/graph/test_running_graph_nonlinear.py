@@ -1,6 +1,6 @@
 """Law 2 of the running graph: nothing marginalised, iSAM2 is Levenberg-Marquardt on everything; with a lag, consistent.
 
-Scenes (`pipelines.bench.drawn_traffic`): intelligent drivers, pedestrians who keep apart, range and bearing, the
+Scenes (`pipelines.bench.sampled_traffic`): intelligent drivers, pedestrians who keep apart, range and bearing, the
 vehicle's own pose.
 """
 
@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from factors import Robust, SolverSettings
-from pipelines.bench.drawn_traffic import Detections, Objects, Vehicle, draw_traffic, providers
+from pipelines.bench.sampled_traffic import Detections, Objects, Vehicle, providers, sample_traffic
 from saga_fg.estimators import IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT
 
@@ -28,7 +28,7 @@ def off(smoother, values):
 
 @pytest.mark.parametrize("seed", range(50))
 def test_every_frame_equals_levenberg_marquardt_on_everything(seed):
-    scene = draw_traffic(np.random.default_rng(seed), frames=7, cars=3, pedestrians=2)
+    scene = sample_traffic(np.random.default_rng(seed), frames=7, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=None)
     for moment in scene.moments:
         smoother.step(moment.time)
@@ -40,7 +40,7 @@ def test_every_frame_equals_levenberg_marquardt_on_everything(seed):
 
 
 def test_gtsams_own_solver_finds_the_same():
-    scene = draw_traffic(np.random.default_rng(0), frames=7, cars=3, pedestrians=2)
+    scene = sample_traffic(np.random.default_rng(0), frames=7, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=None)
     for moment in scene.moments:
         smoother.step(moment.time)
@@ -55,7 +55,7 @@ def test_gtsams_own_solver_finds_the_same():
 def test_robust_losses_are_weighted_anew(seed):
     """A tenth of the detections far off; iteratively reweighted least squares comes nearer by a factor a time."""
     rng = np.random.default_rng(seed)
-    scene = draw_traffic(rng, frames=5, cars=3, pedestrians=2)
+    scene = sample_traffic(rng, frames=5, cars=3, pedestrians=2)
     for moment in scene.moments:
         for node in moment.seen:
             if rng.random() < 0.1:
@@ -73,7 +73,7 @@ def test_with_a_lag_errors_are_as_large_as_their_covariance_says(lag):
     """The 99 % band of the NEES, of vehicle and objects together at the end of thirty scenes drawn from the model."""
     total, degrees = 0.0, 0
     for seed in range(30):
-        scene = draw_traffic(np.random.default_rng(1000 + seed), frames=10, cars=3, pedestrians=2)
+        scene = sample_traffic(np.random.default_rng(1000 + seed), frames=10, cars=3, pedestrians=2)
         smoother = IncrementalSmoother(providers(scene), lag=lag)
         for moment in scene.moments:
             smoother.step(moment.time)
@@ -93,7 +93,7 @@ def test_with_a_lag_errors_are_as_large_as_their_covariance_says(lag):
 @pytest.mark.parametrize("lag", [0.0, 0.5])
 def test_the_graph_stays_as_large_as_the_lag(lag):
     """Factors and variables, those that iSAM2 holds among them, over 120 frames with births and deaths."""
-    scene = draw_traffic(np.random.default_rng(7), frames=120, cars=3, pedestrians=3, intervals=(0.1,))
+    scene = sample_traffic(np.random.default_rng(7), frames=120, cars=3, pedestrians=3, intervals=(0.1,))
     smoother, sizes = IncrementalSmoother(providers(scene), lag, RelinearisationSettings(threshold=0.1)), []
     for moment in scene.moments:
         smoother.step(moment.time)
@@ -107,8 +107,8 @@ def test_the_graph_stays_as_large_as_the_lag(lag):
 
 def test_what_goes_in_acts():
     """Without interactions the estimate is another one; so it is with a factor of the user's."""
-    scene = draw_traffic(np.random.default_rng(3), frames=8)
-    alone = draw_traffic(np.random.default_rng(3), frames=8)
+    scene = sample_traffic(np.random.default_rng(3), frames=8)
+    alone = sample_traffic(np.random.default_rng(3), frames=8)
     alone.leaders, alone.neighbours = {}, lambda node, present: []
 
     def newest(made):

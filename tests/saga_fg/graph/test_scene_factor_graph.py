@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factors import SolverSettings, gaussian_factor, marginal_moments, pose_prior_factor, prior_factor
-from pipelines.bench.drawn_traffic import draw_traffic, providers
+from pipelines.bench.sampled_traffic import providers, sample_traffic
 from saga_fg.estimators import BatchSmoother, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import (
     EGO_POSE,
@@ -60,7 +60,7 @@ def test_keys_in_words_and_those_that_are_none():
 
 
 def driven(lag=None, frames=6, seed=2):
-    scene = draw_traffic(np.random.default_rng(seed), frames=frames, cars=3, pedestrians=2)
+    scene = sample_traffic(np.random.default_rng(seed), frames=frames, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=lag)
     for moment in scene.moments[:-1]:
         smoother.step(moment.time)
@@ -100,9 +100,9 @@ def test_the_graph_is_the_one_that_runs():
     _, smoother = driven()
     graph = smoother.graph()
     assert sum(1 for _ in graph.factors()) == sum((slots >= 0).sum() for slots in smoother._engine.slots.values())
-    said = [str(factor) for factor in graph.factors()]
-    assert "PriorFactorPose2 on vehicle 0 at 0.00 s (provider odometry)" in said
-    assert any(text.startswith("SmoothDriver interactions on car 1 at ") for text in said)
+    text = [str(factor) for factor in graph.factors()]
+    assert "PriorFactorPose2 on vehicle 0 at 0.00 s (provider odometry)" in text
+    assert any(text.startswith("SmoothDriver interactions on car 1 at ") for text in text)
     before = graph.values
     solution = graph.copy().solve(SolverSettings(tolerance=1e-8))
     for key, variable in graph.variables.items():
@@ -203,7 +203,7 @@ def test_providers_see_what_is_there():
 
 def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
     """So that relinearisation is what the equality with Levenberg-Marquardt rests on."""
-    scene = draw_traffic(np.random.default_rng(2), frames=6, cars=3, pedestrians=2)
+    scene = sample_traffic(np.random.default_rng(2), frames=6, cars=3, pedestrians=2)
     once = IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e9))
     _, smoother = driven()
     for moment in scene.moments[:-1]:

@@ -19,7 +19,7 @@ from saga_fg.estimators import (
     JointKalmanFilter,
     Measurements,
 )
-from saga_fg.estimators.flow import flows
+from saga_fg.estimators.interval_dynamics import nonlinear_dynamics
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.node import RandomWalk
@@ -146,7 +146,7 @@ def test_a_flow_is_the_motion_the_law_and_the_linear_edges():
     """The bicycle: motion and law; the first car: motion alone; going straight, the second one: the transition."""
     graph = scene()
     moved, dt = {}, 0.2
-    for flow in flows(discretise(graph, dt)):
+    for flow in nonlinear_dynamics(discretise(graph, dt)):
         columns = [np.stack([START[r] for r in rows]) for rows in flow.rows.T]
         moved.update(zip(flow.rows[:, 0].tolist(), flow.predict(columns), strict=True))
     assert sorted(moved) == [0, 1, 2, 3, 4, 6]
@@ -157,7 +157,7 @@ def test_a_flow_is_the_motion_the_law_and_the_linear_edges():
     np.testing.assert_allclose(moved[2], BIKE.motion.flow(bike, dt) + pushed, atol=1e-12)
     straight = [*START[1][:4], 0.0]
     linear = discretise(SceneGraph(graph.nodes, graph.types, graph.edges), dt)
-    (flow,) = (f for f in flows(linear) if f.rows.shape[1] == 2)
+    (flow,) = (f for f in nonlinear_dynamics(linear) if f.rows.shape[1] == 2)
     x = flow.predict([np.array([straight]), np.array([START[0]])])[0]
     joint = np.concatenate([START[0], straight, *START[2:]])
     np.testing.assert_allclose(x, (linear.F_matrix @ joint + linear.b)[5:10], atol=1e-12)

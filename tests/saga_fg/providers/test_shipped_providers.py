@@ -243,7 +243,7 @@ def test_vehicles_keep_to_a_lane_that_the_map_has_too_far_left() -> None:
         off[len(providers)] = np.abs(tracks.boxes.position[:, 1] - 50.0)
     assert off[1][3] < 0.5 * off[0][3]
     assert off[1][:3].max() < 0.15
-    graph = tracker.snapshot().tracks.state[0].graph
+    graph = tracker.snapshot().joint[0].graph
     (line,) = graph.of(MAP_NODE, None).values()
     assert str(line) == "lane main 0"
     assert graph.state(line.key) == pytest.approx([-0.6], abs=0.15)

@@ -13,7 +13,7 @@ angles = st.floats(-3.1, 3.1)
 
 
 def born(size=(4.0, 2.0, 1.5), weight=0.5, z=1.0, z_noise=0.2, yaw=0.0, yaw_noise=0.3):
-    return BoxFilter.born(
+    return BoxFilter.initiated(
         np.array([size]), np.array([weight]), np.array([z]), np.array([z_noise]), np.array([yaw]), np.array([yaw_noise])
     )
 

@@ -62,11 +62,11 @@ def test_a_belief_can_always_be_changed():
         belief = groups.updated(belief, car)
     assert belief.min() >= 0.9 * LEAST_BELIEF
     label = np.array(["car"])
-    told = []
+    reported = []
     for _ in range(4):
         belief = groups.updated(belief, bus)
-        told.append(str(groups.labels(belief, label)[0]))
-    assert told == ["car", "car", "bus", "bus"]  # after log(1 / LEAST_BELIEF) / log(0.9 / 0.05) detections
+        reported.append(str(groups.labels(belief, label)[0]))
+    assert reported == ["car", "car", "bus", "bus"]  # after log(1 / LEAST_BELIEF) / log(0.9 / 0.05) detections
 
 
 def test_between_classes_believed_alike_the_track_keeps_its_own():
@@ -92,21 +92,21 @@ def test_a_table_of_confusion_takes_the_place_of_one_number():
 @pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
 def test_sensors_that_disagree_make_one_track_of_the_likelier_class(estimator):
     track = tracker(estimator=estimator)
-    told = []
+    reported = []
     for k in range(8):  # the camera comes first, and is wrong throughout
         sensor, label = ("camera", "car") if k % 2 == 0 else ("lidar", "truck")
-        told.append(track.step(frame(0.1 * k, (label, 20.0), sensor=sensor)))
-    assert [len(t) for t in told] == [1] * 8
-    assert len({int(t.id[0]) for t in told}) == 1
-    assert [t.boxes.label[0] for t in told] == ["car"] + ["truck"] * 7
-    assert told[-1].score[0] > told[0].score[0]
+        reported.append(track.step(frame(0.1 * k, (label, 20.0), sensor=sensor)))
+    assert [len(t) for t in reported] == [1] * 8
+    assert len({int(t.id[0]) for t in reported}) == 1
+    assert [t.boxes.label[0] for t in reported] == ["car"] + ["truck"] * 7
+    assert reported[-1].score[0] > reported[0].score[0]
 
 
 def test_without_groups_there_are_two():
     track = tracker(groups=())
     for k in range(4):
-        told = track.step(frame(0.1 * k, (("car", "truck")[k % 2], 20.0)))
-    assert sorted(told.boxes.label.tolist()) == ["car", "truck"]
+        reported = track.step(frame(0.1 * k, (("car", "truck")[k % 2], 20.0)))
+    assert sorted(reported.boxes.label.tolist()) == ["car", "truck"]
 
 
 def test_groups_keep_to_themselves_and_ones_own_class_goes_before_a_nearer_other():

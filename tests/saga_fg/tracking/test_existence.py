@@ -1,22 +1,25 @@
 """Existence by Bayes' rule, and what it makes of a track's score."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from saga_fg.tracking import ExistenceSettings
-from saga_fg.tracking.columns import TrackColumns
-from saga_fg.tracking.existence import after_hit, after_miss, reported_score
+from saga_fg.tracking.existence import after_hit, after_miss
+from saga_fg.tracking.reporting import reported_score
+from saga_fg.tracking.track_table import TrackTable
 
 SETTINGS = ExistenceSettings(lifetime=np.inf)
 
 
-def columns(score, hits, looks, existence=0.9):
-    score = np.atleast_1d(np.asarray(score, dtype=float))
-    label, told, confirmed = np.full(len(score), "car"), (score, score), np.zeros(len(score), dtype=bool)
-    table = TrackColumns.born(np.arange(len(score)), label, score, told, 0.0, 0.0, confirmed, True)
-    table.hits, table.looks = np.broadcast_to(hits, len(score)) * 1.0, np.broadcast_to(looks, len(score)) * 1.0
-    table.existence = np.full(len(score), existence)
-    return table
+def score(probability, hits, opportunities, coasting=False, existence=0.9, settings=SETTINGS):
+    """Reported scores of tracks with these attributes."""
+    probability = np.atleast_1d(np.asarray(probability, dtype=float))
+    n = len(probability)
+    counts = {"hits": np.full(n, hits * 1.0), "opportunities": np.full(n, opportunities * 1.0)}
+    table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, **counts)
+    return reported_score(table, np.ones(n), np.full(n, coasting), settings)
 
 
 def test_a_miss_is_the_likelier_the_less_the_track_exists():
@@ -34,19 +37,16 @@ def test_a_detection_as_probable_as_clutter_says_nothing():
     assert (after_hit(r, np.full(2, 0.05), SETTINGS) < r).all()
 
 
-def test_the_score_is_the_detections_unless_told_otherwise():
-    seen, coasting = np.zeros(2, dtype=bool), np.ones(2, dtype=bool)
-    table = columns([0.4, 0.8], 1, 5)
-    assert reported_score(table, seen, SETTINGS) == pytest.approx([0.4, 0.8])
-    assert reported_score(table, coasting, SETTINGS) == pytest.approx([0.36, 0.72])
-    assert reported_score(table, coasting, ExistenceSettings(coasting_score=0.5)) == pytest.approx([0.18, 0.36])
+def test_the_score_is_the_detections_unless_set_otherwise():
+    assert score([0.4, 0.8], 1, 5) == pytest.approx([0.4, 0.8])
+    assert score([0.4, 0.8], 1, 5, coasting=True) == pytest.approx([0.36, 0.72])
+    half = ExistenceSettings(coasting_score=0.5)
+    assert score([0.4, 0.8], 1, 5, coasting=True, settings=half) == pytest.approx([0.18, 0.36])
 
 
 def test_a_steady_track_scores_higher_than_a_new_or_a_flickering_one():
     settings = ExistenceSettings(newness=1.0, steadiness_weight=0.5)
-    steady, new, flickering = (
-        float(reported_score(columns(0.6, hits, looks), np.zeros(1, dtype=bool), settings)[0])
-        for hits, looks in ((9, 9), (1, 1), (4, 9))
-    )
+    counts = ((9, 9), (1, 1), (4, 9))
+    steady, new, flickering = (score(0.6, *count, settings=settings).item() for count in counts)
     assert steady == pytest.approx(0.6 * np.sqrt(0.9))
     assert steady > new > flickering

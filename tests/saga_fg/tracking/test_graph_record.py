@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from factors import ResidualFactors
-from pipelines.bench.drawn_traffic import draw_traffic, providers
+from pipelines.bench.sampled_traffic import providers, sample_traffic
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import OBJECT, Additions
@@ -70,7 +70,7 @@ def test_factors_of_users_are_in_it_under_their_names():
 
 
 def test_any_running_graph_is_listed_factor_for_factor():
-    scene = draw_traffic(np.random.default_rng(0), frames=4, intervals=(0.5,))
+    scene = sample_traffic(np.random.default_rng(0), frames=4, intervals=(0.5,))
     smoother, record = IncrementalSmoother(providers(scene), lag=None), GraphRecord()
     for moment in scene.moments:
         smoother.step(moment.time)

@@ -36,7 +36,7 @@ def of_kind(events: list[dict], kind: str) -> list[dict]:
 
 def test_births_say_what_they_come_from_and_who_was_near() -> None:
     events, _ = run(frame(0.0, 10.0), frame(0.1, 10.0, 12.0))
-    first, second = of_kind(events, "born")
+    first, second = of_kind(events, "initiated")
     assert (first["track"], first["detection"], first["nearest_tracks"]) == (1, 0, [])
     assert first["probability"] == pytest.approx(0.95)
     assert second["detection"] == 1
@@ -67,17 +67,17 @@ def test_what_another_track_took_is_named() -> None:
     assert last[2]["event"] == "matched"
     assert last[1]["event"] == "missed"
     assert last[1]["candidates"][0]["outcome"] == "taken by track 2"
-    assert last[1]["unseen"] == pytest.approx(0.1)
+    assert last[1]["coasting"] == pytest.approx(0.1)
     assert last[1]["existence"][1] < last[1]["existence"][0]
 
 
 def test_ends_have_a_reason() -> None:
     events, _ = run(frame(0.0, 0.0, score=0.99), frame(0.1, 0.0, score=0.99), *(frame(0.1 * k) for k in range(2, 20)))
-    (ended,) = of_kind(events, "ended")
-    assert ended["confirmed"]
-    assert ended["reason"] == "unseen for longer than 1.2 s"
+    (deleted,) = of_kind(events, "deleted")
+    assert deleted["confirmed"]
+    assert deleted["reason"] == "not detected for longer than 1.2 s"
     events, _ = run(frame(0.0, 0.0, score=0.2), *(frame(0.1 * k) for k in range(1, 9)))
-    assert of_kind(events, "ended")[0]["reason"].startswith("existence below 0.02")
+    assert of_kind(events, "deleted")[0]["reason"].startswith("existence below 0.02")
 
 
 def test_keeping_a_journal_changes_nothing() -> None:
@@ -132,10 +132,10 @@ def test_a_view_stays_as_it_was() -> None:
     tracker = Tracker(SETTINGS, observer=Keep())
     for k in range(20):
         tracker.step(frame(0.1 * k, 10.0 + k))
-    before = next(view for view in views if len(view.columns.id))
+    before = next(view for view in views if len(view.table.id))
     assert before.nodes.has_moved is not None
-    assert before.nodes.has_moved.tolist() == before.columns.has_moved.tolist() == [False]
-    assert views[-1].columns.has_moved.tolist() == [True]
+    assert before.nodes.has_moved.tolist() == before.table.has_moved.tolist() == [False]
+    assert views[-1].table.has_moved.tolist() == [True]
 
 
 def test_an_observer_is_told_every_stage_in_turn() -> None:
@@ -144,10 +144,10 @@ def test_an_observer_is_told_every_stage_in_turn() -> None:
     class Watch:
         def after(self, stage: str, view) -> None:
             stages.append(stage)
-            if stage == "births":
+            if stage == "initiate":
                 seen: TrackerView = view()
-                assert len(seen.born) == 1
-                assert seen.places()[0].tolist() == [10.0, 0.0]
+                assert len(seen.initiated) == 1
+                assert seen.positions()[0].tolist() == [10.0, 0.0]
 
     Tracker(SETTINGS, observer=Watch()).step(frame(0.0, 10.0))
-    assert stages == ["predict", "observe", "associate", "update", "believe", "births", "deaths", "report"]
+    assert stages == ["predict", "measure", "associate", "update", "existence", "initiate", "delete", "report"]

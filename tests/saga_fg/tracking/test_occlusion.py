@@ -11,7 +11,7 @@ from traffic_frames import NAN, SIZE, frame
 from saga_fg import Boxes, Tracker, TrackerSettings
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import ExistenceSettings
-from saga_fg.tracking.occlusion import covered
+from saga_fg.tracking.existence import covered
 
 ALL = np.array([True, True])
 EGO = yaw_transform(0.0, 0.0, 0.0, 0.0)
@@ -63,13 +63,13 @@ def existence(occlusion):
     for k in range(15):
         cars = [(20.0, 0.0)] if k < 10 else [(10.0, 0.0)]
         tracker.step(replace(frame(0.1 * k, cars, size=SIZE, yaw=np.pi / 2), world_T_ego=EGO))
-    columns = tracker.snapshot().tracks.tables.columns
-    return columns.existence[0], columns.looks[0] - columns.hits[0]
+    table = tracker.snapshot().table
+    return table.existence[0], table.opportunities[0] - table.hits[0]
 
 
 def test_a_hidden_track_is_not_believed_in_less():
-    kept, looks = existence(1.0)
+    kept, misses = existence(1.0)
     lost, in_vain = existence(0.0)
     assert kept > 0.98
     assert lost < 0.6
-    assert (looks, in_vain) == (1, 5), "in the first frame, the car in front is no track yet"
+    assert (misses, in_vain) == (1, 5), "in the first frame, the car in front is no track yet"

@@ -171,7 +171,7 @@ def test_names_of_sensors_without_end_are_not_remembered():
     tracker = Tracker()
     for k in range(200):
         tracker.step(frame(0.1 * k, [(0, 0)], sensor=f"sensor {k}", label=f"class {k}"))
-    assert len(tracker.snapshot().tracks.tables.evidence.sensors) < 50
+    assert len(tracker.snapshot().table.sensors.sensors) < 50
 
 
 @ALL

@@ -166,6 +166,6 @@ def test_tracks_come_and_go_in_a_graph_that_stays_small(name: str, size: int) ->
     for k in range(60):
         where = CARS(0.1 * k)[[k // 20]] if k % 20 < 12 else np.empty((0, 2))
         tracker.step(frame(0.1 * k, where))
-        graph = tracker.snapshot().tracks.state[0].graph
+        graph = tracker.snapshot().joint[0].graph
         sizes.append(len(graph.variables))
     assert max(sizes) <= size

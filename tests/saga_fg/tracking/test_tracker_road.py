@@ -82,22 +82,22 @@ def test_drivers_without_corners_brake_for_a_red_light_one_after_the_other(estim
 
 def test_the_light_is_believed_by_noisy_reports():
     tracker = tracked(queue_frames("red", accuracy=0.85))
-    assert tracker.roadside.belief("light")["red"] > 0.95
+    assert tracker.map_nodes.belief("light")["red"] > 0.95
     far = tracker.snapshot()
     tracker.tracks(63.0)
-    assert tracker.roadside.belief("light")["red"] > 0.95
+    assert tracker.map_nodes.belief("light")["red"] > 0.95
     for timestamp in (60.0, 60.1):
         tracker.step(Frame(timestamp, "camera", Detections.empty()))
-    assert tracker.roadside.belief("light")["red"] < 0.6
+    assert tracker.map_nodes.belief("light")["red"] < 0.6
     tracker.restore(far)
-    assert tracker.roadside.belief("light")["red"] > 0.95
+    assert tracker.map_nodes.belief("light")["red"] > 0.95
 
 
 def test_colours_are_no_tracks_and_without_a_map_no_nodes():
     for known in (True, False):
         tracker = tracked(queue_frames(known=known))
         assert sorted(set(tracker.tracks(0).boxes.label.tolist())) == ["car"]
-        assert len(tracker.roadside) == (3 if known else 0)
+        assert len(tracker.map_nodes) == (3 if known else 0)
 
 
 @pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
@@ -125,9 +125,9 @@ def test_the_map_is_corrected_by_what_is_seen():
     wrong = replace(MAP, lights=(TrafficLight("light", (12.0, 0.5)),), deviation=0.5)
     frames = [replace(frame, road_map=wrong) for frame in queue_frames()]
     tracker = tracked(frames)
-    light = tracker.roadside.id[tracker.roadside.label == "traffic_light"]
-    position, _, P, _ = tracker._tracks._state.node(light, np.array(["traffic_light"]))
-    assert position[0, 1] + tracker._tracks._origin[1] == pytest.approx(0.0, abs=0.15)
+    light = tracker.map_nodes.id[tracker.map_nodes.label == "traffic_light"]
+    position, _, P, _ = tracker._state.joint.kinematics_of(light, np.array(["traffic_light"]))
+    assert position[0, 1] + tracker._state.origin[1] == pytest.approx(0.0, abs=0.15)
     assert P[0, 1, 1] < 0.1
 
 
@@ -168,13 +168,13 @@ def test_a_map_may_come_in_the_settings_or_bit_by_bit():
     assert np.allclose(in_settings.tracks(3.5).boxes.position, in_frames.tracks(3.5).boxes.position)
     more = RoadMap(lanes=(Lane("other", ((0.0, 3.5), (50.0, 3.5))),))
     in_settings.step(Frame(3.1, "camera", Detections.empty(), road_map=more))
-    assert len(in_settings.roadside) == 4
+    assert len(in_settings.map_nodes) == 4
 
 
 def test_a_map_may_be_of_lanes_alone():
     only = RoadMap(lanes=MAP.lanes)
     tracker = tracked([replace(frame, road_map=only) for frame in queue_frames(duration=1.0)])
-    assert len(tracker.roadside) == 1
+    assert len(tracker.map_nodes) == 1
     assert {edges.interaction for edges in tracker.graph.edges} == {"KeepLane", "SharedVelocity"}
 
 

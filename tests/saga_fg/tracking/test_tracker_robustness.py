@@ -16,6 +16,7 @@ from traffic_frames import columns, frame, run, seen, straight
 from saga_fg import Boxes, Detection, Detections, Frame, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import JointKalmanFilter
 from saga_fg.tracking import ClassSettings
+from saga_fg.tracking import tracker as tracker_module
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 from saga_fg.types.sensor import NoiseModel
 
@@ -116,26 +117,26 @@ class Failing:
 
 
 def estimator_state(tracker):
-    return columns(tracker.tracks(100.0)), tracker.snapshot().tracks.next_id, tracker.time_verdict
+    return columns(tracker.tracks(100.0)), tracker.snapshot().next_id, tracker.time_verdict
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("stage", ["_associate", "_update", "_believe", "_bear", "_bury"])
+@pytest.mark.parametrize(
+    "stage", ["associate", "update_tracks", "update_existence", "initiate_tracks", "delete_tracks"]
+)
 def test_what_raises_in_a_step_leaves_the_tracker_as_it_was(monkeypatch, estimator, stage):
-    from saga_fg.tracking.track_set import TrackSet
-
     silent, failing = (Tracker(TrackerSettings(estimator=estimator)) for _ in range(2))
     frames = traffic(12)
     for tracker in (silent, failing):
         run(tracker, frames[:10])
-    original = getattr(TrackSet, stage)
+    original = getattr(tracker_module, stage)
 
-    def breaking(self, *arguments):
-        original(self, *arguments)
+    def breaking(*arguments):
+        original(*arguments)
         raise ArithmeticError("broken")
 
     with monkeypatch.context() as patched:
-        patched.setattr(TrackSet, stage, breaking)
+        patched.setattr(tracker_module, stage, breaking)
         with pytest.raises(ArithmeticError, match="broken"):
             failing.step(frames[10])
     for a, b in zip(run(silent, frames[10:]), run(failing, frames[10:]), strict=True):
@@ -145,17 +146,15 @@ def test_what_raises_in_a_step_leaves_the_tracker_as_it_was(monkeypatch, estimat
 
 
 def test_an_interrupt_leaves_the_tracker_as_it_was(monkeypatch):
-    from saga_fg.tracking.track_set import TrackSet
-
     tracker = Tracker()
     run(tracker, traffic())
     before = columns(tracker.tracks(0.9))
 
-    def interrupted(self):
+    def interrupted(state):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(TrackSet, "_bury", interrupted)
+        patched.setattr(tracker_module, "delete_tracks", interrupted)
         with pytest.raises(KeyboardInterrupt):
             tracker.step(frame(1.0, CARS(1.0)))
     assert columns(tracker.tracks(0.9)) == before

@@ -10,7 +10,7 @@ from traffic_frames import frame
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.tracking import FlowSettings
-from saga_fg.tracking.traffic_flow import Passages, TrafficFlow
+from saga_fg.tracking.traffic_flow import Passages, TrafficFlowPrior
 
 ON = FlowSettings(weight=5.0)
 
@@ -41,9 +41,9 @@ def expected_at(flow, standing, position=(0.0, 0.0), heading=0.0, label="car", v
 
 
 def remembering(*tables, settings=ON):
-    flow = TrafficFlow(settings)
+    flow = TrafficFlowPrior(settings)
     for table in tables:
-        flow.pass_by(table)
+        flow.update(table)
     return flow
 
 

@@ -1,0 +1,103 @@
+"""The errors at labels summed up: root mean squares, and how honest the covariances are.
+
+A class is *judged* by its calibration if it has enough objects and boxes for that; the shares of errors within the
+tracks' ellipses then say something (`data_tools.metrics.consistency`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.metrics.consistency import coverages
+from data_tools.metrics.label_errors import LabelErrors
+
+FEWEST_OBJECTS, FEWEST_BOXES = 20, 500
+BANDS = {0.5: (0.4, 0.6), 0.9: (0.85, 0.95), 0.99: (0.96, 1.0)}
+OVERALL = "overall"
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Figures of one class, NaN where undefined.
+
+    labels, tracked      matched labels, and those of them with a track
+    position, detection  RMSE of tracks and of detections on the same labels, m
+    velocity, velocity_parked, velocity_moving   RMSE, m/s
+    heading              RMSE, rad; flipped: share of headings off by more than 90 degrees
+    """
+
+    labels: int
+    tracked: int
+    position: float
+    detection: float
+    velocity: float
+    velocity_parked: float
+    velocity_moving: float
+    heading: float
+    flipped: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How well one class's covariances fit its errors.
+
+    objects, boxes  that have a track with a covariance
+    anees           mean NEES over its 2 degrees of freedom: 1 if the covariances are right
+    median_nees     over that of the chi-square distribution
+    held            share of the errors within the ellipse, by its probability
+    """
+
+    objects: int
+    boxes: int
+    anees: float
+    median_nees: float
+    held: Mapping[float, float]
+
+    @property
+    def judged(self) -> bool:
+        """Whether there are enough objects and boxes to judge."""
+        return self.objects >= FEWEST_OBJECTS and self.boxes >= FEWEST_BOXES
+
+    @property
+    def honest(self) -> bool:
+        """Whether each share is within its band."""
+        return all(low <= self.held[p] <= high for p, (low, high) in BANDS.items())
+
+
+def error_summary(errors: LabelErrors) -> ErrorSummary:
+    """Sum up errors."""
+    heading = errors.sample("heading").values
+    moving = errors.moving
+    return ErrorSummary(
+        labels=int(errors.matched.sum()),
+        tracked=int((errors.matched & errors.tracked).sum()),
+        position=errors.sample("position").rmse,
+        detection=errors.sample("detection").rmse,
+        velocity=errors.sample("velocity").rmse,
+        velocity_parked=errors.sample("velocity", ~moving).rmse,
+        velocity_moving=errors.sample("velocity", moving).rmse,
+        heading=errors.sample("heading").rmse,
+        flipped=float(np.mean(heading > np.pi / 2)) if len(heading) else float("nan"),
+    )
+
+
+def calibration(errors: LabelErrors) -> Calibration:
+    """Compare errors with their covariances."""
+    known = np.isfinite(errors.nees)
+    values = errors.nees[known]
+    return Calibration(
+        objects=len(np.unique(errors.object[known])),
+        boxes=len(values),
+        anees=float(values.mean() / 2) if len(values) else float("nan"),
+        median_nees=float(np.median(values) / (2 * np.log(2))) if len(values) else float("nan"),
+        held=coverages(values, tuple(BANDS)),
+    )
+
+
+def errors_by_class(errors: LabelErrors) -> dict[str, LabelErrors]:
+    """The errors of each class that has labels, those of all of them first."""
+    labels = np.unique(errors.label).tolist()
+    return {OVERALL: errors, **{label: errors.select(errors.label == label) for label in labels}}

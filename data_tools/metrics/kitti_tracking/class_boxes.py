@@ -1,0 +1,144 @@
+"""The rows of one class, and which of them count: the rules of the KITTI tracking benchmark.
+
+A class is scored together with its neighbour (car: van; pedestrian: person sitting), so that a detector which cannot
+tell them apart is not charged. True boxes count unless they are of the neighbour class, truncated, or occluded beyond
+"largely"; those may be matched but are neither found nor missed. Found boxes that match nothing are let pass if they
+are of the neighbour class, at most 25 px high in the image, or lie for more than half in a DontCare area.
+
+Source: Geiger et al., Are we ready for autonomous driving?, CVPR 2012, and the benchmark's evaluation rules,
+https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.boxes import Boxes
+
+NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting"}
+MIN_HEIGHT = 25.0  # px
+MAX_OCCLUSION = 2
+MAX_TRUNCATION = 0
+NO_SCORE = -1.0  # of results that have none
+
+# The camera's axes turned upright, x ahead, y left, z up: boxes keep their overlaps to the last digit.
+UPRIGHT_T_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class KittiTrackingSequence:
+    """One sequence to score: the labels, DontCare rows included, and the tracker's output."""
+
+    truth: KittiObjects
+    found: KittiObjects
+
+
+@dataclass(frozen=True, eq=False)
+class ClassBoxes:
+    """N rows of one class (and its neighbour) over all sequences, in order of frame key.
+
+    frame_key  (N,) number of sequence and frame, the same for true and found rows
+    identity   (N,) number of the object or track, from 0, over all sequences
+    exempt     (N,) true boxes that need not be found; found boxes that need not match
+    boxes      in an upright frame
+    score      (N,) of found boxes
+    """
+
+    frame_key: IntArray
+    identity: IntArray
+    exempt: BoolArray
+    boxes: Boxes
+    score: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.frame_key)
+
+
+def true_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
+    """The true boxes of a class (name in lower case)."""
+    kept = [_of_class(sequence.truth, label) for sequence in sequences]
+    exempt = [hardly_seen(rows) | _neighbour(rows, label) for rows in kept]
+    return _joined(kept, exempt, _frames(sequences))
+
+
+def found_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
+    """The found boxes of a class (name in lower case)."""
+    kept = [_of_class(sequence.found, label) for sequence in sequences]
+    exempt = [
+        is_small(rows) | _neighbour(rows, label) | in_ignored_area(rows, sequence.truth)
+        for rows, sequence in zip(kept, sequences, strict=True)
+    ]
+    return _joined(kept, exempt, _frames(sequences))
+
+
+def joined_ranges(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
+    """All (n, k) with first[n] <= k < last[n], as two arrays."""
+    count = last - first
+    n = np.repeat(np.arange(len(count)), count)
+    return n, np.arange(len(n)) - np.repeat(np.cumsum(count) - count - first, count)
+
+
+def _of_class(objects: KittiObjects, label: str) -> KittiObjects:
+    types = np.char.lower(objects.type)
+    return objects.select(((types == label) | (types == NEIGHBOUR.get(label, label))) & (objects.track_id != -1))
+
+
+def _neighbour(objects: KittiObjects, label: str) -> BoolArray:
+    return np.asarray(np.char.lower(objects.type) != label)
+
+
+def hardly_seen(objects: KittiObjects) -> BoolArray:
+    """(N,) which true objects are truncated, or occluded beyond "largely"."""
+    return np.asarray(
+        (np.trunc(objects.truncated) > MAX_TRUNCATION) | (np.trunc(objects.occluded) > MAX_OCCLUSION), dtype=np.bool_
+    )
+
+
+def is_small(objects: KittiObjects) -> BoolArray:
+    """(N,) which objects are too low in the image to be asked for."""
+    return np.asarray(np.abs(objects.bbox[:, 1] - objects.bbox[:, 3]) <= MIN_HEIGHT, dtype=np.bool_)
+
+
+def _frames(sequences: Sequence[KittiTrackingSequence]) -> int:
+    """More than the highest frame number."""
+    return 1 + max((int(o.frame.max(initial=0)) for s in sequences for o in (s.truth, s.found)), default=0)
+
+
+def _joined(parts: Sequence[KittiObjects], exempt: Sequence[BoolArray], frames: int) -> ClassBoxes:
+    sequence = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    empty = np.empty(0, dtype=np.int64)
+    frame_key = sequence * frames + np.concatenate([empty, *(part.frame for part in parts)])
+    owner = np.stack([sequence, np.concatenate([empty, *(part.track_id for part in parts)])], axis=1)
+    _, identity = np.unique(owner, axis=0, return_inverse=True)
+    score = np.concatenate([np.empty(0), *(part.score for part in parts)])
+    boxes = Boxes.concatenate([camera_boxes_to_world(part.boxes, part.type, UPRIGHT_T_CAMERA) for part in parts])
+    order = np.argsort(frame_key, kind="stable")
+    return ClassBoxes(
+        frame_key[order],
+        identity.reshape(-1)[order],
+        np.concatenate([np.empty(0, dtype=np.bool_), *exempt])[order],
+        boxes.select(order),
+        np.nan_to_num(score, nan=NO_SCORE)[order],
+    )
+
+
+def in_ignored_area(rows: KittiObjects, truth: KittiObjects) -> BoolArray:
+    """(N,) which rows lie with more than half of their image box in one DontCare area of their frame."""
+    areas = truth.select(np.char.lower(truth.type) == "dontcare")
+    order = np.argsort(areas.frame, kind="stable")
+    frame = areas.frame[order]
+    first, last = np.searchsorted(frame, rows.frame), np.searchsorted(frame, rows.frame, side="right")
+    row, other = joined_ranges(first, last)
+    a, b = rows.bbox[row], areas.bbox[order][other]
+    width = np.minimum(a[:, 2], b[:, 2]) - np.maximum(a[:, 0], b[:, 0])
+    height = np.minimum(a[:, 3], b[:, 3]) - np.maximum(a[:, 1], b[:, 1])
+    own = (a[:, 2] - a[:, 0]) * (a[:, 3] - a[:, 1])
+    covered = (width > 0) & (height > 0) & (width * height > 0.5 * own)
+    result = np.zeros(len(rows), dtype=np.bool_)
+    result[row[covered]] = True
+    return result

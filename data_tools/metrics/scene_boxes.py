@@ -1,0 +1,75 @@
+"""Boxes with identities over the moments of a scene, as one table: what tracking metrics compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked, checked_labels
+from saga_fg.numerics.columns import Columns
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations
+from saga_fg.types.track import Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBoxes(Columns):
+    """N boxes of one scene, in order of time.
+
+    moment  (N,) which of the scene's moments, from 0, never decreasing
+    id      (N,) names of the objects or tracks; a name occurs once at a moment at most
+    boxes   label, position, size, yaw, velocity, all moments in one coordinate frame
+    score   (N,) confidence; 0 for ground truth
+    position_covariance  (N, 2, 2) of the horizontal position, m^2, NaN where unknown; may be left out
+
+    Raises `InputError` for moments out of order or an identity that occurs twice at one moment.
+    """
+
+    moment: IntArray
+    id: StrArray
+    boxes: Boxes
+    score: FloatArray
+    position_covariance: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+
+    def __post_init__(self) -> None:
+        n = len(self.boxes)
+        moment = np.array(self.moment, dtype=np.int64)
+        if moment.shape != (n,) or (np.diff(moment) < 0).any() or (n and moment[0] < 0):
+            raise InputError(f"moment: expected {n} indices from 0 that never decrease")
+        names = checked_labels("id", self.id, n)
+        _, numbers = np.unique(names, return_inverse=True)
+        key = numbers * (moment[-1] + 1 if n else 1) + moment
+        unique, first = np.unique(key, return_index=True)
+        if len(unique) != n:
+            row = int(np.setdiff1d(np.arange(n), first)[0])
+            raise InputError(
+                f"id[{row}]: expected unique ids, {str(names[row])!r} occurs twice at moment {moment[row]}"
+            )
+        for name, array in (("moment", moment), ("id", names), ("score", checked("score", self.score, (n,)))):
+            object.__setattr__(self, name, array)
+        given = self.position_covariance if len(self.position_covariance) else np.full((n, 2, 2), np.nan)
+        covariance = checked("position_covariance", given, (n, 2, 2), "finite-or-nan")
+        object.__setattr__(self, "position_covariance", covariance)
+
+    @classmethod
+    def of_annotations(cls, moments: Sequence[Annotations], hidden: bool = True) -> Self:
+        """Ground truth as a table; without `hidden`, visible objects only."""
+        kept = [np.ones(len(truth), dtype=np.bool_) if hidden else truth.visible for truth in moments]
+        boxes = Boxes.concatenate([truth.boxes.select(rows) for truth, rows in zip(moments, kept, strict=True)])
+        names = [truth.id[rows] for truth, rows in zip(moments, kept, strict=True)]
+        moment = np.repeat(np.arange(len(moments)), [int(rows.sum()) for rows in kept])
+        return cls(moment, np.concatenate([np.empty(0, dtype="<U1"), *names]), boxes, np.zeros(len(boxes)))
+
+    @classmethod
+    def of_tracks(cls, moments: Sequence[Tracks]) -> Self:
+        """A tracker's output as a table."""
+        boxes = Boxes.concatenate([found.boxes for found in moments])
+        moment = np.repeat(np.arange(len(moments)), [len(found) for found in moments])
+        numbers = np.concatenate([np.empty(0, dtype=np.int64), *(found.id for found in moments)])
+        score = np.concatenate([np.empty(0), *(found.score for found in moments)])
+        covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in moments)])
+        return cls(moment, numbers.astype(np.str_), boxes, score, covariance)

@@ -1,0 +1,79 @@
+"""Pictures from above, in world coordinates: paths, and a LiDAR map with landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from data_tools.plots.birds_eye import COLOURS
+from saga_fg.numerics.arrays import FloatArray
+
+MOST_POINTS = 60_000  # of a map that are drawn, evenly chosen
+MARGIN = 30.0  # m around the paths
+
+
+def paths_from_above(paths: Mapping[str, FloatArray], points: Mapping[str, FloatArray] | None = None) -> Any:
+    """Return a matplotlib `Figure` of paths (N, 2 or 3) and sets of points (K, 2 or 3), m, each under its name.
+
+    The first path is grey, for comparison with the others.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 8.0), layout="constrained")
+    ax = figure.subplots()
+    colours = ("#b0b0b0", *COLOURS)
+    for (name, path), colour in zip(paths.items(), colours, strict=False):
+        ax.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.0, label=name)
+    for (name, set_), colour, marker in zip((points or {}).items(), COLOURS[1:], "^x+os", strict=False):
+        ax.plot(set_[:, 0], set_[:, 1], marker, color=colour, markersize=5, label=name)
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    ax.grid(color="#e6e6e6", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def scan_map_from_above(
+    points: FloatArray,
+    paths: Mapping[str, FloatArray],
+    poles: FloatArray,
+    lines: Mapping[str, FloatArray],
+    tracks: Sequence[FloatArray] = (),
+) -> Any:
+    """Return a matplotlib `Figure`; all in world coordinates, m.
+
+    points  (N, 3) of the map, coloured by height
+    paths   (K, 3) by name
+    poles   (P, 2)
+    lines   (W, 2, 2) the two ends of walls and road lines, by kind
+    tracks  (n, 2) of objects
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
+    ax = figure.subplots()
+    chosen = points[:: max(1, len(points) // MOST_POINTS)]
+    low, high = np.percentile(chosen[:, 2], [5, 95]) if len(chosen) else (0.0, 1.0)
+    x, y, z = chosen.T
+    dots = ax.scatter(x, y, c=z, s=0.3, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+    figure.colorbar(dots, ax=ax, label="height, m", shrink=0.7)
+    for (name, ends), colour in zip(lines.items(), ("#d62728", "#9467bd"), strict=False):
+        if len(ends):
+            ax.add_collection(LineCollection(list(ends), colors=colour, linewidths=1.5, label=name))
+    if len(poles):
+        ax.plot(
+            *poles.T, "o", color="#ff7f0e", markersize=4, markeredgecolor="black", markeredgewidth=0.4, label="poles"
+        )
+    if tracks:
+        ax.add_collection(LineCollection(list(tracks), colors="#2ca02c", linewidths=1.2, label="objects"))
+        ax.plot(*np.array([track[-1] for track in tracks]).T, "s", color="#2ca02c", markersize=3)
+    for (name, path), colour in zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False):
+        ax.plot(*path[:, :2].T, color=colour, linewidth=1.5, label=name)
+    driven = np.concatenate([path[:, :2] for path in paths.values()])
+    (left, bottom), (right, top) = driven.min(axis=0) - MARGIN, driven.max(axis=0) + MARGIN
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))
+    ax.legend(frameon=True, fontsize=9, loc="upper right")
+    return figure

@@ -1,0 +1,202 @@
+"""Traffic drawn from the model of the running graph: a vehicle that drives by odometry and sees, in range and bearing,
+cars that follow each other (intelligent driver) and pedestrians who keep apart (social force).
+
+Cars and pedestrians come and go, are missed now and then, and time is irregular. Three providers give the very factors
+that were drawn from to an estimator, so that its covariances must fit the errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import (
+    NonlinearInteraction,
+    Robust,
+    between_factor,
+    pose_prior_factor,
+    prior_factors,
+    relative_range_bearing_factors,
+)
+from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView, NewVariable
+from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction
+from saga_fg.numerics.arrays import FloatArray
+
+START = np.diag([0.05, 0.05, 0.01]) ** 2
+ODOMETRY = np.diag([0.05, 0.03, 0.01]) ** 2
+SEEN = np.diag([0.15, 0.01]) ** 2
+BORN = np.diag([1.0, 1.0, 0.5, 0.5]) ** 2
+NOISE = 0.3  # spectral density of accelerations, m^2/s^3
+_FOLLOWING, _REPULSION = interaction(SmoothDriver()), interaction(SocialForce())
+States = dict[int, FloatArray]
+
+
+def process_noise(dt: float) -> FloatArray:
+    """Q (4, 4) of a state (x, y, vx, vy) over dt s."""
+    return np.asarray(NOISE * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2)))
+
+
+@dataclass
+class Moment:
+    """States and pose as they are; the odometry since the moment before, prior means of objects that are new, and range
+    and bearing of those seen.
+    """
+
+    time: float
+    dt: float
+    pose: gtsam.Pose2
+    odometry: gtsam.Pose2
+    states: States
+    born: States
+    seen: States
+
+
+@dataclass
+class Traffic:
+    """kinds: "car" or "pedestrian" by id; leaders: of cars by id; start: where the vehicle believes to be."""
+
+    start: gtsam.Pose2
+    kinds: dict[int, str] = field(default_factory=dict)
+    leaders: dict[int, int] = field(default_factory=dict)
+    moments: list[Moment] = field(default_factory=list)
+
+    def neighbours(self, node: int, present: Collection[int]) -> list[int]:
+        """Who acts on a node: a car's leader, all other pedestrians on a pedestrian."""
+        if self.kinds[node] == "car":
+            return [self.leaders[node]] if self.leaders.get(node) in present else []
+        return [other for other in sorted(present) if other != node and self.kinds[other] == "pedestrian"]
+
+    def law(self, node: int, near: Sequence[int]) -> NonlinearInteraction:
+        """The interaction function of a node with these neighbours; alone, everybody keeps going."""
+        if self.kinds[node] == "car" and near:
+            return _FOLLOWING
+        return _REPULSION
+
+
+def sample_traffic(
+    rng: np.random.Generator,
+    frames: int = 12,
+    cars: int = 4,
+    pedestrians: int = 3,
+    intervals: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
+) -> Traffic:
+    """A scene of so many frames, with intervals in between that are drawn from `intervals`, s."""
+    waiting: dict[int, tuple[FloatArray, int]] = {}
+    heading = rng.uniform(-0.3, 0.3)
+    scene = Traffic(gtsam.Pose2(0, 0, heading))
+    along, side = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    for k in range(cars):
+        place = (20 + 14 * (cars - k) + rng.normal()) * along + 3 * side
+        waiting[k] = np.concatenate([place, rng.uniform(7, 9) * along]), int(rng.integers(0, 4)) if k else 0
+        scene.kinds[k] = "car"
+        if k:
+            scene.leaders[k] = k - 1
+    for k in range(cars, cars + pedestrians):
+        place = 15 * along - 6 * side + rng.normal(0, 1.0, 2)
+        waiting[k] = np.concatenate([place, rng.normal(0, 0.6, 2)]), int(rng.integers(0, 4))
+        scene.kinds[k] = "pedestrian"
+    leaving = {node: int(rng.integers(frames // 2, 2 * frames)) for node in waiting}
+    time, pose = 0.0, scene.start.retract(np.linalg.cholesky(START) @ rng.normal(size=3))
+    states: States = {}
+    for k in range(frames):
+        dt = float(rng.choice(intervals)) if k else 0.0
+        time += dt
+        step = gtsam.Pose2(8 * dt, 0, 0.05 * dt)
+        if k:
+            pose = pose.compose(step).retract(np.linalg.cholesky(ODOMETRY) @ rng.normal(size=3))
+        states = {node: x for node, x in states.items() if leaving[node] > k}
+        moved = {}
+        for node, x in states.items():
+            near = scene.neighbours(node, states)
+            f = np.asarray(scene.law(node, near).predict(x, [states[other] for other in near], dt))
+            moved[node] = f + np.linalg.cholesky(process_noise(dt)) @ rng.normal(size=4)
+        born = {node: x for node, (x, first) in waiting.items() if first == k and leaving[node] > k}
+        states = moved | {node: x + np.linalg.cholesky(BORN) @ rng.normal(size=4) for node, x in born.items()}
+        seen = {}
+        for node, x in states.items():
+            if rng.random() < 0.8:
+                s = pose.transformTo(x[:2])
+                z = np.array([np.hypot(*s), np.arctan2(s[1], s[0])])
+                seen[node] = z + np.linalg.cholesky(SEEN) @ rng.normal(size=2)
+        scene.moments.append(Moment(time, dt, pose, step, states, born, seen))
+    return scene
+
+
+class Vehicle:
+    """The ego pose, by odometry."""
+
+    name = "odometry"
+
+    def __init__(self, scene: Traffic) -> None:
+        self.scene = scene
+
+    def factors(self, view: GraphView) -> Additions:
+        """A prior at first, odometry later."""
+        moment, key = self.scene.moments[view.epoch], view.key(EGO_POSE, 0)
+        if view.epoch == 0:
+            new = NewVariable(EGO_POSE, 0, self.scene.start, label="vehicle")
+            return Additions([new], [pose_prior_factor(key, self.scene.start.matrix(), START)])
+        before = view.before(EGO_POSE)[0].key
+        new = NewVariable(EGO_POSE, 0, view.state(before).compose(moment.odometry), label="vehicle")
+        return Additions([new], [between_factor(before, key, moment.odometry.matrix(), ODOMETRY)])
+
+
+class Objects:
+    """Births and interactions, those of one shape in one batch."""
+
+    name = "interactions"
+
+    def __init__(self, scene: Traffic) -> None:
+        self.scene = scene
+
+    def factors(self, view: GraphView) -> Additions:
+        """Of all objects that are there."""
+        moment, before = self.scene.moments[view.epoch], view.before(OBJECT)
+        new: list[NewVariable] = []
+        batches: dict[tuple[NonlinearInteraction, int], list[list[int]]] = {}
+        for node in moment.states:
+            label = self.scene.kinds[node]
+            if node in moment.born:
+                new.append(NewVariable(OBJECT, node, moment.born[node], label=label))
+                continue
+            near = self.scene.neighbours(node, before)
+            law, states = self.scene.law(node, near), [view.state(before[i].key) for i in (node, *near)]
+            new.append(NewVariable(OBJECT, node, law.predict(states[0], states[1:], moment.dt), label=label))
+            batches.setdefault((law, len(near)), []).append([node, *near])
+        born = list(moment.born)
+        factors: list[Any] = []
+        if born:
+            factors += prior_factors([view.key(OBJECT, i) for i in born], [moment.born[i] for i in born], BORN)
+        for (law, _), rows in batches.items():
+            earlier = np.array([[before[i].key for i in row] for row in rows], dtype=np.uint64)
+            now = [view.key(OBJECT, row[0]) for row in rows]
+            Q = process_noise(moment.dt)
+            factors.append(law.factors(now, earlier[:, 0], earlier[:, 1:], 4, moment.dt, Q))
+        return Additions(new, factors)
+
+
+class Detections:
+    """Range and bearing from the vehicle."""
+
+    name = "detections"
+
+    def __init__(self, scene: Traffic, robust: Robust | None = None) -> None:
+        self.scene, self.robust = scene, robust
+
+    def factors(self, view: GraphView) -> Additions:
+        """Of all objects that are seen."""
+        seen = self.scene.moments[view.epoch].seen
+        if not seen:
+            return Additions()
+        rows = np.array([[view.key(EGO_POSE, 0), view.key(OBJECT, node)] for node in seen], dtype=np.uint64)
+        z = np.stack(list(seen.values()))
+        return Additions(factors=[relative_range_bearing_factors(rows, z, SEEN, 4, robust=self.robust)])
+
+
+def providers(scene: Traffic, robust: Robust | None = None) -> list[FactorProvider]:
+    """The model that a scene was drawn from."""
+    return [Vehicle(scene), Objects(scene), Detections(scene, robust)]

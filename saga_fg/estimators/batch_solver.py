@@ -1,0 +1,158 @@
+"""The batch back end of the running graph: everything at once, nothing marginalised, by Levenberg-Marquardt.
+
+Providers are asked epoch by epoch, as by `saga_fg.estimators.IncrementalSmoother`, or a graph is handed over whole;
+it is solved when somebody asks for an estimate. Residual functions of one family are linearised together in NumPy
+(`factors.solve`); losses that ask for graduated non-convexity get it (`saga_fg.estimators.graduated`). A last step by
+QR brings back the digits that Cholesky leaves behind, unless cliques are wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from factors import FactorError, SolverSettings, linearised
+from saga_fg.errors import InputError
+from saga_fg.estimators.graduated import solve_graduated
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.graph.errors import GraphError
+from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.frame import Frame
+
+
+class BatchSolver:
+    """The graph of some providers, solved as a whole.
+
+    providers   asked once an epoch, in this order. What they see of the states is where these begin, or were at the
+                last solution; asking for a covariance solves what there is so far
+    graph       to begin with, by default an empty one; it is copied
+    settings    of Levenberg-Marquardt
+
+    Every method raises `GraphError`, for what the graph does not take, and then the solver is as it was before.
+    """
+
+    def __init__(
+        self,
+        providers: Sequence[FactorProvider] = (),
+        graph: SceneFactorGraph | None = None,
+        settings: SolverSettings | None = None,
+    ) -> None:
+        self.providers = tuple(providers)
+        self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
+        self._settings = settings or SolverSettings()
+        self._graph = SceneFactorGraph()
+        self._solution: GraphSolution | None = None
+        self._lent = False  # whether somebody may hold the graph
+        if graph is not None:
+            self.restore(graph)
+
+    @property
+    def time(self) -> float:
+        """Time of the newest epoch, s."""
+        return self._graph.time
+
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
+        """Begin the epoch at `time`, s, and ask the providers, by default those of the solver.
+
+        frame: what they are told of the epoch
+        """
+        asked = self.providers if providers is None else providers
+        unchanged, begun = (self._graph, self._solution, self._lent), predictors(asked)
+        self._asked(time, begun or asked, frame)
+        if begun:
+            try:
+                self._asked(None, asked, frame)
+            except GraphError:
+                self._graph, self._solution, self._lent = unchanged
+                self._graph.erase_unknown_values()
+                raise
+
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Ask some more providers at the present epoch."""
+        self._asked(None, providers)
+
+    def marginalise(self, keys: Iterable[int]) -> None:
+        """Integrate variables out, linearised at the solution; what they knew of others stays."""
+        graph = self.graph().copy()
+        graph.marginalise(keys)
+        self._changed(graph)
+
+    def solve(self) -> GraphSolution:
+        """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
+        if self._solution is None:
+            graph = self._graph.copy()
+            graph.erase_unknown_values()  # when a provider asks, others have added some already
+            self._solution = _solved(graph, self._settings)
+            self._graph = graph
+        return self._solution
+
+    solution = solve
+
+    def graph(self) -> SceneFactorGraph:
+        """The graph itself, solved: its variables, factors and values. To be read, not changed."""
+        self.solve()
+        self._lent = True
+        return self._graph
+
+    def state(self, key: int) -> object:
+        """Where a variable is: a vector, or a pose."""
+        return self.graph().state(key)
+
+    def covariance(self, key: int) -> FloatArray:
+        """Marginal covariance (d, d) of a variable; of a pose in its own frame, as GTSAM's."""
+        self._graph.variable(key)
+        return self.solve().marginal(key)
+
+    def joint_covariance(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of variables in the order given."""
+        for key in keys:
+            self._graph.variable(key)
+        return self.solve().covariance(keys)
+
+    def snapshot(self) -> SceneFactorGraph:
+        """The graph as a value, which can be pickled."""
+        return self._graph.copy()
+
+    def restore(self, graph: SceneFactorGraph) -> None:
+        """Continue from a graph, of whichever back end."""
+        if not isinstance(graph, SceneFactorGraph):
+            raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
+        self._changed(graph.copy())
+
+    def _asked(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:
+        known = self._graph
+        graph = known.copy(share_values=not self._lent)
+        view = GraphView(graph, self.covariance, self.origin, frame)
+        try:
+            if time is not None:
+                graph.advance(time)
+            for provider in providers:
+                ask(provider, graph, view)
+        except GraphError:
+            known.erase_unknown_values()
+            raise
+        self._changed(graph)
+
+    def _changed(self, graph: SceneFactorGraph) -> None:
+        self._graph, self._solution, self._lent = graph, None, False
+
+
+def _solved(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
+    """The minimum, to which the graph moves."""
+    native, ours = graph.solver_inputs()
+    try:
+        found = solve_graduated(native, ours, graph.values, settings)
+        rough = GraphSolution(
+            LinearisationPoint(graph.variables, found.values, found.values), found.linear, found.converged
+        )
+        graph.moved_to(found.values.retract(rough.step))
+        values = graph.values
+        return GraphSolution(
+            LinearisationPoint(dict(graph.variables), values, values), linearised(native, ours, values), found.converged
+        )
+    except FactorError as error:
+        raise graph.undetermined(error) from error

@@ -1,0 +1,226 @@
+"""`gtsam.ISAM2` as the engine of a running graph: any factors, one variable a node and epoch, fluid relinearisation.
+
+iSAM2 gets linear factors on increments from the base of every variable (`saga_fg.graph.linearisation_point`) and never
+linearises itself: no callback runs inside it, and a factor that raises does so before. When a variable has moved by
+more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
+anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
+2012). Robust losses are weighted anew with it (iteratively reweighted least squares). Where that does not
+settle, as after a poor start, Levenberg-Marquardt solves the whole graph, and iSAM2 begins anew from there.
+
+Epochs older than `lag` are marginalised: their factors go out, the prior that they leave on their neighbours comes in,
+and iSAM2 drops the variables that nothing speaks of. Between the two they need not be leaves of the Bayes tree, which
+GTSAM's `marginalizeLeaves` asks for, and the prior is a factor of the graph like any other.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Collection, Iterable, Sequence
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
+from saga_fg.estimators.joint_gaussian import joint_gaussian
+from saga_fg.estimators.layout import Layout
+from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.frame import Frame
+
+
+class IncrementalSmoother:
+    """The running graph of some providers, solved after every frame.
+
+    providers   asked once a frame, in this order
+    lag         s; epochs leave but for the last that is at least so old: 0 is a filter, None keeps everything. What has
+                one variable for all time stays until it is marginalised by hand
+    settings    of relinearisation
+
+    Every method raises `GraphError`, for what the graph does not take, and then the smoother is as it was before.
+    """
+
+    def __init__(
+        self,
+        providers: Sequence[FactorProvider] = (),
+        lag: float | None = 0.0,
+        settings: RelinearisationSettings | None = None,
+    ) -> None:
+        if lag is not None and not (math.isfinite(lag) and lag >= 0):
+            raise InputError(f"lag: expected a finite number of seconds >= 0, or None, got {lag!r}")
+        self.providers = tuple(providers)
+        self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
+        self.frame: Frame | None = None  # of the present epoch
+        self._lag, self._settings = lag, settings or RelinearisationSettings()
+        self._graph = SceneFactorGraph()
+        self._engine: Engine | None = None
+        self._times: list[float] = []
+
+    @property
+    def time(self) -> float:
+        """Time of the newest epoch, s."""
+        return self._graph.time
+
+    def graph(self) -> SceneFactorGraph:
+        """The running graph itself: its variables, factors and values. To be read, not changed."""
+        return self._graph
+
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
+        """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve.
+
+        frame: what they are told of the epoch
+        """
+        unchanged, times, asked = self._graph, self._times, self.providers if providers is None else providers
+        self.frame = frame
+        begun = predictors(asked)
+        try:
+            self.begin(time, begun or asked)
+            if begun:
+                self.extend(asked)
+            self.forget()
+        except GraphError:
+            self._graph, self._times, self._engine = unchanged, times, None
+            raise
+
+    def begin(
+        self,
+        time: float,
+        providers: Sequence[FactorProvider],
+        carried_over: Iterable[int] = (),
+        change: Callable[[SceneFactorGraph], None] | None = None,
+    ) -> None:
+        """The same, but keep all that is older than the lag.
+
+        carried_over: variables that are those of the new epoch, too; change: of the graph, after the first provider
+        """
+        graph = self._graph.copy()
+        graph.advance(time, carried_over)
+        self._asked(graph, providers, change)
+        self._times = [*self._times, graph.time]
+
+    def forget(self, kept: Collection[int] = ()) -> None:
+        """Marginalise what is older than the lag, but for the variables `kept`."""
+        if self._lag is None:
+            return
+        first = sum(t <= self.time - self._lag for t in self._times[1:])
+        self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
+        self._times = self._times[first:]
+
+    def steps(self, epochs: Iterable[tuple[float, Sequence[FactorProvider]]]) -> None:
+        """Begin several epochs, each at its time with its providers, and solve once; nothing is marginalised."""
+        graph = self._graph.copy()
+        for time, providers in epochs:
+            graph.advance(time)
+            self._ask(graph, [*predictors(providers), *providers])
+        self._move_to(graph)
+
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Ask some more providers at the present epoch, and solve again."""
+        self._asked(self._graph.copy(), providers)
+
+    def marginalise(self, keys: Iterable[int]) -> None:
+        """Integrate variables out; what they knew of others stays."""
+        graph = self._graph.copy()
+        graph.marginalise(keys)
+        self._graph = graph
+
+    def state(self, key: int) -> object:
+        """Where a variable is: a vector, or a pose."""
+        return self._graph.state(key)
+
+    def covariance(self, key: int) -> FloatArray:
+        """Marginal covariance (d, d) of a variable; of a pose in its own frame, as GTSAM's."""
+        self._graph.variable(key)
+        root = np.asarray(np.linalg.inv(self._ready().root(key)))
+        D = self._graph.point().transport(key)
+        root = root if D is None else D @ root
+        return root @ root.T
+
+    def joint_covariance(self, keys: Sequence[int], rough: bool = False) -> FloatArray:
+        """Joint covariance of variables in the order given; rough: to half the digits, from their part of the tree."""
+        for key in keys:
+            self._graph.variable(key)
+        P = self._ready().joint(keys) if rough else None
+        return self.solution().covariance(keys) if P is None else self._graph.point().transported(keys, P)
+
+    def solution(self) -> GraphSolution:
+        """The present solution as a value."""
+        engine, graph = self._ready(), self._graph
+        return GraphSolution(
+            LinearisationPoint(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged
+        )
+
+    def joint_gaussian(self, layout: Layout, keys: Sequence[int]) -> BlockGaussian:
+        """The joint Gaussian of variables by components, as `saga_fg.estimators.joint_gaussian` has it."""
+        engine = self._ready()
+        return joint_gaussian(self._graph, engine.linear(), layout, keys)
+
+    def handed_over(self) -> IncrementalSmoother:
+        """A smoother that goes on from here with the same iSAM2; this one builds another when it is asked again."""
+        twin = copy.copy(self)
+        twin._times, self._engine = list(self._times), None
+        return twin
+
+    def snapshot(self) -> SceneFactorGraph:
+        """The graph as a value, which can be pickled."""
+        return self._graph.copy()
+
+    def restore(self, graph: SceneFactorGraph) -> None:
+        """Continue from a snapshot; iSAM2 is built anew."""
+        if not isinstance(graph, SceneFactorGraph):
+            raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
+        self._graph, self._engine = graph.copy(), None
+        times = {one.time for one in graph.variables.values() if one.time is not None}
+        self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))
+
+    def _asked(
+        self,
+        graph: SceneFactorGraph,
+        providers: Sequence[FactorProvider],
+        change: Callable[[SceneFactorGraph], None] | None = None,
+    ) -> None:
+        self._ask(graph, providers, change)
+        self._move_to(graph)
+
+    def _ask(
+        self,
+        graph: SceneFactorGraph,
+        providers: Sequence[FactorProvider],
+        change: Callable[[SceneFactorGraph], None] | None = None,
+    ) -> None:
+        view = GraphView(graph, self.covariance, self.origin, self.frame)
+        for k, provider in enumerate(providers):
+            ask(provider, graph, view)
+            if k == 0 and change is not None:
+                change(graph)
+
+    def _move_to(self, graph: SceneFactorGraph) -> None:
+        self._engine = self._solved(graph)
+        self._graph = graph
+
+    def _ready(self) -> Engine:
+        """iSAM2 with the graph as it is."""
+        if self._engine is None:
+            graph = self._graph.copy()
+            self._engine = self._solved(graph)
+            self._graph = graph
+        return self._engine
+
+    def _solved(self, graph: SceneFactorGraph) -> Engine:
+        """iSAM2 with the graph, which moves to the solution."""
+        engine, self._engine = self._engine, None  # it is begun anew, should it fail
+        start = graph.values
+        if engine is None or engine.elimination != graph.elimination:
+            engine = Engine(graph.elimination)
+        try:
+            return engine.solved(graph, self._settings)
+        except UndeterminedError:
+            if graph.elimination == "qr":
+                raise
+        graph.moved_to(start)  # Cholesky has half the digits
+        return Engine("qr").solved(graph, self._settings)

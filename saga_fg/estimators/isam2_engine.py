@@ -1,0 +1,302 @@
+"""iSAM2 as the solver of a running graph: which of its factors are which rows of the graph's groups.
+
+`saga_fg.estimators.incremental_smoother` has the method. Factors on a variable are linearised anew when it has moved by
+
+    || R (delta - delta_0) ||  >  threshold,      R^T R = P^-1
+
+from delta_0, where its factors were linearised, in its own standard deviations (Mahalanobis distance in its marginal
+covariance P). Fluid relinearisation after Kaess et al., "iSAM2", IJRR 31 (2012), section 4.1, whose threshold is in the
+units of each variable. R is computed anew whenever a variable gets new factors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import gtsam
+import numpy as np
+
+from factors import SingularSystemError, SolverSettings, marginal_moments
+from factors.marginal import Elimination
+from factors.singular import singular_system
+from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import insert_state
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.settings import Positive, Range, Settings, setting
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RelinearisationSettings(Settings):
+    """When factors are linearised anew."""
+
+    threshold: Positive = setting(
+        0.001, "linearise factors anew when a variable has moved by this many of its standard deviations"
+    )
+    max_iterations: Annotated[int, Range(1, 1000)] = setting(
+        25, "linearisations in a frame, before Levenberg-Marquardt solves the whole graph"
+    )
+
+
+class Engine:
+    """iSAM2, and which of its factors are which rows of the graph's groups."""
+
+    def __init__(self, elimination: Elimination) -> None:
+        parameters = gtsam.ISAM2Params()
+        parameters.setFactorization(elimination.upper())
+        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        parameters.enableRelinearization = False
+        parameters.findUnusedFactorSlots = True
+        self.isam, self.elimination = gtsam.ISAM2(parameters), elimination
+        self.points = Displacements()
+        self.slots: dict[int, IntArray] = {}
+        self.converged = True
+        self.elimination_order: dict[int, tuple[bool, int]] = {}
+
+    def solved(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
+        """The engine with everything that has changed in the graph, which moves to the solution."""
+        start, self.converged = graph.values, True
+        try:
+            if not self._synchronised(graph):
+                return self
+            for _ in range(settings.max_iterations):
+                if not self._relinearised(graph, settings.threshold):
+                    return self
+            log.info("at %.3f s relinearisation has not settled in %d iterations", graph.time, settings.max_iterations)
+        except UndeterminedError:
+            raise
+        except GraphError as error:  # where it got to a factor may not be defined
+            log.info("at %.3f s: %s", graph.time, error)
+        graph.moved_to(start)
+        anew = Engine(graph.elimination)
+        anew.converged = graph.solve(SolverSettings(tolerance=settings.threshold / 10)).converged
+        if not anew.converged:
+            log.warning("at %.3f s the graph has not settled: its factors may contradict each other", graph.time)
+        anew._synchronised(graph)
+        return anew
+
+    def root(self, key: int, rough: bool = False) -> FloatArray:
+        """R (d, d) of a variable's marginal, P = R^-1 R^-T, on increments from the base; rough: to half the digits."""
+        conditional = None
+        if rough or self.elimination == "cholesky":
+            with contextlib.suppress(RuntimeError):
+                conditional = self.isam.marginalFactor(key)
+        if conditional is None:
+            conditional = self.isam.marginalFactor(key, gtsam.EliminateQR)
+        return np.array(conditional.R())  # R() is a view into the conditional
+
+    def joint(self, keys: Sequence[int]) -> FloatArray | None:
+        """Joint covariance of variables on increments from the base, to half the digits; None where these are lost."""
+        try:
+            return np.asarray(np.linalg.inv(self.isam.jointMarginalInformation(list(keys)).fullMatrix()))
+        except (RuntimeError, np.linalg.LinAlgError):
+            return None
+
+    def linear(self) -> gtsam.GaussianFactorGraph:
+        """All linear factors that it holds, the sharpest first."""
+        held, linear = self.isam.getFactorsUnsafe(), gtsam.GaussianFactorGraph()
+        for number in sorted(self.slots, key=self.elimination_order.__getitem__):
+            slots = self.slots[number]
+            for slot in slots[slots >= 0].tolist():
+                factor = held.at(slot)
+                assert isinstance(factor, gtsam.LinearContainerFactor)
+                linear.push_back(factor.factor())
+        return linear
+
+    def _synchronised(self, graph: SceneFactorGraph) -> bool:
+        """Tell iSAM2 what has changed in the graph, and move it to the solution; whether any factor is nonlinear."""
+        gone = [key for key in self.points.keys if key not in graph.variables]
+        new = {key: one.dim for key, one in graph.variables.items() if key not in self.points}
+        removed = self._remove_factors(graph)
+        rows: list[tuple[int, IntArray]] = []
+        linear: list[gtsam.JacobianFactor] = []
+        point, nonlinear = graph.point(), set[int]()
+        for number in sorted(graph.groups.keys() - self.slots.keys(), key=lambda n: graph.groups[n].elimination_order):
+            held = graph.groups[number]
+            rows.append((number, held.rows))
+            linear += graph.linear(number, point)
+            self.slots[number], self.elimination_order[number] = np.full(len(held.active), -1), held.elimination_order
+            if not held.factors.linear:
+                nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
+        if alone := graph.without_factors():
+            raise graph.undetermined(SingularSystemError("", tuple(alone)))
+        self.points.remove(gone)
+        self.points.add(new)
+        self._update(graph, linear, rows, removed, new)
+        self._update_sigmas(graph, nonlinear)
+        return any(not held.factors.linear for held in graph.groups.values())
+
+    def _update_sigmas(self, graph: SceneFactorGraph, keys: set[int]) -> None:
+        """Ask for the standard deviations of variables; where everything hangs together, of the newest ones at once.
+
+        The marginal of a single variable then costs as much as that of all.
+        """
+        if self.elimination == "qr":
+            for key in keys:
+                self.points.set_root(key, self.root(key, rough=True))
+            return
+        newest = [key for key in keys if graph.variable(key).epoch in (graph.epoch, None)]
+        if not newest:
+            return
+        P = self.joint(newest)
+        if P is None:
+            P = marginal_moments(self.linear(), newest, "qr")[1]
+        start = 0
+        for key in newest:
+            span = slice(start, start + graph.variable(key).dim)
+            self.points.set_root(key, np.linalg.cholesky(np.linalg.inv(P[span, span])).T)
+            start = span.stop
+
+    def _remove_factors(self, graph: SceneFactorGraph) -> list[int]:
+        """Forget which factors are no more; returns their indices."""
+        removed: list[int] = []
+        for number, slots in list(self.slots.items()):
+            held = graph.groups.get(number)
+            if held is None:
+                removed += slots[slots >= 0].tolist()
+                del self.slots[number], self.elimination_order[number]
+            elif (out := (slots >= 0) & ~held.active).any():
+                removed += slots[out].tolist()
+                self.slots[number] = np.where(out, -1, slots)
+        return removed
+
+    def _relinearised(self, graph: SceneFactorGraph, threshold: float) -> bool:
+        """Exchange the factors on variables that have moved; whether there were any."""
+        moved = set(self.points.moved(self.isam.getDelta(), threshold))
+        rows: list[tuple[int, IntArray]] = []
+        linear: list[gtsam.JacobianFactor] = []
+        removed: list[int] = []
+        point = graph.point()
+        for number in sorted({number for key in moved for number in graph.touching(key)}):
+            held = graph.groups[number]
+            if held.factors.linear:
+                continue
+            mine = np.array([r for r in held.rows.tolist() if not moved.isdisjoint(held.factors.rows[r])], dtype=int)
+            if len(mine):
+                rows.append((number, mine))
+                linear += graph.linearised(held, mine, point)
+                removed += self.slots[number][mine].tolist()
+        if rows:
+            self._update(graph, linear, rows, removed, {})
+        return bool(rows)
+
+    def _update(
+        self,
+        graph: SceneFactorGraph,
+        linear: Sequence[gtsam.JacobianFactor],
+        rows: Sequence[tuple[int, IntArray]],
+        removed: list[int],
+        new: Iterable[int],
+    ) -> None:
+        """One update of iSAM2: `linear` in, which are `rows` of groups, `removed` out; and the graph is moved."""
+        factors, values, base = gtsam.GaussianFactorGraph(), gtsam.Values(), graph.base
+        for factor in linear:
+            factors.push_back(factor)
+        for key in new:
+            insert_state(values, graph.variable(key), graph.variable(key).type.read(base, key))
+        parameters, last = gtsam.ISAM2UpdateParams(), gtsam.KeyGroupMap()
+        parameters.removeFactorIndices = removed
+        for key, one in graph.variables.items():
+            if (
+                one.epoch == graph.epoch or key in graph.carried_over
+            ):  # at the root, where the next frame's factors will touch the tree
+                last.insert2(key, 1)
+        parameters.constrainedKeys = last
+        try:
+            # without a linearisation point: increments are those that iSAM2 counts, from the base
+            told = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
+            result = self.isam.update(told, values, parameters)
+            estimate, length = self.isam.calculateEstimate(), self.isam.getDelta().norm()
+        except RuntimeError as error:
+            raise self._undetermined(graph, error) from error
+        if not np.isfinite(length):
+            raise self._undetermined(graph, None)
+        slots = list(result.getNewFactorsIndices())
+        start = 0
+        for number, mine in rows:
+            self.slots[number][mine] = slots[start : start + len(mine)]
+            start += len(mine)
+        graph.moved_to(estimate)
+
+    def _undetermined(self, graph: SceneFactorGraph, error: RuntimeError | None) -> GraphError:
+        point, linear = graph.point(), gtsam.GaussianFactorGraph()
+        for number in graph.groups:
+            for factor in graph.linear(number, point):
+                linear.push_back(factor)
+        return graph.undetermined(singular_system(linear, error))
+
+
+class Displacements:
+    """Variables with delta_0 (d,), where their factors were linearised, and R (d, d), in a table for each dimension."""
+
+    def __init__(self) -> None:
+        self._tables: dict[int, _Table] = {}
+        self._dims: dict[int, int] = {}
+
+    def add(self, dims: dict[int, int]) -> None:
+        """New variables at their base."""
+        for key, dim in dims.items():
+            self._dims[key] = dim
+            self._tables.setdefault(dim, _Table(dim)).add(key)
+
+    def remove(self, keys: Iterable[int]) -> None:
+        """Forget variables."""
+        for key in keys:
+            self._tables[self._dims.pop(key)].remove(key)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._dims
+
+    @property
+    def keys(self) -> Iterable[int]:
+        """All variables."""
+        return self._dims.keys()
+
+    def set_root(self, key: int, R: FloatArray) -> None:
+        """Set R of a variable."""
+        table = self._tables[self._dims[key]]
+        table.root[table.row[key]] = R
+
+    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
+        """The variables that are farther off than the threshold; from now on they count from here."""
+        return [key for table in self._tables.values() for key in table.moved(delta, threshold)]
+
+
+class _Table:
+    """Variables of one dimension in rows without gaps."""
+
+    def __init__(self, dim: int) -> None:
+        self.keys: list[int] = []
+        self.row: dict[int, int] = {}
+        self.at = np.zeros((16, dim))
+        self.root = np.zeros((16, dim, dim))
+
+    def add(self, key: int) -> None:
+        n = len(self.keys)
+        if n == len(self.at):
+            self.at, self.root = (np.concatenate([a, np.zeros_like(a)]) for a in (self.at, self.root))
+        self.row[key] = n
+        self.keys.append(key)
+        self.at[n], self.root[n] = 0.0, 0.0
+
+    def remove(self, key: int) -> None:
+        n, last = self.row.pop(key), self.keys.pop()
+        if last != key:
+            self.keys[n], self.row[last] = last, n
+            self.at[n], self.root[n] = self.at[len(self.keys)], self.root[len(self.keys)]
+
+    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
+        n = len(self.keys)
+        if n == 0:
+            return []
+        now = np.asarray(delta.vector(self.keys)).reshape(n, -1)
+        way = (self.root[:n] @ (now - self.at[:n])[:, :, None])[:, :, 0]
+        rows = np.flatnonzero(np.linalg.norm(way, axis=1) > threshold)
+        self.at[rows] = now[rows]
+        return [self.keys[row] for row in rows.tolist()]

@@ -1,0 +1,175 @@
+r"""Associate: match the measurements of a frame to the tracks, within the classes.
+
+    cost_ij      = d_ij^2 + log det S_ij - w GIoU_ij
+    unmatched_ij = a 2 log( p_D r_i / (1 - p_D r_i) ) + b 2 log( p_j / (1 - p_j) ) - 2 log( 2 pi lambda )
+    lambda       = sum over j of (1 - p_j) / clutter_area
+
+A pair is matched for less than what it costs to leave both alone: with w = 0 and a = b = 1 the difference of the two is
+-2 log of the ratio of likelihoods that the detection is the track's, or that the track was missed and the detection is
+false. r_i is the track's existence, p_D the sensor's detection probability, p_j the detection's probability; a and b
+below 1 reduce their influence. lambda is the number of false detections of the class per m^2 that the frame's own
+scores suggest, so that it fits any detector. A track of low existence can't take a strong detection from afar, least of
+all among many weak ones, and of two detections the more probable one is preferred.
+
+Candidates are the pairs of one class inside its gate. The assignment is the one of least total cost (`hungarian`), is
+made cheapest pair first (`greedy`), or registers the observed graph to the predicted graph (`graph`): the costs above
+are then joined by those of `saga_fg.numerics.pairwise_costs` between pairs of candidates, of all classes, whose tracks
+have correlated errors.
+
+Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
+Generalized Intersection over Union, CVPR 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from saga_fg.numerics.arrays import FloatArray, IntArray, distinct
+from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
+from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
+from saga_fg.numerics.quadratic_matching import QuadraticMatching
+from saga_fg.tracking.class_belief import ClassEvidence
+from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_settings, class_values
+from saga_fg.types.overlap import paired_giou_3d
+
+LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
+
+
+class Candidates(NamedTuple):
+    """K pairs that may be matched.
+
+    track, detection  (K,) rows
+    innovation, S     (K, 2), m, and its covariance (K, 2, 2)
+    d2                (K,) its squared distance
+    gain              (K,) cost of the pair less that of leaving both unmatched; negative if the match pays
+    """
+
+    track: IntArray
+    detection: IntArray
+    innovation: FloatArray
+    S: FloatArray
+    d2: FloatArray
+    gain: FloatArray
+
+    def select(self, rows: IntArray) -> Candidates:
+        return Candidates._make(column[rows] for column in self)
+
+
+def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
+    """Match the measurements to the tracks, predicted to the time of the frame."""
+    table, joint, association = state.table, state.joint, state.settings.association
+    if len(table) == 0 or len(measurements) == 0:
+        return Matching.empty()
+    sensor, delay, cross = measurements.sensor, measurements.delay, None
+    position, P = joint.positions_before(table.id, table.label, delay)
+    if association.method == "graph":
+        cross = joint.cross_covariances_before(table.id, table.label, delay)
+    if measurements.relative is not None:
+        P = joint.relative_covariances(table.id, table.label)
+    predicted = state.boxes(position, np.full_like(position, np.nan))
+    expected = table.existence * sensor.detection_chance(table.label)
+    area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
+    groups, likelihood = state.class_groups, measurements.class_likelihood
+    evidence = ClassEvidence(groups, table.class_belief, likelihood) if len(groups) else None
+    return match(predicted, P, expected, measurements, state.settings, area, cross, evidence)
+
+
+def match(
+    predicted: Boxes,
+    P: FloatArray,
+    expected: FloatArray,
+    measurements: FrameMeasurements,
+    settings: TrackerSettings,
+    clutter_area: float,
+    cross: CrossCovariances | None = None,
+    evidence: ClassEvidence | None = None,
+) -> Matching:
+    """The assignment of a frame.
+
+    predicted     boxes of the n tracks at the time of the frame, world
+    P             (n, 2, 2) covariance of their positions
+    expected      (n,) chance that the track is detected: its existence times the sensor's detection probability
+    clutter_area  of the module, m^2
+    cross         covariances between the positions of tracks, for the method `graph`
+    evidence      of classes, where detectors mistake some for each other
+    """
+    found = candidates(predicted, P, expected, measurements, settings, clutter_area, evidence)
+    if settings.association.method == "graph" and cross is not None:
+        pairs = pair_costs(found.track, found.detection, found.innovation, found.S, cross)
+        pairs = pairs._replace(cost=settings.association.pair_weight * pairs.cost)
+        chosen = QuadraticMatching(found.track, found.detection, found.gain, pairs).solve()
+    else:
+        choose = cheapest_first if settings.association.method == "greedy" else least_total
+        chosen = choose(found.track, found.detection, found.gain)
+    return Matching(found.track[chosen], found.detection[chosen], found.d2[chosen])
+
+
+def candidates(
+    predicted: Boxes,
+    P: FloatArray,
+    expected: FloatArray,
+    measurements: FrameMeasurements,
+    settings: TrackerSettings,
+    clutter_area: float,
+    evidence: ClassEvidence | None = None,
+) -> Candidates:
+    """The pairs of one class, or group, that are inside its gate; the arguments are those of `match`."""
+    (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
+    same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
+    if evidence is not None:
+        same = evidence.groups.same_group(np.array(classes), np.array(seen))
+    names = ("max_distance", "giou_weight")
+    reach, giou_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
+    gates = np.array([gate(class_settings(settings.classes, ClassSettings, c).gate) for c in classes])[of_track]
+    x, y = (measurements.boxes.position[:, k] - predicted.position[:, k, None] for k in (0, 1))
+    near = same[of_track[:, None], of_detection] & (x * x + y * y < (reach**2)[:, None])
+    t, d = near.nonzero()
+    innovation, S = np.stack([x[near], y[near]], axis=-1), P[t] + measurements.R[d, :2, :2]
+    d2, log_det = mahalanobis_of_pairs(innovation, S)
+    of_class = 0.0 if evidence is None else evidence.costs(t, d)
+    inside = (d2 + of_class < gates[t]).nonzero()[0]
+    found = Candidates(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
+    found = found._replace(gain=found.gain - _overlap(found, predicted, measurements.boxes, giou_weight))
+    unmatched = _unmatched(found, expected, measurements.probability, of_detection, settings.association, clutter_area)
+    return found._replace(gain=found.gain - unmatched)
+
+
+def _overlap(found: Candidates, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:
+    """(K,) gain by the overlap of the boxes; weight (n,) of each track's class."""
+    if not weight.any():
+        return np.zeros(len(found.track))
+    return weight[found.track] * paired_giou_3d(predicted.select(found.track), detected.select(found.detection))
+
+
+def _unmatched(
+    found: Candidates,
+    expected: FloatArray,
+    probability: FloatArray,
+    of_detection: IntArray,
+    settings: AssociationSettings,
+    clutter_area: float,
+) -> FloatArray:
+    """(K,) cost of leaving pairs unmatched; for an infinite area so large that as many as possible are matched.
+
+    found.gain (K,): costs of the pairs; of_detection (m,): the number of each detection's class
+    """
+    if clutter_area == math.inf:
+        dearest = found.gain.max(initial=0.0)
+        return np.full(len(found.gain), dearest + 1 + len(found.gain) * (dearest - found.gain.min(initial=dearest)))
+    false = np.maximum(np.bincount(of_detection, weights=1 - probability), LEAST_CLUTTER)
+    of_track = settings.existence_weight * _log_odds(expected)
+    by_score = settings.score_weight * _log_odds(probability)
+    by_density = np.log(2 * math.pi * false / clutter_area)[of_detection]
+    return np.asarray(2 * (of_track[found.track] + (by_score - by_density)[found.detection]))
+
+
+def _log_odds(probability: FloatArray) -> FloatArray:
+    p = np.clip(probability, 1e-6, 1 - 1e-6)
+    return np.log(p / (1 - p))

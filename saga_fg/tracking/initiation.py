@@ -1,0 +1,90 @@
+"""Initiate: new tracks from unmatched measurements; velocities that are not measured are by class and traffic."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Matching
+from saga_fg.tracking.box_filter import BoxFilter
+from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.stationarity import Stationarity, after_evidence, log_density
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.tracking.update import update_range_rates
+from saga_fg.types.boxes import Boxes
+
+
+def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
+    """Append new tracks; returns the rows of their measurements, whose delay the tracks are predicted by."""
+    free = np.ones(len(measurements), dtype=bool)
+    free[matching.detection] = False
+    initiation_score = state.class_values(measurements.boxes.label, "initiation_score")[0]
+    rows = np.flatnonzero(free & (measurements.probability >= initiation_score))
+    if len(rows) == 0:
+        return rows
+    k, delay, boxes, p = len(rows), measurements.delay, measurements.boxes.select(rows), measurements.probability[rows]
+    ids = np.arange(state.next_id, state.next_id + k, dtype=np.int64)
+    state.next_id += k
+    kinematics, stationary = initial_kinematics(state, measurements, rows)
+    relative = None if measurements.relative is None else measurements.relative.select(rows)
+    state.joint.add(ids, boxes.label, kinematics, delay, relative)
+    update_range_rates(state, measurements, rows, ids, boxes.label)
+    likelihood, time = measurements.class_likelihood[rows], state.time - delay
+    z_noise, yaw_noise = measurements.z_noise[rows], measurements.yaw_noise[rows]
+    new = TrackTable(
+        ids,
+        boxes.label,
+        existence=p.copy(),
+        score=p.copy(),
+        covariance_scale=measurements.covariance_scale[rows],
+        shared_error=measurements.shared_error[rows],
+        last_detected=np.full(k, time),
+        last_in_view=np.full(k, state.time),
+        confirmed=p >= state.settings.existence.confirm,
+        has_moved=np.zeros(k, dtype=bool),
+        opportunities=np.ones(k),
+        hits=np.ones(k),
+        accepted=np.full(k, measurements.sensor.initiation == "alone"),
+        ready=np.zeros(k, dtype=bool),
+        class_belief=state.class_groups.updated(0 * likelihood, likelihood),
+        box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
+        stationarity=Stationarity.initiated(kinematics, stationary),
+        sensors=state.table.sensors.initiated(measurements.name, p, time),
+    )
+    state.table = state.table.append(new)
+    return rows
+
+
+def initial_kinematics(
+    state: TrackerState, measurements: FrameMeasurements, rows: IntArray
+) -> tuple[Kinematics, FloatArray]:
+    """The kinematics of new tracks from the measurements `rows` (k,), if they move; and the probability (k,) that they
+    are stationary."""
+    boxes, measured = measurements.boxes.select(rows), measurements.with_velocity[rows]
+    R, prior = measurements.R[rows], state.settings.standing.prior
+    velocity, P_velocity, stationary = _unmeasured_velocity(state, boxes, prior)
+    if prior > 0:
+        z, R_v = np.nan_to_num(boxes.velocity), R[:, 2:, 2:]
+        evidence = log_density(z, R_v) - log_density(z - velocity, P_velocity + R_v)
+        stationary = np.where(measured, after_evidence(stationary, evidence), stationary)
+    kinematics = Kinematics(
+        boxes.position[:, :2] - state.origin,
+        np.where(measured[:, None], boxes.velocity, velocity),
+        R[:, :2, :2],
+        np.where(measured[:, None, None], R[:, 2:, 2:], P_velocity),
+    )
+    return kinematics, stationary
+
+
+def _unmeasured_velocity(state: TrackerState, boxes: Boxes, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Velocity (k, 2), its covariance (k, 2, 2) and the probability (k,) to be stationary, by class, heading and
+    traffic."""
+    speed, drift = state.class_values(boxes.label, "initial_speed_deviation", "initial_lateral_speed_deviation")
+    stationary, mean, variance = state.traffic.expected(boxes.label, boxes.position[:, :2], boxes.yaw, speed**2, prior)
+    known = np.isfinite(boxes.yaw)
+    ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))
+    along = np.where(known, variance - drift**2, 0.0)[:, None, None] * (ahead[:, :, None] * ahead[:, None])
+    P = along + (np.where(known, drift, speed) ** 2)[:, None, None] * np.eye(2)
+    return mean[:, None] * ahead, P, stationary

@@ -1,0 +1,63 @@
+r"""Report: the tracks that are believed and were detected recently, with a score and a calibrated covariance.
+
+    score       p ( hits / (opportunities + newness) )^w           when detected; while coasting times r and
+                                                                   coasting_score
+    P_reported  = ( c (1 + h (1 - p)) )^2 P + ( e (1 + g (1 - p)) )^2 u u^T
+
+A filter's noise is wider than its errors where it also has to let the right detections through the gate, which are not
+as Gaussian as it assumes: the factor c, of sensor and class, corrects this, and h its dependence on the probability p
+of the latest detection. A detector that sees one side of a car misjudges its length, and with it the position of its
+centre along the heading u, in one frame as in the next. No filter averages that away: the shared error e. Both are for
+the report; the filter and the association, which compare detections with detections, do without them. c, e and their
+growth are the sensor's noise settings, see `saga_fg.types.sensor`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.tracking.settings import ExistenceSettings
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.track import Tracks
+
+
+def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
+    """The tracks to be reported, as of `timestamp` (s)."""
+    table, settings = state.table, state.settings
+    coasting = table.coasting(state.time)
+    rows = np.flatnonzero(
+        (table.accepted | (settings.unconfirmed_share > 0))
+        & (table.confirmed | (table.existence >= settings.existence.report))
+        & (coasting <= settings.report_coasting)
+        & table.ready
+    )
+    table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
+    boxes = table.boxes(now.position + state.origin, now.velocity)
+    P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.shared_error)
+    certainty = state.class_groups.certainty(table.class_belief)
+    score = reported_score(table, certainty, coasting > 0, settings.existence)
+    score = np.where(table.accepted, score, settings.unconfirmed_share * score)
+    return Tracks(timestamp, table.id, boxes, score, P, now.P_velocity, coasting)
+
+
+def reported_score(
+    table: TrackTable, certainty: FloatArray, coasting: BoolArray, settings: ExistenceSettings
+) -> FloatArray:
+    """(n,) score of the tracks' boxes: of the latest detection, times the certainty (n,) of the class and the hit
+    ratio; less while coasting."""
+    hit_ratio = (table.hits / (table.opportunities + settings.newness)) ** settings.steadiness_weight
+    unseen = table.existence * settings.coasting_score
+    return np.asarray(table.score * certainty * hit_ratio * np.where(coasting, unseen, 1.0))
+
+
+def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, shared: FloatArray) -> FloatArray:
+    """Reported covariances (n, 2, 2), m^2, of positions.
+
+    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, shared (n,) error, m. Where the heading is unknown, half of
+    the shared variance goes to each axis.
+    """
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+    direction = np.where(np.isfinite(yaw)[:, None, None], ahead[:, :, None] * ahead[:, None], np.eye(2) / 2)
+    return np.asarray(scale[:, None, None] ** 2 * P + shared[:, None, None] ** 2 * direction)

@@ -1,0 +1,113 @@
+r"""Stationary or moving: a discrete state of every track beside its Gaussian one, and its use.
+
+    s <- b + (s - b) exp(-(depart + halt) dt),   b = halt / (depart + halt)     prediction over dt
+    s / (1 - s) <- s / (1 - s)  N(z; a, D + R) / N(z; H m, H P H^T + R)         update with a detection z
+
+s is the probability that the object is stationary. If it moves, its state is that of the joint filter, N(m, P). If it
+is stationary, it has a position of its own, N(a, D), which drifts slowly and of which all its detections are
+measurements; the position of an object that has just halted is that of the joint filter, and the two are merged by
+their moments. A measured velocity is a second piece of evidence, N(z_v; 0, R_v) against N(z_v; v, P_v + R_v), taken
+for independent of the first.
+
+The probability is used in two places. The joint filter's process noise over the next interval is the one expected
+under it, (1 - s + s * noise) Qc, frozen with the interval as the edges are. The reported velocity is the mixture,
+
+    v_reported = (1 - s) v     P_reported = (1 - s) P_v + s (1 - s) v v^T
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6: the
+interacting multiple model, here without mixing the stationary state into the moving one, so that the joint filter stays
+a Kalman filter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.assignment import mahalanobis_of_pairs
+from saga_fg.numerics.columns import Columns
+from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.settings import StandingSettings
+
+_MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
+
+
+@dataclass(eq=False)
+class Stationarity(Columns):
+    """Columns over n tracks: probability (n,) of being stationary; then, position (n, 2), local, m, and its covariance
+    P (n, 2, 2)."""
+
+    position: FloatArray
+    P: FloatArray
+    probability: FloatArray
+
+    @classmethod
+    def empty(cls) -> Stationarity:
+        return cls(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+
+    @classmethod
+    def initiated(cls, now: Kinematics, probability: FloatArray) -> Stationarity:
+        """Return the rows of new tracks."""
+        return cls(now.position.copy(), now.P.copy(), probability)
+
+    def predict(self, dt: float, moving: Kinematics, settings: StandingSettings) -> None:
+        """Predict by `dt` s; `moving` is the joint filter's state before."""
+        rate = settings.depart + settings.halt
+        balance, lost = settings.halt / max(rate, 1e-12), -math.expm1(-rate * dt)
+        stays, halts = self.probability * (1 - (1 - balance) * lost), (1 - self.probability) * balance * lost
+        self.probability = stays + halts
+        new = (halts / np.maximum(self.probability, 1e-12))[:, None]
+        apart = moving.position - self.position
+        self.position = self.position + new * apart
+        self.P = (
+            (1 - new)[..., None] * self.P
+            + new[..., None] * moving.P
+            + (new * (1 - new))[..., None] * apart[:, :, None] * apart[:, None]
+            + settings.drift**2 * dt * np.eye(2)
+        )
+
+    def update(
+        self, rows: IntArray, z: FloatArray, R: FloatArray, moving: Kinematics, with_velocity: BoolArray
+    ) -> None:
+        """Take in one detection each for the tracks `rows` (k,).
+
+        z (k, 4) position and velocity, R (k, 4, 4); `moving`: the joint filter's prediction of these tracks
+        """
+        if len(rows) == 0:
+            return
+        z_p, R_p, z_v, R_v = z[:, :2], R[:, :2, :2], np.where(with_velocity[:, None], z[:, 2:], 0.0), R[:, 2:, 2:]
+        evidence = log_density(z_p - self.position[rows], self.P[rows] + R_p)
+        evidence -= log_density(z_p - moving.position, moving.P + R_p)
+        by_velocity = log_density(z_v, R_v) - log_density(z_v - moving.velocity, moving.P_velocity + R_v)
+        evidence += np.where(with_velocity, by_velocity, 0.0)
+        S = self.P[rows] + R_p
+        gain = np.swapaxes(np.linalg.solve(S, self.P[rows]), 1, 2)
+        self.position[rows] += (gain @ (z_p - self.position[rows])[:, :, None])[:, :, 0]
+        self.P[rows] = self.P[rows] - gain @ self.P[rows]
+        self.probability[rows] = after_evidence(self.probability[rows], evidence)
+
+    def noise_scale(self, settings: StandingSettings) -> FloatArray:
+        """(n,) factor on the process noise, expected over both states."""
+        return np.asarray(1 - self.probability * (1 - settings.noise))
+
+    def reported(self, moving: Kinematics) -> Kinematics:
+        """The joint filter's state with the velocity that is reported."""
+        s, v = self.probability[:, None], moving.velocity
+        P = (1 - s)[..., None] * moving.P_velocity + (s * (1 - s))[..., None] * v[:, :, None] * v[:, None]
+        return moving._replace(velocity=(1 - s) * v, P_velocity=P)
+
+
+def after_evidence(probability: FloatArray, evidence: FloatArray) -> FloatArray:
+    """Probability (k,) after evidence (k,), the log of a ratio of likelihoods."""
+    before = np.clip(probability, 1e-9, 1 - 1e-9)
+    odds = np.clip(np.log(before / (1 - before)) + evidence, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
+    return np.asarray(1 / (1 + np.exp(-odds)))
+
+
+def log_density(innovation: FloatArray, S: FloatArray) -> FloatArray:
+    """(k,) log N(innovation; 0, S) in the plane, up to a constant."""
+    distance, log_det = mahalanobis_of_pairs(innovation, S)
+    return np.asarray(-0.5 * (distance + log_det))

@@ -1,0 +1,96 @@
+"""The table of tracks: one row a track, one column an attribute, all that is known of tracks besides the joint state.
+
+The joint state (`saga_fg.tracking.joint_state`) is kept by id, since tracks are correlated in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.tracking.box_filter import BoxFilter
+from saga_fg.tracking.sensor_evidence import SensorEvidence
+from saga_fg.tracking.stationarity import Stationarity
+from saga_fg.types.boxes import Boxes
+
+
+@dataclass(eq=False)
+class TrackTable(Columns):
+    """n tracks, in order of initiation. Times in s on the tracker's clock.
+
+    id                (n,)
+    label             (n,) class
+    existence         (n,) probability that the track is a real object
+    score             (n,) probability of its latest detection
+    covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
+    shared_error      (n,) error of the position that all detections of the track share, m
+    last_detected     (n,) time of its latest detection
+    last_in_view      (n,) time when it was last inside a sensor's field of view
+    confirmed         (n,) whether misses no longer delete it
+    has_moved         (n,) whether it was ever clearly in motion
+    opportunities     (n,) frames in which its best sensor could have detected it
+    hits              (n,) frames in which that sensor detected it
+    accepted          (n,) whether it was initiated by a sensor that is trusted alone, or confirmed since
+    ready             (n,) whether its velocity was ever known well enough to be reported
+    class_belief      (n, C) probabilities of the classes that detectors mistake for each other
+    box               size, height and heading
+    stationarity      probability and place of standing still
+    sensors           latest evidence of each sensor
+    """
+
+    id: IntArray
+    label: StrArray
+    existence: FloatArray
+    score: FloatArray
+    covariance_scale: FloatArray
+    shared_error: FloatArray
+    last_detected: FloatArray
+    last_in_view: FloatArray
+    confirmed: BoolArray
+    has_moved: BoolArray
+    opportunities: FloatArray
+    hits: FloatArray
+    accepted: BoolArray
+    ready: BoolArray
+    class_belief: FloatArray
+    box: BoxFilter
+    stationarity: Stationarity
+    sensors: SensorEvidence
+
+    @classmethod
+    def empty(cls, classes: int = 0) -> Self:
+        """A table without tracks; `classes`: C."""
+        number, truth = np.empty(0), np.empty(0, dtype=bool)
+        return cls(
+            np.empty(0, dtype=np.int64),
+            np.empty(0, dtype="<U1"),
+            *(number,) * 6,
+            *(truth,) * 2,
+            *(number,) * 2,
+            *(truth,) * 2,
+            np.empty((0, classes)),
+            BoxFilter.empty(),
+            Stationarity.empty(),
+            SensorEvidence.empty(),
+        )
+
+    def append(self, new: Self) -> Self:
+        """The table with the rows of new tracks at the end."""
+        return self.extended(new)
+
+    def snapshot(self) -> Self:
+        """A copy that shares no array with this table."""
+        return self.select(np.arange(len(self)))
+
+    def coasting(self, now: float) -> FloatArray:
+        """(n,) time since the latest detection, s, rounded to the microsecond."""
+        return np.maximum(np.round(now - self.last_detected, 6), 0.0)
+
+    def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
+        """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2)."""
+        centre = np.concatenate([position, self.box.z[:, None]], axis=1)
+        return Boxes(self.label, centre, self.box.size, self.box.yaw, velocity)

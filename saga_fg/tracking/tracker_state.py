@@ -1,0 +1,202 @@
+"""All that a tracker knows at one time: the tracks, the map, the vehicle, traffic and the clock.
+
+The steps of `saga_fg.tracking.tracker` change a state; a copy goes its own way, and a snapshot is a plain value.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from saga_fg.graph import FactorProvider
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.assignment import Assignment
+from saga_fg.tracking.class_belief import ClassGroups
+from saga_fg.tracking.clock import Clock, TimeVerdict
+from saga_fg.tracking.ego_node import EgoNode
+from saga_fg.tracking.joint_state import JointTrackState, new_estimator
+from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.map_nodes import MapNodes, motion_of
+from saga_fg.tracking.settings import ClassSettings, ClockSettings, TrackerSettings
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.traffic_flow import TrafficFlowPrior
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_values
+from saga_fg.types.frame import Frame
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerSnapshot:
+    """A tracker at one time.
+
+    table         one row a track
+    map_nodes     known lights, stop lines, lanes and walls
+    ego           the vehicle as a node
+    traffic       speeds of earlier traffic
+    graph         scene graph of the latest interval, None before the first
+    start         time from which all others in here are counted, s
+    time          of the state, s
+    origin        (2,) of local positions in the world, m
+    next_id       of the next new track
+    clock         timestamps accepted so far
+    time_verdict  on the timestamp of the latest frame
+    late_frames   number of frames left out because they came late
+    assignment    of the latest frame
+    joint         the estimator's state
+    """
+
+    table: TrackTable
+    map_nodes: MapNodes
+    ego: EgoNode
+    traffic: TrafficFlowPrior
+    graph: SceneGraph | None
+    start: float
+    time: float
+    origin: FloatArray
+    next_id: int
+    clock: Clock
+    time_verdict: TimeVerdict
+    late_frames: int
+    assignment: Assignment
+    joint: Any
+
+
+_VALUES = tuple(field.name for field in fields(TrackerSnapshot) if field.name != "joint")
+
+
+class TrackerState:
+    """The attributes of a `TrackerSnapshot`, and the joint state of the tracks as a running estimator."""
+
+    def __init__(
+        self, settings: TrackerSettings, rules: tuple[EdgeRule, ...], providers: tuple[FactorProvider, ...] = ()
+    ) -> None:
+        self.settings, self.rules, self.providers = settings, rules, providers
+        self.class_groups = ClassGroups(settings.class_groups)
+        self.graph: SceneGraph | None = None
+        self.start, self.time, self.origin = 0.0, 0.0, np.zeros(2)
+        self.next_id = 1
+        self.clock = Clock()
+        self.time_verdict: TimeVerdict = "accepted"
+        self.late_frames = 0
+        self.assignment = Assignment.empty()
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove all tracks, the map and the vehicle; ids go on."""
+        settings = self.settings
+        estimator = new_estimator(settings.estimator, settings.lag, self.providers, settings.nonlinear(self.rules))
+        self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
+        self.table = TrackTable.empty(len(self.class_groups))
+        self.map_nodes, self.ego = MapNodes(settings.signals), EgoNode.of(settings)
+        self.traffic = TrafficFlowPrior(settings.flow)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def relative(self, timestamp: float) -> float:
+        """Count a timestamp, s, from `start`, rounded to the microsecond: independent of when the scene begins."""
+        return round(timestamp - self.start, 6)
+
+    def class_values(self, label: StrArray, *names: str) -> FloatArray:
+        """(k, n) class settings of these k names for each label (n,)."""
+        return class_values(self.settings.classes, ClassSettings, label, *names)
+
+    def kinematics(self) -> Kinematics:
+        """The estimates of all tracks."""
+        return self.joint.kinematics(self.table.id, self.table.label)
+
+    def reported_kinematics(self) -> Kinematics:
+        """The estimates of all tracks, with velocities that allow for standing still."""
+        now = self.kinematics()
+        return self.table.stationarity.reported(now) if self.settings.standing.prior > 0 else now
+
+    def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
+        """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""
+        return self.table.boxes(position + self.origin, velocity)
+
+    @property
+    def world_T_ego(self) -> FloatArray | None:
+        """The vehicle's pose (4, 4) as estimated in the running graph; None where it is not."""
+        pose = self.joint.pose()
+        if pose is not None:
+            pose[:2, 3] += self.origin
+        return pose
+
+    def set_origin(self, frame: Frame) -> None:
+        """Choose the local origin of a scene: where the vehicle, else the first detection, is first.
+
+        World coordinates reach 4e6 m, at which too few digits are left for filtering.
+        """
+        place = np.zeros(2)
+        if frame.world_T_ego is not None:
+            place = frame.world_T_ego[:2, 3]
+        elif frame.ego is not None and frame.ego.gps is not None:
+            place = frame.ego.gps.position[:2]
+        elif len(frame) and frame.coordinates == "world":
+            place = frame.detections.boxes.position[0, :2]
+        self.origin = np.round(place)
+
+    def keep_time(self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float) -> bool:
+        """Judge the time of a frame, s; return whether it is to be used.
+
+        Where the clock was set back, all tracks are deleted; where it was set ahead, those that coast for too long.
+        """
+        before = self.clock.newest
+        verdict, self.clock = self.clock.judged(timestamp, sensor, settings, max_delay)
+        self.time_verdict = verdict
+        if verdict in ("late", "unconfirmed"):
+            self.late_frames += verdict == "late"
+            text = "frame of %s at %.3f s is left out: %s, %+.3f s from the newest one"
+            log.warning(text, sensor, timestamp, verdict, timestamp - before)
+            return False
+        if before == -math.inf or verdict == "set_back":
+            self.remove(np.ones(len(self), dtype=bool))
+            self.start = timestamp - self.time
+        elif verdict == "set_ahead":
+            coasting = self.table.coasting(self.relative(timestamp))
+            self.remove(coasting > self.class_values(self.table.label, "max_coasting")[0])
+        if verdict != "accepted":
+            log.warning("the clock was set from %.3f s to %.3f s by %s", before, timestamp, sensor)
+        return True
+
+    def remove(self, deleted: BoolArray) -> None:
+        """Marginalise tracks (n,)."""
+        if deleted.any():
+            self.joint.remove(self.table.id[deleted])
+            self.table = self.table.select(~deleted)
+
+    def copied(self) -> TrackerState:
+        """Return a state that changes independently of this one."""
+        twin = copy.copy(self)
+        twin.joint = self.joint.copied()
+        for name in _VALUES:
+            setattr(twin, name, _copied(getattr(self, name)))
+        return twin
+
+    def snapshot(self) -> TrackerSnapshot:
+        """The state as a value."""
+        values = {name: _copied(getattr(self, name)) for name in _VALUES}
+        return TrackerSnapshot(**values, joint=self.joint.snapshot())
+
+    def restore(self, snapshot: TrackerSnapshot) -> None:
+        """Continue from a snapshot, which stays as it is."""
+        self.joint.restore(snapshot.joint)
+        for name in _VALUES:
+            setattr(self, name, _copied(getattr(snapshot, name)))
+
+
+def _copied(value: T) -> T:
+    """Copy what is changed in place: the table, the map, the vehicle and traffic; all else is never changed."""
+    if isinstance(value, TrackTable):
+        return value.snapshot()
+    return copy.copy(value) if isinstance(value, MapNodes | EgoNode | TrafficFlowPrior) else value
