@@ -122,7 +122,7 @@ def _method(
         1000 * (np.full(len(table), np.nan) if coasting is None else coasting),
     ]
     rows = _whole(np.column_stack(columns))
-    starts = np.searchsorted(table.moment, np.arange(moments + 1)).tolist()
+    starts = np.searchsorted(table.frame, np.arange(moments + 1)).tolist()
     return {
         "ids": ids.tolist(),
         "moments": [rows[a:b] for a, b in pairwise(starts)],
@@ -148,7 +148,7 @@ def edges_of_moments(table: SceneBoxes, moments: int, rules: Sequence[EdgeRule])
     node_type = NodeType("track", ConstantVelocity())
     moved: set[str] = set()
     for k in range(moments):
-        rows = np.flatnonzero(table.moment == k)
+        rows = np.flatnonzero(table.frame == k)
         boxes = table.boxes.select(rows)
         velocity = np.nan_to_num(boxes.velocity)
         ids = table.id[rows]
