@@ -1,4 +1,4 @@
-"""Figures as people and programs read them: tables of texts, and JSON with null for what is not defined."""
+"""Figures for people and programs: tables of texts, and JSON with null for undefined numbers."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class FigureTable:
 
 
 def cell(value: float, digits: int = 3) -> str:
-    """A number as text: whole numbers as they are, others to so many digits, "-" for what is not defined."""
+    """A number as text: whole numbers as they are, others to so many digits, "-" if it is not finite."""
     if isinstance(value, int | np.integer):
         return str(int(value))
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def count(value: float) -> str:
-    """A number that counts something, "-" where it is not defined."""
+    """A count as text, "-" if it is not finite."""
     return cell(value, 0)
 
 
@@ -49,7 +49,7 @@ def percent(change: Interval, digits: int = 1) -> str:
 
 
 def as_json(value: Any) -> Any:
-    """Dataclasses, mappings, sequences, arrays and numbers as JSON has them: null for what is not finite."""
+    """Dataclasses, mappings, sequences, arrays and numbers as values of JSON: null for numbers that are not finite."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, np.ndarray | np.generic):

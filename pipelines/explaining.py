@@ -1,4 +1,4 @@
-"""Why tracks are what they are: journals written while tracking, read back and told track by track.
+"""Journals of tracking: written by the tracker, read back and explained track by track.
 
 A journal lies beside the result it belongs to, `RESULT.journal.jsonl`, an event (`saga_fg.tracking.journal`) a line.
 """
@@ -27,7 +27,7 @@ from saga_fg.tracking.journal import Event, Journal, of_scene
 
 
 def journal_of(result: Path) -> Path:
-    """Where the journal of a result lies."""
+    """Return the path of a result's journal."""
     return result.with_name(f"{result.name}.journal.jsonl")
 
 
@@ -35,7 +35,7 @@ def journal_of(result: Path) -> Path:
 def trackers(
     settings: TrackConfig, method: Method, scenes: Iterable[str], journal: Path | None
 ) -> Iterator[Callable[[], OnlineTracker]]:
-    """Makes a fresh tracker for one scene after the other; with a `journal`, one that keeps it.
+    """Yield a function that makes a fresh tracker for each scene in turn; with a `journal`, one that writes it.
 
     Raises `InputError` for a journal of method centerpoint, which keeps none, or one that is not writable.
     """
@@ -56,7 +56,7 @@ def trackers(
 
 
 def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
-    """The events of one track; `track` is its number, or SCENE-NUMBER as in nuScenes results.
+    """Read the events of one track; `track` is its number, or SCENE-NUMBER as in nuScenes results.
 
     Raises `InputError` for a journal that is not there or broken, a track that is not in it, or one that is in several
     scenes of which none is named.
@@ -90,7 +90,7 @@ def journal_innovations(journal: Path) -> dict[str, FloatArray]:
 
 
 def read_graphs(journal: Path) -> dict[str, list[Event]]:
-    """The graphs of all frames, in order of time, by scene. Raises `InputError` as `read_events`."""
+    """Read the graphs of all frames, in order of time, by scene. Raises `InputError` as `read_events`."""
     graphs: dict[str, list[Event]] = {}
     for event in read_events(journal):
         if event.get("event") == "graph":
@@ -101,10 +101,10 @@ def read_graphs(journal: Path) -> dict[str, list[Event]]:
 def graph_picture(
     by_scene: Mapping[str, Sequence[Event]], scene: str | None, time: float, track: str | None = None
 ) -> Any:
-    """A matplotlib `Figure` of the last graph of a scene up to `time`, s after the first one; around a track, if named.
+    """Return a matplotlib `Figure` of the last graph up to `time`, s after the first one; around a track, if named.
 
     Raises `InputError` for a scene without graphs, several of which none is named, a time before or after them all, a
-    track that is not in it, and what nobody wrote.
+    track that is not in it, and for events that are no graph.
     """
     if scene is None and len(by_scene) == 1:
         (scene,) = by_scene
@@ -132,7 +132,7 @@ def graph_picture(
 
 
 def read_events(journal: Path) -> Iterator[Event]:
-    """All events. Raises `InputError` for a journal that is not there or broken."""
+    """Read all events. Raises `InputError` for a journal that is not there or broken."""
     if not journal.exists():
         raise InputError(f"{journal}: there is no journal; track with --explain to have one beside the result")
     with open_bytes(journal) as file:
@@ -144,7 +144,7 @@ def read_events(journal: Path) -> Iterator[Event]:
 
 
 def story(events: Sequence[Event]) -> list[str]:
-    """A track's life in lines for people; times from its birth. Raises `InputError` for events that nobody wrote."""
+    """Return a track's history in lines of text; times from its first frame. Raises `InputError` for other events."""
     try:
         return _story(events)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
@@ -155,10 +155,10 @@ def _story(events: Sequence[Event]) -> list[str]:
     first, last = events[0], events[-1]
     end = "" if last["event"] == "deleted" else ", then the recording ends"
     head = f"track {first['track']} of {first['scene']}, {first['label']}: {last['time'] - first['time']:.1f} s{end}"
-    tell = {"initiated": _initiated, "matched": _matched, "missed": _missed, "deleted": _deleted}
+    describe = {"initiated": _initiated, "matched": _matched, "missed": _missed, "deleted": _deleted}
     lines = [head]
     for event in events:
-        text, *more = tell[event["event"]](event)
+        text, *more = describe[event["event"]](event)
         lines.append(f"{event['time'] - first['time']:8.2f} s  {event['sensor']:<8} {text}")
         lines += [f"{'':22}{line}" for line in more]
     return lines

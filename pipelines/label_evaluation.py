@@ -196,7 +196,7 @@ def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
     assert scene.ground_truth is not None
     truth = SceneBoxes.of_annotations(scene.ground_truth)
     visible = np.concatenate([np.empty(0, dtype=np.bool_), *(moment.visible for moment in scene.ground_truth)])
-    place = scene.world_T_ego[truth.moment][:, :2, 3]
+    place = scene.world_T_ego[truth.frame][:, :2, 3]
     distance = np.hypot(*(truth.boxes.position[:, :2] - place).T)
     return LabelledScene(truth, visible, truth.boxes.velocity, distance, systems)
 
@@ -204,13 +204,13 @@ def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
 def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
     """The same with moments from `first` on and ids that name the scene."""
     names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
-    return replace(table, moment=table.moment + first, id=names)
+    return replace(table, frame=table.frame + first, id=names)
 
 
 def _joined(tables: Sequence[SceneBoxes]) -> SceneBoxes:
     """The boxes of several scenes whose moments follow each other."""
     return SceneBoxes(
-        np.concatenate([t.moment for t in tables]),
+        np.concatenate([t.frame for t in tables]),
         np.concatenate([t.id for t in tables]),
         Boxes.concatenate([t.boxes for t in tables]),
         np.concatenate([t.score for t in tables]),
@@ -242,11 +242,11 @@ def _group_table(group: tuple[str, Mapping[str, CommonBoxes]]) -> FigureTable:
 
 
 def _errors(same: CommonBoxes) -> tuple[str, ...]:
-    position = {name: same.rmse(name, "position") for name in SYSTEMS}
-    heading = (cell(float(np.degrees(same.rmse(name, "heading"))), 1) for name in SYSTEMS)
+    position = {name: same.sample(name, "position").rmse for name in SYSTEMS}
+    heading = (cell(float(np.degrees(same.sample(name, "heading").rmse)), 1) for name in SYSTEMS)
     ratios = (position["labels"] / position[name] if len(same) else float("nan") for name in ("online", "detections"))
-    size = (cell(same.rmse(name, "size")) for name in SYSTEMS)
-    velocity = (cell(same.rmse(name, "velocity")) for name in ("online", "labels"))
+    size = (cell(same.sample(name, "size").rmse) for name in SYSTEMS)
+    velocity = (cell(same.sample(name, "velocity").rmse) for name in ("online", "labels"))
     return (*map(cell, position.values()), *map(cell, ratios), *heading, *size, *velocity)
 
 
@@ -256,17 +256,17 @@ def _calibration_table(same: CommonBoxes) -> FigureTable:
     for label in ("all", *np.unique(visible.label).tolist()):
         part = visible if label == "all" else visible.select(visible.label == label)
         for name in ("online", "labels"):
-            values = part.known(name, "nees")
-            held = (cell(share) for share in coverages(values).values())
+            values = part.sample(name, "nees").values
+            covered = (cell(share) for share in coverages(values).values())
             mean = cell(float(values.mean() / 2) if len(values) else float("nan"), 2)
-            rows.append((f"{label}, {name}", cell(len(values)), mean, *held))
+            rows.append((f"{label}, {name}", cell(len(values)), mean, *covered))
     columns = ("class", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
     return FigureTable("Calibration: share of position errors within the stated ellipses", columns, tuple(rows))
 
 
 def _consistency_table(consistency: Mapping[str, SelfConsistency]) -> FigureTable:
     columns = (
-        *("system", "objects", "boxes", "moments each", "jerkiness, m/s^2", "turned", "resized, m", "gaps"),
+        *("system", "objects", "boxes", "frames each", "jerkiness, m/s^2", "turned", "resized, m", "gaps"),
         "residual",
     )
     rows = tuple((name, *(cell(v) for v in asdict(value).values())) for name, value in consistency.items())
@@ -274,6 +274,8 @@ def _consistency_table(consistency: Mapping[str, SelfConsistency]) -> FigureTabl
 
 
 def _json_of(same: CommonBoxes) -> dict[str, Any]:
-    rmse = {name: {q: same.rmse(name, q) for q in ("position", "heading", "size", "velocity")} for name in SYSTEMS}
-    held = {name: coverages(same.known(name, "nees")) for name in ("online", "labels")}
-    return {"boxes": len(same), "rmse": rmse, "held": held}
+    rmse = {
+        name: {q: same.sample(name, q).rmse for q in ("position", "heading", "size", "velocity")} for name in SYSTEMS
+    }
+    coverage = {name: coverages(same.sample(name, "nees").values) for name in ("online", "labels")}
+    return {"boxes": len(same), "rmse": rmse, "coverage": coverage}

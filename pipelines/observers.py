@@ -19,11 +19,11 @@ class StageClock:
         self._mark = 0.0
 
     def start(self) -> None:
-        """A frame begins."""
+        """Begin a frame."""
         self._mark = time.thread_time()
 
     def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
-        """A stage is done."""
+        """Add the time of a stage that is done."""
         now = time.thread_time()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
         self._mark = now
@@ -36,7 +36,7 @@ class Innovations:
         self._parts: dict[str, list[FloatArray]] = {}
 
     def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
-        """Take note of the matches of a frame."""
+        """Record the matches of a frame."""
         if stage != "associate":
             return
         now = view()

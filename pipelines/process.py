@@ -1,6 +1,6 @@
 """This process: the threads of its linear algebra, and its memory.
 
-To matrices as small as a filter's, threads cost more than they bring.
+For matrices as small as a filter's, threads cost more than they bring.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def one_thread() -> Iterator[None]:
 def return_large_blocks() -> None:
     """Give memory of large blocks back to the system when they are freed.
 
-    Where the C library is glibc, which else keeps ever larger ones (mallopt(3), M_MMAP_THRESHOLD and M_TRIM_THRESHOLD).
+    Only with glibc as C library, which otherwise keeps ever larger ones (mallopt(3)).
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
@@ -39,9 +39,9 @@ def return_large_blocks() -> None:
 
 
 def resident_memory() -> float:
-    """Of this process, MB."""
+    """Return the resident memory of this process, MB."""
     status = Path("/proc/self/statm")
     if status.exists():
         return int(status.read_text().split()[1]) * resource.getpagesize() / 1e6
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # where there is no better: the most it ever was
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # elsewhere: the peak
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

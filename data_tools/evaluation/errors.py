@@ -41,9 +41,10 @@ def error_json(errors: LabelErrors) -> dict[str, Any]:
         "calibration": {
             name: {
                 **{
-                    field: getattr(c, field) for field in ("objects", "boxes", "anees", "median_nees", "held", "judged")
+                    field: getattr(c, field)
+                    for field in ("objects", "boxes", "anees", "median_nees", "coverage", "enough_data")
                 },
-                "honest": c.honest if c.judged else None,
+                "consistent": c.consistent if c.enough_data else None,
             }
             for name, c in fits.items()
         },
@@ -63,6 +64,6 @@ def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
 
 
 def _calibration_cells(c: Calibration) -> tuple[str, ...]:
-    verdict = ("honest" if c.honest else "off") if c.judged else "too few to judge"
-    shares = (cell(share) for share in c.held.values())
+    verdict = ("consistent" if c.consistent else "inconsistent") if c.enough_data else "too few boxes"
+    shares = (cell(share) for share in c.coverage.values())
     return (cell(c.objects), cell(c.boxes), cell(c.anees, 2), cell(c.median_nees, 2), *shares, verdict)

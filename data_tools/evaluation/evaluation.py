@@ -84,7 +84,7 @@ def evaluate_tracks(
     for scene, found in results:
         if scene.ground_truth is None:
             raise InputError(f"scene {scene.name}: expected ground truth")
-        for label, metrics in scene_metrics_by_label(scene.ground_truth, found.by_moment(len(scene))).items():
+        for label, metrics in scene_metrics_by_label(scene.ground_truth, found.by_frame(len(scene))).items():
             by_label.setdefault(label, []).append(metrics)
         visible = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
         errors.append(label_errors(visible, found, visible.boxes.velocity))

@@ -1,4 +1,4 @@
-"""How good are tracks? Metrics over ground truth and tracks in memory; they know no files."""
+"""Metrics of tracks against ground truth, both in memory; they read no files."""
 
 from data_tools.metrics.bootstrap import (
     Interval,

@@ -1,9 +1,8 @@
-"""Optimal one-to-one pairs at many score thresholds at once.
+"""Optimal one-to-one assignment at many score thresholds at once.
 
-At each threshold ("level") some of the candidate pairs are there; wanted is, within each group of them (a frame and
-class), the assignment with as many pairs as possible, and among those the least sum of costs. Most pairs have no
-rival, so they are chosen at once; only the rest goes through the Hungarian method, and what recurs at several levels
-is solved once.
+At each threshold ("level") some of the candidate pairs are present. Within each group of candidates (a frame and class)
+the assignment has as many pairs as possible, and among those assignments the least sum of costs. Most pairs have no
+competing pair and are chosen at once; the Hungarian method solves the rest, equal problems of several levels once.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """P pairs that may be chosen: `row` and `column` (P,), of cost `cost` (P,) >= 0, in `group` (P,).
+    """P candidate pairs: `row` and `column` (P,), `cost` (P,) >= 0, `group` (P,).
 
     Pairs of different groups share neither row nor column.
     """
@@ -33,13 +32,13 @@ class Candidates:
 
 
 def optimal_pairs(candidates: Candidates, present: BoolArray) -> BoolArray:
-    """(P, T): which of the candidates `present` (P, T) at each of T levels the assignment chooses."""
+    """(P, T): the candidates chosen at each of T levels, out of those `present` (P, T) there."""
     chosen = np.zeros_like(present)
     if not present.any():
         return chosen
     levels = present.shape[1]
     pair, level = np.nonzero(present)
-    alone = _unrivalled(candidates.row[pair], level, levels) & _unrivalled(candidates.column[pair], level, levels)
+    alone = _unique(candidates.row[pair], level, levels) & _unique(candidates.column[pair], level, levels)
     chosen[pair[alone], level[alone]] = True
     pair, level = pair[~alone], level[~alone]
     if len(pair) == 0:
@@ -58,17 +57,22 @@ def optimal_pairs(candidates: Candidates, present: BoolArray) -> BoolArray:
     return chosen
 
 
-def _unrivalled(row: IntArray, level: IntArray, levels: int) -> BoolArray:
-    """(Q,) whether no other entry has the same row at the same level."""
+def best_pairs(candidates: Candidates) -> BoolArray:
+    """(P,): the candidates that the assignment of all of them chooses."""
+    return optimal_pairs(candidates, np.ones((len(candidates), 1), dtype=np.bool_))[:, 0]
+
+
+def _unique(row: IntArray, level: IntArray, levels: int) -> BoolArray:
+    """(Q,) True for entries whose row occurs once at their level."""
     key = (row - row.min()) * levels + level
     return np.asarray(np.bincount(key)[key] == 1)
 
 
 def _hungarian(row: IntArray, column: IntArray, cost: FloatArray) -> BoolArray:
-    """Which of the pairs (row, column) the assignment chooses."""
+    """Mask of the pairs (row, column) that the assignment chooses."""
     rows, r = np.unique(row, return_inverse=True)
     columns, c = np.unique(column, return_inverse=True)
-    outside = 2.0 * min(len(rows), len(columns)) * (cost.max() + 1.0) + 1.0  # dearer than all pairs together
+    outside = 2.0 * min(len(rows), len(columns)) * (cost.max() + 1.0) + 1.0  # more than all pairs together
     matrix = np.full((len(rows), len(columns)), outside)
     matrix[r, c] = cost
     selected = np.zeros(matrix.shape, dtype=np.bool_)

@@ -1,8 +1,9 @@
-"""Paired bootstrap over scenes: how sure is a difference between two trackers run on the same scenes?
+"""Paired bootstrap over scenes: confidence intervals of differences between two trackers run on the same scenes.
 
-Scenes are drawn with replacement, the same draw for both trackers; each draw's sums are added up and the statistic is
-taken of the totals (a pooled RMSE, a pooled MOTA), not averaged over scenes. The interval is the percentile interval
-of the compared statistics. Scenes, not boxes, are the independent units: errors within a scene are correlated.
+Scenes are sampled with replacement, the same sample for both trackers; the sums of each sample are added up and the
+statistic is computed from the totals (a pooled RMSE, a pooled MOTA), not averaged over scenes. The interval is the
+percentile interval of the compared statistics. The independent units are scenes,
+not boxes: errors within a scene are correlated.
 
 Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 13.
 """
@@ -32,7 +33,7 @@ class Interval:
     confidence: float
 
     def excludes(self, value: float) -> bool:
-        """Whether `value` lies outside the interval."""
+        """True if `value` lies outside the interval."""
         return value < self.low or value > self.high
 
     def __str__(self) -> str:
@@ -51,7 +52,7 @@ def root_mean_square(sums: FloatArray) -> FloatArray:
 
 
 def relative_change(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a / b - 1: -0.25 says that a is 25 % lower than b."""
+    """a / b - 1: -0.25 if a is 25 % lower than b."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(a / b - 1.0)
 
@@ -76,7 +77,7 @@ def paired_bootstrap(
     a, b       (S, m) sums of each scene, for instance `ErrorSample.square_sums`
     statistic  maps totals (..., m) to values (...); must work on stacks of totals
 
-    Draws in which the statistic is undefined (all scenes drawn are empty) are left out; the interval is NaN if all are.
+    Samples in which the statistic is undefined (all their scenes are empty) are left out; NaN if there are no others.
     Raises `InputError` for arrays of different shapes, no scene, or a confidence outside (0, 1).
     """
     first = checked("a", a, (None, None))

@@ -1,4 +1,4 @@
-"""Are the covariances honest? The normalised estimation error squared (NEES) and the coverage of ellipses.
+"""Consistency of covariances: the normalised estimation error squared (NEES) and the coverage of ellipses.
 
     nees = (x_hat - x)^T P^-1 (x_hat - x)        chi-squared with dim(x) degrees of freedom if P is right
 
@@ -19,9 +19,9 @@ from saga_fg.numerics.chi_square import chi_square_quantile
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """NEES (N,) of errors (N, d) under covariances (N, d, d); NaN where one has NaN or is not positive definite."""
-    known = np.isfinite(covariance).all(axis=(1, 2), keepdims=True)
-    eigenvalues = np.linalg.eigvalsh(np.where(known, covariance, 0.0))
+    """NEES (N,) of errors (N, d) under covariances (N, d, d); NaN for covariances unknown or not positive definite."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    eigenvalues = np.linalg.eigvalsh(np.where(known[:, None, None], covariance, 0.0))
     proper = eigenvalues[:, 0] > 1e-12 * np.maximum(eigenvalues[:, -1], np.finfo(np.float64).tiny)
     result = np.full(len(error), np.nan)
     solved = np.linalg.solve(covariance[proper], error[proper][..., None])[..., 0]
@@ -30,14 +30,14 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def coverage(nees_values: FloatArray, probability: float, dimension: int = 2) -> float:
-    """Share of errors inside the ellipse that should hold `probability` of them; NaN without values."""
+    """Share of errors inside the ellipse of a `probability`; NaN without values."""
     if len(nees_values) == 0:
         return float("nan")
     return float(np.mean(nees_values <= chi_square_quantile(probability, dimension)))
 
 
 def nees_band(count: int, dimension: int = 2, probability: float = 0.999) -> tuple[float, float]:
-    """Two-sided band that holds the mean NEES of `count` independent consistent estimates with `probability`."""
+    """Two-sided interval that contains the mean NEES of `count` independent consistent estimates with `probability`."""
     tail = (1 - probability) / 2
     degrees = dimension * count
     return chi_square_quantile(tail, degrees) / count, chi_square_quantile(1 - tail, degrees) / count

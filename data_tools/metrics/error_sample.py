@@ -1,4 +1,4 @@
-"""A sample of errors that can be pooled over scenes: kept as values, so that medians pool as exactly as sums do."""
+"""Errors pooled over scenes as values, from which medians follow as exactly as means."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from saga_fg.numerics.arrays import FloatArray, checked
 
 @dataclass(frozen=True, eq=False)
 class ErrorSample:
-    """Errors `values` (N,), all >= 0, in one unit. Every statistic of an empty sample is NaN."""
+    """Errors `values` (N,) in one unit. Every statistic of an empty sample is NaN."""
 
     values: FloatArray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", checked("values", self.values, (None,)))
+
+    @classmethod
+    def known(cls, values: FloatArray) -> Self:
+        """The values that are finite."""
+        return cls(values[np.isfinite(values)])
 
     @classmethod
     def pool(cls, samples: Iterable[ErrorSample]) -> Self:
@@ -43,5 +48,5 @@ class ErrorSample:
 
     @property
     def square_sums(self) -> tuple[float, float]:
-        """(sum of squares, number of values): what a bootstrap of the RMSE resamples."""
+        """(sum of squares, number of values), the sums for a bootstrap of the RMSE."""
         return float(np.sum(self.values**2)), float(len(self))

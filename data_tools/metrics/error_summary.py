@@ -1,7 +1,7 @@
-"""The errors at labels summed up: root mean squares, and how honest the covariances are.
+"""Summary of the errors at labels: root mean squares, and the consistency of the covariances.
 
-A class is *judged* by its calibration if it has enough objects and boxes for that; the shares of errors within the
-tracks' ellipses then say something (`data_tools.metrics.consistency`).
+The shares of errors within the tracks' ellipses (`data_tools.metrics.consistency`) are meaningful for classes with
+enough objects and boxes.
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class Calibration:
-    """How well one class's covariances fit its errors.
+    """Consistency of the covariances of one class.
 
     objects, boxes  that have a track with a covariance
     anees           mean NEES over its 2 degrees of freedom: 1 if the covariances are right
     median_nees     over that of the chi-square distribution
-    held            share of the errors within the ellipse, by its probability
+    coverage        share of the errors within the ellipse, by its probability
     """
 
     objects: int
     boxes: int
     anees: float
     median_nees: float
-    held: Mapping[float, float]
+    coverage: Mapping[float, float]
 
     @property
-    def judged(self) -> bool:
-        """Whether there are enough objects and boxes to judge."""
+    def enough_data(self) -> bool:
+        """True with enough objects and boxes for a conclusion."""
         return self.objects >= FEWEST_OBJECTS and self.boxes >= FEWEST_BOXES
 
     @property
-    def honest(self) -> bool:
-        """Whether each share is within its band."""
-        return all(low <= self.held[p] <= high for p, (low, high) in BANDS.items())
+    def consistent(self) -> bool:
+        """True if each share is within its band."""
+        return all(low <= self.coverage[p] <= high for p, (low, high) in BANDS.items())
 
 
 def error_summary(errors: LabelErrors) -> ErrorSummary:
-    """Sum up errors."""
+    """Summarise errors."""
     heading = errors.sample("heading").values
     moving = errors.moving
     return ErrorSummary(
@@ -93,11 +93,11 @@ def calibration(errors: LabelErrors) -> Calibration:
         boxes=len(values),
         anees=float(values.mean() / 2) if len(values) else float("nan"),
         median_nees=float(np.median(values) / (2 * np.log(2))) if len(values) else float("nan"),
-        held=coverages(values, tuple(BANDS)),
+        coverage=coverages(values, tuple(BANDS)),
     )
 
 
 def errors_by_class(errors: LabelErrors) -> dict[str, LabelErrors]:
-    """The errors of each class that has labels, those of all of them first."""
+    """The errors of each class with labels, preceded by those of all classes."""
     labels = np.unique(errors.label).tolist()
     return {OVERALL: errors, **{label: errors.select(errors.label == label) for label in labels}}

@@ -2,7 +2,7 @@
 
     HOTA(a) = sqrt(DetA(a) AssA(a))   a: similarity from which a pair counts; HOTA: mean over a = 0.05, 0.10, ..., 0.95
     DetA    = TP / (TP + FN + FP)
-    AssA    = mean over the pairs of TPA / (TPA + FNA + FPA), how well the two tracks of a pair agree over time
+    AssA    = mean over the pairs of TPA / (TPA + FNA + FPA), the agreement over time of the two tracks of a pair
     LocA    = mean similarity of the pairs
     IDF1    = 2 IDTP / (2 IDTP + IDFN + IDFP), pairs under the best one-to-one mapping of whole tracks
 
@@ -57,14 +57,14 @@ class HotaMetrics:
 
 @dataclass(frozen=True, eq=False)
 class SceneSimilarities:
-    """One scene as the metrics see it: at each moment the names of true and found objects, and (n, m) similarities."""
+    """Input of the metrics for one scene: names of true and found objects in each frame, and (n, m) similarities."""
 
     true: Sequence[IntArray | StrArray]
     found: Sequence[IntArray | StrArray]
     similarities: Sequence[FloatArray]
 
     def sequence(self) -> dict[str, Any]:
-        """As `trackeval` wants it: names are numbers from 0."""
+        """The input of `trackeval`, with names as numbers from 0."""
         true, found = _numbered(self.true), _numbered(self.found)
         return {
             "num_timesteps": len(true),
@@ -137,7 +137,7 @@ def _trackeval_metrics() -> Any:
 
 
 def _numbered(names: Sequence[IntArray | StrArray]) -> list[IntArray]:
-    """The names at each moment as numbers from 0 without gaps."""
+    """The names in each frame as numbers from 0 without gaps."""
     if not names:
         return []
     numbers = np.unique(np.concatenate(list(names)), return_inverse=True)[1].reshape(-1)
@@ -147,9 +147,9 @@ def _numbered(names: Sequence[IntArray | StrArray]) -> list[IntArray]:
 def _similarities(
     truth: SceneBoxes, found: SceneBoxes, label: str, similarity: Similarity, reach: float
 ) -> SceneSimilarities:
-    """The objects of a class in one scene."""
-    moments = 1 + int(max(truth.moment.max(initial=-1), found.moment.max(initial=-1)))
-    true_rows, found_rows = (_rows_of_class(table, label, moments) for table in (truth, found))
+    """Names and similarities of the objects of a class in one scene."""
+    frames = 1 + int(max(truth.frame.max(initial=-1), found.frame.max(initial=-1)))
+    true_rows, found_rows = (_rows_of_class(table, label, frames) for table in (truth, found))
     return SceneSimilarities(
         [truth.id[rows] for rows in true_rows],
         [found.id[rows] for rows in found_rows],
@@ -160,10 +160,10 @@ def _similarities(
     )
 
 
-def _rows_of_class(table: SceneBoxes, label: str, moments: int) -> list[IntArray]:
-    """Rows of a class at each moment."""
+def _rows_of_class(table: SceneBoxes, label: str, frames: int) -> list[IntArray]:
+    """Rows of a class in each frame."""
     rows = np.flatnonzero(table.boxes.label == label)
-    return np.split(rows, np.searchsorted(table.moment[rows], np.arange(1, moments)))[:moments]
+    return np.split(rows, np.searchsorted(table.frame[rows], np.arange(1, frames)))[:frames]
 
 
 def box_similarities(truth: Boxes, found: Boxes, similarity: Similarity, reach: float = 4.0) -> FloatArray:

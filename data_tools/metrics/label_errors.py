@@ -1,10 +1,10 @@
-"""What a tracker says of labelled objects beside what the labels say: position, velocity, heading, covariance.
+"""Errors of tracks at labelled objects: position, velocity, heading, and consistency of the covariance.
 
-Labels and tracks are paired moment by moment (`nearest_pairs`). Where the detections are known, position, velocity and
-heading are judged on the labels that a detection matches, so that every tracker on the same detections is judged on the
-same labels, and its positions can be compared with those it was given. Covariances are judged on all pairs.
+Labels and tracks are paired frame by frame (`nearest_pairs`). If the detections are given, errors of position, velocity
+and heading are those at labels that a detection matches: every tracker with the same detections is then evaluated on
+the same labels, and its position errors compare with those of the detections. Covariances are evaluated on all pairs.
 
-The velocity of a label is the difference of its positions `reach` moments before and after,
+The velocity of a label is the difference of its positions `reach` frames before and after,
 
     v_k = (p_{k+r} - p_{k-r}) / (t_{k+r} - t_{k-r})
 
@@ -39,7 +39,7 @@ class LabelErrors(Columns):
     label      class
     object     number of the object, from 0
     speed      of the label, m/s
-    matched    whether a detection matches it (all, where the detections are not known)
+    matched    True where a detection matches it; True for all if no detections are given
     detection  error of that detection's position, m
     position, velocity, heading  errors of the track, m, m/s, rad in [0, pi]
     nees       normalised squared error of the track's position, 2 degrees of freedom
@@ -57,7 +57,7 @@ class LabelErrors(Columns):
 
     @classmethod
     def pool(cls, scenes: Iterable[Self]) -> Self:
-        """The labels of all scenes; objects of different scenes are different ones."""
+        """The labels of all scenes; objects of different scenes get different numbers."""
         parts, first = [], 0
         for scene in scenes:
             parts.append(replace(scene, object=scene.object + first))
@@ -66,19 +66,18 @@ class LabelErrors(Columns):
 
     @property
     def tracked(self) -> BoolArray:
-        """(N,) which labels have a track."""
+        """(N,) True for labels with a track."""
         return np.isfinite(self.position)
 
     @property
     def moving(self) -> BoolArray:
-        """(N,) which labels move; not those of unknown speed."""
+        """(N,) True for moving labels, False for unknown speed."""
         return np.asarray(self.speed >= MOVING)
 
     def sample(self, name: str, rows: BoolArray | None = None) -> ErrorSample:
-        """The known errors `name` of the matched labels that have a track, of those `rows` (N,) alone if given."""
-        values: FloatArray = getattr(self, name)
-        chosen = self.matched & self.tracked & np.isfinite(values)
-        return ErrorSample(values[chosen if rows is None else chosen & rows])
+        """The known errors `name` of matched labels with a track, limited to the mask `rows` (N,) if given."""
+        chosen = self.matched & self.tracked
+        return ErrorSample.known(getattr(self, name)[chosen if rows is None else chosen & rows])
 
 
 def label_errors(
@@ -90,23 +89,20 @@ def label_errors(
 ) -> LabelErrors:
     """The errors of `found` at the labels `truth` (N) of one scene, whose velocities (N, 2) are given.
 
-    detections  (moment (M,), boxes (M)): what the tracks were made of
+    detections  (frame (M,), boxes (M)): the input of the tracker
     gate        largest distance of a label and its track or detection, m
     """
     n = len(truth)
     columns: dict[str, Any] = {
         name: np.full(n, np.nan) for name in ("detection", "position", "velocity", "heading", "nees")
     }
-    placed = truth.moment, truth.boxes
-    row, column, distance = nearest_pairs(placed, (found.moment, found.boxes), gate)
+    placed = truth.frame, truth.boxes
+    row, column, distance = nearest_pairs(placed, (found.frame, found.boxes), gate)
     a, b = truth.boxes.select(row), found.boxes.select(column)
     columns["position"][row] = distance
     columns["velocity"][row] = np.linalg.norm(b.velocity - velocity[row], axis=1)
     columns["heading"][row] = np.abs(wrap_angle(b.yaw - a.yaw))
-    covariance = found.position_covariance[column]
-    known = np.isfinite(covariance).all(axis=(1, 2))
-    offset = (b.position - a.position)[known, :2]
-    columns["nees"][row[known]] = nees(offset, covariance[known])
+    columns["nees"][row] = nees((b.position - a.position)[:, :2], found.position_covariance[column])
     matched = np.ones(n, dtype=np.bool_)
     if detections is not None:
         row, _, distance = nearest_pairs(placed, detections, gate)
@@ -117,24 +113,24 @@ def label_errors(
 
 
 def label_velocities(truth: SceneBoxes, timestamps: FloatArray, reach: int) -> FloatArray:
-    """Velocities (N, 2), m/s, of labels over `reach` moments to either side; NaN where these have no label.
+    """Velocities (N, 2), m/s, of labels over `reach` frames to either side; NaN where these have no label.
 
-    timestamps  (K,) of the moments, s
+    timestamps  (K,) of the frames, s
     """
     _, number = np.unique(truth.id, return_inverse=True)
     stride = len(timestamps) + 2 * reach
-    key = number * stride + truth.moment + reach
+    key = number * stride + truth.frame + reach
     order = np.argsort(key)
     before, after = (_rows_of(key[order], key + step) for step in (-reach, reach))
     known = (before >= 0) & (after >= 0)
     first, last = order[before[known]], order[after[known]]
     velocity = np.full((len(truth), 2), np.nan)
-    elapsed = timestamps[truth.moment[last]] - timestamps[truth.moment[first]]
+    elapsed = timestamps[truth.frame[last]] - timestamps[truth.frame[first]]
     velocity[known] = (truth.boxes.position[last, :2] - truth.boxes.position[first, :2]) / elapsed[:, None]
     return velocity
 
 
 def _rows_of(keys: IntArray, wanted: IntArray) -> IntArray:
-    """Where each wanted key is among the sorted keys, -1 for nowhere."""
+    """Row of each wanted key among the sorted keys, -1 if missing."""
     at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
     return np.where(keys[at] == wanted, at, -1) if len(keys) else np.empty(0, dtype=np.int64)

@@ -1,10 +1,10 @@
 """One-to-one correspondences between true objects and tracks over a scene, as the CLEAR MOT metrics define them.
 
-At every moment, in this order:
+In every frame, in this order:
 
-1. an object keeps the track it was matched to last, as long as that track is within the gate (so that a tracker is
-   not charged with identity switches where two objects merely come close);
-2. the rest is assigned by the Hungarian method: as many pairs within the gate as possible, and among those the
+1. an object keeps the track it was matched to last while that track is within the gate, so that objects which come
+   close to each other cause no identity switches;
+2. the others are assigned by the Hungarian method: as many pairs within the gate as possible, and among those the
    assignment with the least sum of distances.
 
 Distances are between centres in the horizontal plane; with `same_label` only equal classes can match.
@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from data_tools.metrics.assignment import Candidates, best_pairs
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.types.boxes import Boxes
@@ -43,12 +43,12 @@ class FoundBoxes(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """The M pairs of one moment.
+    """The M pairs of one frame.
 
     object_row  (M,) rows of the annotations
     track_row   (M,) rows of the tracks
     distance    (M,) m, horizontal
-    switched    (M,) whether the object was last matched to another track: an identity switch
+    switched    (M,) identity switches: the object was last matched to another track
     """
 
     object_row: IntArray
@@ -60,13 +60,13 @@ class Matching:
 def match_scene(
     ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], gate: float = 2.0, same_label: bool = True
 ) -> list[Matching]:
-    """The matching at each of the K moments of a scene; pairs further apart than `gate` (m) never match.
+    """The matching at each of the K frames of a scene; pairs further apart than `gate` (m) never match.
 
     Raises `InputError` when the two sequences differ in length.
     """
     if len(ground_truth) != len(tracks):
         raise InputError(
-            f"tracks: expected one entry per moment of the ground truth ({len(ground_truth)}), got {len(tracks)}"
+            f"tracks: expected one entry per frame of the ground truth ({len(ground_truth)}), got {len(tracks)}"
         )
     numbers = {
         name: n for n, name in enumerate(np.unique([name for truth in ground_truth for name in truth.id.tolist()]))
@@ -97,24 +97,19 @@ def _distances(truth: Annotations, found: FoundBoxes, same_label: bool) -> Float
 
 
 def _assign(distance: FloatArray, previous: BoolArray) -> tuple[IntArray, IntArray]:
-    """Rows and columns of the pairs: previous ones within the gate (finite) first, then the Hungarian method.
+    """Rows and columns of the pairs: previous pairs within the gate (finite) first, then the optimal assignment.
 
-    Track ids are unique, but two objects may remember the same track (one lost it to the other): the nearer keeps it.
+    Two objects may have been matched last to the same track; the nearer one keeps it.
     """
     kept = np.where(previous, distance, np.inf)
     kept[kept > kept.min(axis=0, initial=np.inf)] = np.inf
     kept_rows, kept_columns = np.nonzero(np.isfinite(kept))
     kept_columns, first = np.unique(kept_columns, return_index=True)
     kept_rows = kept_rows[first]
-    rows = np.setdiff1d(np.arange(distance.shape[0]), kept_rows)
-    columns = np.setdiff1d(np.arange(distance.shape[1]), kept_columns)
-    rest = distance[np.ix_(rows, columns)]
-    within = np.isfinite(rest)
-    # One pair more is worth more than any saving in distance, so the pairs outside cost more than all within together.
-    outside = 1.0 + 2.0 * rest[within].sum()
-    chosen = np.stack(linear_sum_assignment(np.where(within, rest, outside)))
-    chosen = chosen[:, within[chosen[0], chosen[1]]]
-    all_rows = np.concatenate([kept_rows, rows[chosen[0]]])
-    all_columns = np.concatenate([kept_columns, columns[chosen[1]]])
-    order = np.argsort(all_rows)
-    return all_rows[order], all_columns[order]
+    free = np.isfinite(distance)
+    free[kept_rows], free[:, kept_columns] = False, False
+    rows, columns = np.nonzero(free)
+    chosen = best_pairs(Candidates(rows, columns, distance[rows, columns], np.zeros(len(rows), dtype=np.int64)))
+    rows, columns = np.append(kept_rows, rows[chosen]), np.append(kept_columns, columns[chosen])
+    order = np.argsort(rows)
+    return rows[order], columns[order]

@@ -1,7 +1,6 @@
-"""One-to-one pairs of boxes of the same moment and class: as many as possible within a gate, then the nearest.
+"""Pairs of boxes of the same frame and class: all within a gate, and the best one-to-one pairs among them.
 
-No memory and no identities: what is paired at a moment depends on that moment alone, so that two trackers are compared
-on the same labels.
+Pairs of a frame do not depend on other frames or on identities, so trackers are compared on the same labels.
 """
 
 from __future__ import annotations
@@ -9,31 +8,40 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from data_tools.metrics.assignment import Candidates, optimal_pairs
+from data_tools.metrics.assignment import Candidates, best_pairs
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 
+FrameBoxes = tuple[IntArray, Boxes]  # index of the frame (N,), and N boxes
+Pairs = tuple[IntArray, IntArray, FloatArray]  # rows (P,) of the first and of the second table, distance (P,) in m
 
-def nearest_pairs(
-    first: tuple[IntArray, Boxes], second: tuple[IntArray, Boxes], gate: float
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Rows (P,) of the first and of the second table, and horizontal distances (P,), m, of at most `gate`.
 
-    A table is (moment (N,), boxes (N)).
-    """
+def near_pairs(first: FrameBoxes, second: FrameBoxes, gate: float) -> Pairs:
+    """All pairs of the same frame and class within a horizontal distance of `gate` m, in order of their rows."""
     labels = np.unique(np.concatenate([first[1].label, second[1].label]))
-    group = [moment * len(labels) + np.searchsorted(labels, boxes.label) for moment, boxes in (first, second)]
-    if not len(group[0]) or not len(group[1]):
+    if not len(first[1]) or not len(second[1]):
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
     origin = first[1].position[0, :2]
-    # boxes of another moment or class are out of reach along the third axis
+    # the third axis moves boxes of another frame or class out of reach
     a, b = (
-        np.column_stack([boxes.position[:, :2] - origin, 2.0 * gate * own])
-        for (_, boxes), own in zip((first, second), group, strict=True)
+        cKDTree(
+            np.column_stack(
+                [
+                    boxes.position[:, :2] - origin,
+                    3.0 * gate * (frame * len(labels) + np.searchsorted(labels, boxes.label)),
+                ]
+            )
+        )
+        for frame, boxes in (first, second)
     )
-    near = cKDTree(a).sparse_distance_matrix(cKDTree(b), gate, output_type="ndarray")
-    order = np.lexsort((near["j"], near["i"]))
-    row, column, distance = (near[name][order] for name in ("i", "j", "v"))
-    candidates = Candidates(row.astype(np.int64), column.astype(np.int64), distance, group[0][row])
-    chosen = optimal_pairs(candidates, np.ones((len(candidates), 1), dtype=np.bool_))[:, 0]
-    return candidates.row[chosen], candidates.column[chosen], candidates.cost[chosen]
+    near = a.sparse_distance_matrix(b, gate, output_type="ndarray")
+    near = near[np.lexsort((near["j"], near["i"]))]
+    return near["i"].astype(np.int64), near["j"].astype(np.int64), near["v"].copy()
+
+
+def nearest_pairs(first: FrameBoxes, second: FrameBoxes, gate: float) -> Pairs:
+    """One-to-one pairs of the same frame and class within `gate` m: as many as possible, then the nearest."""
+    row, column, distance = near_pairs(first, second, gate)
+    labels, label = np.unique(first[1].label, return_inverse=True)
+    chosen = best_pairs(Candidates(row, column, distance, (first[0] * len(labels) + label)[row]))
+    return row[chosen], column[chosen], distance[chosen]

@@ -1,9 +1,9 @@
-"""How well things that were told apart agree with what they truly are: pairwise precision, recall and F1.
+"""Agreement of an estimated and a true grouping of observations: pairwise precision, recall and F1.
 
-    precision = pairs that are one in both / pairs that are one in the estimate,     recall = the same / ... in truth
+    precision = pairs joined in both / pairs joined in the estimate,     recall = pairs joined in both / ... in truth
     F1 = 2 precision recall / (precision + recall)
 
-over all pairs of observations; it does not matter how groups are named. Source: Manning, Raghavan and Schuetze,
+over all pairs of observations. Names of groups have no influence. Source: Manning, Raghavan and Schuetze,
 Introduction to Information Retrieval, 2008, section 16.3.
 """
 
@@ -19,7 +19,7 @@ from saga_fg.numerics.arrays import IntArray, checked_rows
 
 @dataclass(frozen=True)
 class PairwiseAgreement:
-    """precision, recall, f1; 1 where there are no pairs to be wrong about."""
+    """precision, recall, f1; precision and recall are 1 without pairs in their denominator."""
 
     precision: float
     recall: float
@@ -27,7 +27,7 @@ class PairwiseAgreement:
 
 
 def pairwise_agreement(estimated: ArrayLike, true: ArrayLike) -> PairwiseAgreement:
-    """The agreement of two groupings (n,) of the same observations, by number of the group.
+    """The agreement of two groupings (n,), given as the group of each observation.
 
     Raises `InputError` for groupings of different lengths.
     """

@@ -1,4 +1,4 @@
-"""How well the tracks of a scene follow its true objects: errors, identities, and what becomes of hidden objects.
+"""Metrics of the tracks of a scene: errors, identity switches, and errors at hidden objects.
 
 Over the matching of `data_tools.metrics.matching` (CLEAR):
 
@@ -6,15 +6,15 @@ Over the matching of `data_tools.metrics.matching` (CLEAR):
     MOTP   = mean distance of the matched pairs of visible objects, m
     recall = matched visible objects / visible objects
 
-An object that no sensor can see (`Annotations.visible` is False) may be matched, and changes of identity count there
-too, but to say nothing about it is no miss: misses and false positives judge what could be seen.
+An object that no sensor can see (`Annotations.visible` is False) may be matched, and identity switches count there too,
+but an unmatched hidden object is not a miss.
 
-Hidden objects are judged by the *carried error*. It asks where the object is according to the very track that
-followed it when it was last seen: for every object that was matched while visible and is hidden now,
+The *carried error* evaluates hidden objects. For every object that was matched while visible and is hidden now, it is
+the distance to the track that was matched to it when it was last visible:
 
     carried error = min(distance to that track, cap)        cap, if that track no longer exists
 
-so that a tracker can't improve the figure by giving up the hard objects.
+A tracker therefore does not improve the figure by deleting difficult tracks.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from saga_fg.types.dataset import Annotations
 
 @dataclass(frozen=True)
 class SceneMetricSettings:
-    """How tracks are compared with ground truth."""
+    """Matching of tracks and ground truth."""
 
     gate: float = setting(2.0, "largest horizontal distance of a matched pair, m")
     same_label: bool = setting(True, "match objects and tracks of the same class only")
@@ -45,14 +45,14 @@ class SceneMetricSettings:
 
 @dataclass(frozen=True, eq=False)
 class SceneMetrics:
-    """Counts and errors of one scene, or of several (`pool`). Errors are of matched pairs, unless said otherwise.
+    """Counts and errors of one scene, or of several (`pool`). Errors are those of matched pairs unless stated.
 
     objects, hidden_objects      true boxes that were visible, and that were not
     matches, hidden_matches      those of them with a track
     false_positives              track boxes that match nothing
     switches                     identity switches
     position, velocity           m and m/s, horizontal, visible objects (velocity: where both are known)
-    hidden_position, hidden_velocity   the same, of hidden objects
+    hidden_position, hidden_velocity   position and velocity errors of hidden objects
     heading                      rad, in [0, pi], visible objects
     carried                      m, hidden objects, lost ones at the cap (see the module)
     nees                         of the position of visible objects, 2 degrees of freedom
@@ -94,7 +94,7 @@ class SceneMetrics:
 
     @property
     def mota_sums(self) -> tuple[float, float]:
-        """(objects less faults, objects), whose ratio is MOTA: what a bootstrap of MOTA resamples."""
+        """(objects less errors, objects), whose ratio is MOTA: the sums for a bootstrap of MOTA."""
         return float(self.matches - self.false_positives - self.switches), float(self.objects)
 
     @property
@@ -114,15 +114,15 @@ class SceneMetrics:
 def scene_metrics(
     ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], settings: SceneMetricSettings | None = None
 ) -> SceneMetrics:
-    """The metrics of one scene: K annotations and the K track tables of the same moments, both in world coordinates.
+    """The metrics of one scene: K annotations and the K `Tracks` of the same frames, both in world coordinates.
 
     Raises `InputError` when their numbers differ.
     """
     settings = settings or SceneMetricSettings()
     matchings = match_scene(ground_truth, tracks, settings.gate, settings.same_label)
-    moments = list(zip(ground_truth, tracks, matchings, strict=True))
-    pairs = [_pair_errors(*moment) for moment in moments]
-    visible = np.concatenate([np.empty(0, dtype=np.bool_), *(truth.visible[m.object_row] for truth, _, m in moments)])
+    frames = list(zip(ground_truth, tracks, matchings, strict=True))
+    pairs = [_pair_errors(*frame) for frame in frames]
+    visible = np.concatenate([np.empty(0, dtype=np.bool_), *(truth.visible[m.object_row] for truth, _, m in frames)])
     position, velocity, heading, consistency = np.concatenate([np.empty((4, 0)), *pairs], axis=1)
     objects = sum(int(truth.visible.sum()) for truth in ground_truth)
     return SceneMetrics(
@@ -133,19 +133,19 @@ def scene_metrics(
         false_positives=sum(map(len, tracks)) - len(visible),
         switches=sum(int(m.switched.sum()) for m in matchings),
         position=ErrorSample(position[visible]),
-        velocity=_known(velocity[visible]),
+        velocity=ErrorSample.known(velocity[visible]),
         hidden_position=ErrorSample(position[~visible]),
-        hidden_velocity=_known(velocity[~visible]),
-        heading=_known(heading[visible]),
-        carried=ErrorSample(_carried_errors(moments, settings.cap)),
-        nees=_known(consistency[visible]),
+        hidden_velocity=ErrorSample.known(velocity[~visible]),
+        heading=ErrorSample.known(heading[visible]),
+        carried=ErrorSample(_carried_errors(frames, settings.cap)),
+        nees=ErrorSample.known(consistency[visible]),
     )
 
 
 def scene_metrics_by_label(
     ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], settings: SceneMetricSettings | None = None
 ) -> dict[str, SceneMetrics]:
-    """`scene_metrics` of each class that occurs, by name; with `same_label` their pool is that of the whole scene."""
+    """`scene_metrics` of each class, by name; with `same_label`, pooling them gives the metrics of the whole scene."""
     boxes = [truth.boxes for truth in ground_truth] + [found.boxes for found in tracks]
     labels = {label for table in boxes for label in table.label.tolist()}
     return {
@@ -159,7 +159,7 @@ def scene_metrics_by_label(
 
 
 def _pair_errors(truth: Annotations, found: FoundBoxes, matching: Matching) -> FloatArray:
-    """(4, M): position, velocity, heading errors and NEES of the pairs of one moment; NaN where unknown."""
+    """(4, M): position, velocity, heading errors and NEES of the pairs of one frame; NaN where unknown."""
     a, b = truth.boxes.select(matching.object_row), found.boxes.select(matching.track_row)
     velocity = b.velocity - a.velocity
     consistency = nees((b.position - a.position)[:, :2], found.position_covariance[matching.track_row])
@@ -167,11 +167,11 @@ def _pair_errors(truth: Annotations, found: FoundBoxes, matching: Matching) -> F
     return np.stack([matching.distance, np.hypot(velocity[:, 0], velocity[:, 1]), heading, consistency])
 
 
-def _carried_errors(moments: Sequence[tuple[Annotations, FoundBoxes, Matching]], cap: float) -> FloatArray:
-    """Errors of all hidden objects, by the track that followed each of them when it was last seen."""
+def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, Matching]], cap: float) -> FloatArray:
+    """Carried errors of all hidden objects, see the module."""
     carrier: dict[str, int | str] = {}
     errors: list[float] = []
-    for truth, found, matching in moments:
+    for truth, found, matching in frames:
         row_of = {track: row for row, track in enumerate(found.id.tolist())}
         for row in np.flatnonzero(~truth.visible):
             track = carrier.get(truth.id[row])
@@ -183,15 +183,11 @@ def _carried_errors(moments: Sequence[tuple[Annotations, FoundBoxes, Matching]],
             else:
                 offset = found.boxes.position[at, :2] - truth.boxes.position[row, :2]
                 errors.append(min(float(np.hypot(*offset)), cap))
-        seen = truth.visible[matching.object_row]
-        names = truth.id[matching.object_row[seen]].tolist()
-        carrier.update(zip(names, found.id[matching.track_row[seen]].tolist(), strict=True))
+        visible = truth.visible[matching.object_row]
+        names = truth.id[matching.object_row[visible]].tolist()
+        carrier.update(zip(names, found.id[matching.track_row[visible]].tolist(), strict=True))
     return np.array(errors)
 
 
 def _annotations(truth: Annotations, rows: BoolArray) -> Annotations:
     return Annotations(truth.id[rows], truth.boxes.select(rows), truth.visible[rows])
-
-
-def _known(values: FloatArray) -> ErrorSample:
-    return ErrorSample(values[np.isfinite(values)])

@@ -1,4 +1,4 @@
-"""Boxes with identities over the moments of a scene, as one table: what tracking metrics compare."""
+"""Boxes with identities over the frames of a scene, as one table: the input of the tracking metrics."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from saga_fg.types.track import Tracks
 class SceneBoxes(Columns):
     """N boxes of one scene, in order of time.
 
-    moment  (N,) which of the scene's moments, from 0, never decreasing
-    id      (N,) names of the objects or tracks; a name occurs once at a moment at most
-    boxes   label, position, size, yaw, velocity, all moments in one coordinate frame
+    frame   (N,) index of the frame, from 0, never decreasing
+    id      (N,) names of the objects or tracks; a name occurs once in a frame at most
+    boxes   label, position, size, yaw, velocity, all frames in one coordinate frame
     score   (N,) confidence; 0 for ground truth
     position_covariance  (N, 2, 2) of the horizontal position, m^2, NaN where unknown; may be left out
 
-    Raises `InputError` for moments out of order or an identity that occurs twice at one moment.
+    Raises `InputError` for frames out of order or an identity that occurs twice in one frame.
     """
 
-    moment: IntArray
+    frame: IntArray
     id: StrArray
     boxes: Boxes
     score: FloatArray
@@ -38,44 +38,42 @@ class SceneBoxes(Columns):
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
-        moment = np.array(self.moment, dtype=np.int64)
-        if moment.shape != (n,) or (np.diff(moment) < 0).any() or (n and moment[0] < 0):
-            raise InputError(f"moment: expected {n} indices from 0 that never decrease")
+        frame = np.array(self.frame, dtype=np.int64)
+        if frame.shape != (n,) or (np.diff(frame) < 0).any() or (n and frame[0] < 0):
+            raise InputError(f"frame: expected {n} indices from 0 that never decrease")
         names = checked_labels("id", self.id, n)
         _, numbers = np.unique(names, return_inverse=True)
-        key = numbers * (moment[-1] + 1 if n else 1) + moment
+        key = numbers * (frame[-1] + 1 if n else 1) + frame
         unique, first = np.unique(key, return_index=True)
         if len(unique) != n:
             row = int(np.setdiff1d(np.arange(n), first)[0])
-            raise InputError(
-                f"id[{row}]: expected unique ids, {str(names[row])!r} occurs twice at moment {moment[row]}"
-            )
-        for name, array in (("moment", moment), ("id", names), ("score", checked("score", self.score, (n,)))):
+            raise InputError(f"id[{row}]: expected unique ids, {str(names[row])!r} occurs twice in frame {frame[row]}")
+        for name, array in (("frame", frame), ("id", names), ("score", checked("score", self.score, (n,)))):
             object.__setattr__(self, name, array)
         given = self.position_covariance if len(self.position_covariance) else np.full((n, 2, 2), np.nan)
         covariance = checked("position_covariance", given, (n, 2, 2), "finite-or-nan")
         object.__setattr__(self, "position_covariance", covariance)
 
     @classmethod
-    def of_annotations(cls, moments: Sequence[Annotations], hidden: bool = True) -> Self:
+    def of_annotations(cls, frames: Sequence[Annotations], hidden: bool = True) -> Self:
         """Ground truth as a table; without `hidden`, visible objects only."""
-        kept = [np.ones(len(truth), dtype=np.bool_) if hidden else truth.visible for truth in moments]
-        boxes = Boxes.concatenate([truth.boxes.select(rows) for truth, rows in zip(moments, kept, strict=True)])
-        names = [truth.id[rows] for truth, rows in zip(moments, kept, strict=True)]
-        moment = np.repeat(np.arange(len(moments)), [int(rows.sum()) for rows in kept])
-        return cls(moment, np.concatenate([np.empty(0, dtype="<U1"), *names]), boxes, np.zeros(len(boxes)))
+        kept = [np.ones(len(truth), dtype=np.bool_) if hidden else truth.visible for truth in frames]
+        boxes = Boxes.concatenate([truth.boxes.select(rows) for truth, rows in zip(frames, kept, strict=True)])
+        names = [truth.id[rows] for truth, rows in zip(frames, kept, strict=True)]
+        frame = np.repeat(np.arange(len(frames)), [int(rows.sum()) for rows in kept])
+        return cls(frame, np.concatenate([np.empty(0, dtype="<U1"), *names]), boxes, np.zeros(len(boxes)))
 
     @classmethod
-    def of_tracks(cls, moments: Sequence[Tracks]) -> Self:
+    def of_tracks(cls, frames: Sequence[Tracks]) -> Self:
         """A tracker's output as a table."""
-        boxes = Boxes.concatenate([found.boxes for found in moments])
-        moment = np.repeat(np.arange(len(moments)), [len(found) for found in moments])
-        numbers = np.concatenate([np.empty(0, dtype=np.int64), *(found.id for found in moments)])
-        score = np.concatenate([np.empty(0), *(found.score for found in moments)])
-        covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in moments)])
-        return cls(moment, numbers.astype(np.str_), boxes, score, covariance)
+        boxes = Boxes.concatenate([found.boxes for found in frames])
+        frame = np.repeat(np.arange(len(frames)), [len(found) for found in frames])
+        numbers = np.concatenate([np.empty(0, dtype=np.int64), *(found.id for found in frames)])
+        score = np.concatenate([np.empty(0), *(found.score for found in frames)])
+        covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in frames)])
+        return cls(frame, numbers.astype(np.str_), boxes, score, covariance)
 
-    def by_moment(self, count: int) -> list[Self]:
-        """The boxes of each of the scene's `count` moments."""
-        bounds = np.searchsorted(self.moment, np.arange(count + 1)).tolist()
+    def by_frame(self, count: int) -> list[Self]:
+        """The boxes of each of the scene's `count` frames."""
+        bounds = np.searchsorted(self.frame, np.arange(count + 1)).tolist()
         return [self.select(slice(first, end)) for first, end in pairwise(bounds)]

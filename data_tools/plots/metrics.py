@@ -63,7 +63,7 @@ def calibration_plot(errors: LabelErrors) -> Any:
         values = of_class.nees[np.isfinite(of_class.nees)]
         if len(values):
             share = np.searchsorted(np.sort(values), ellipses, side="right") / len(values)
-            style = "-" if calibration(of_class).judged else ":"
+            style = "-" if calibration(of_class).enough_data else ":"
             ax.plot(probability, share, style, label=f"{label} ({len(values)})", linewidth=1.4)
     ax.plot([0, 1], [0, 1], color="black", linewidth=0.8)
     for p, (low, high) in BANDS.items():

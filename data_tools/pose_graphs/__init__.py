@@ -1,4 +1,4 @@
-"""Pose graphs: in files, and made up."""
+"""Pose graphs in files, and generated ones."""
 
 from data_tools.pose_graphs.g2o import read_g2o, write_g2o
 from data_tools.pose_graphs.generated import city, torus

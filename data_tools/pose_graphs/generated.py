@@ -1,4 +1,4 @@
-"""Pose graphs of known truth, of any size: a drive through a city of square blocks, and a path wound round a torus.
+"""Generated pose graphs of known truth: a drive through a city of square blocks, and a path wound round a torus.
 
     city    in the plane: steps of 1 m, at every crossing (each `block` steps) straight on, left or right at random;
             measurements to one earlier pose within 1.5 m of each pose, where there is one

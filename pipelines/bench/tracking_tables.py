@@ -10,7 +10,7 @@ from pipelines.bench.tracking import SetResult, verdict
 
 
 def tables(result: SetResult) -> list[FigureTable]:
-    """For people: the variants, times by stage, what the graph changes, how honest the covariances are."""
+    """For people: the variants, times by stage, what the graph changes, the consistency of the covariances."""
     return [_variants(result), _stages(result), *_differences(result), *_calibrations(result)]
 
 
@@ -81,9 +81,15 @@ def _interval(name: str, difference: Interval) -> tuple[str, ...]:
 def _calibrations(result: SetResult) -> list[FigureTable]:
     classes = {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()}
     rows = tuple(
-        (label, cell(c.objects), cell(c.boxes), cell(c.anees, 2), *(cell(100 * share, 1) for share in c.held.values()))
+        (
+            label,
+            cell(c.objects),
+            cell(c.boxes),
+            cell(c.anees, 2),
+            *(cell(100 * share, 1) for share in c.coverage.values()),
+        )
         for label, c in classes.items()
-        if c.judged
+        if c.enough_data
     )
     columns = ("class", "objects", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
     return [FigureTable(f"{result.name}: errors within saga's ellipses, in %", columns, rows)] if rows else []

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from pipelines.cli.options import Config, Scenario, Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import counted
+from pipelines.cli.tables import show_tables
 
 
 def demo(
@@ -38,17 +37,13 @@ def demo(
       saga-fg demo --output out --scenario road-works --scenes 1
     """
     from data_tools.simulator.scenarios import scenario_settings
-    from pipelines.comparison import COLUMNS, table_rows
     from pipelines.config import load_config
     from pipelines.demo import run_demo
+    from pipelines.demo.comparison import comparison_table
 
     with progress_bar() as progress:
         settings = load_config("simulated" if scenario == "traffic" else "heterogeneous", config)
         result = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
-    table = Table(title=f"{counted(scenes, 'simulated scene')}, seed {seed}", title_justify="left")
-    for k, column in enumerate(COLUMNS):
-        table.add_column(column, justify="right" if k else "left", no_wrap=k == 0)
-    for row in table_rows(result.comparison):
-        table.add_row(*row)
-    Console().print(table)
+    title = f"{counted(scenes, 'simulated scene')}, seed {seed}"
+    show_tables([comparison_table(result.comparison, title)])
     typer.echo(f"picture: {result.picture}\npage:    {result.page}")

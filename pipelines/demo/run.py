@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.figures import FigureTable
 from data_tools.files.atomic_files import atomic_directory
 from data_tools.plots import Panel, birds_eye_view, png
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from pipelines.comparison import COLUMNS, Comparison, compare, table_rows
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
+from pipelines.demo.comparison import Comparison, compare, comparison_table
 from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import IntArray
@@ -78,7 +77,7 @@ def _report(comparison: Comparison, config: TrackConfig, first: int, start: int)
         "saga-fg demo",
         [f"{count} simulated scene" + "s" * (count != 1), *TITLES.values()],
         [scene_of_run({m: comparison.runs[m][k] for m in METHODS}, rules, config.sensors) for k in order],
-        [FigureTable(TABLE_TITLE, COLUMNS, tuple(table_rows(comparison)))],
+        [comparison_table(comparison, TABLE_TITLE)],
         configuration=write_settings(config, comments=False),
         notes=[NOTE],
         start=start,

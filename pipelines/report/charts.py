@@ -1,4 +1,4 @@
-"""The charts of a report: what is drawn, as numbers; the page draws them."""
+"""The charts of a report as numbers, which the page draws."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 @dataclass(frozen=True)
 class Series:
-    """A curve, or the heights of bars; `faint` for what the others are compared with."""
+    """A curve, or the heights of bars; `faint`: the reference of the others."""
 
     name: str
     x: Sequence[float]
@@ -37,7 +37,7 @@ class Chart:
 
 
 def accuracy_charts(errors: LabelErrors) -> list[Chart]:
-    """Distributions of the errors at labels by class, and how many of them the tracks' ellipses hold."""
+    """Return distributions of the errors at labels by class, and the shares that the tracks' ellipses hold."""
     classes = {name: of_class for name, of_class in errors_by_class(errors).items() if name != "overall"}
     charts = [
         _distribution(
@@ -59,7 +59,7 @@ def accuracy_charts(errors: LabelErrors) -> list[Chart]:
 
 
 def latency_chart(milliseconds: FloatArray) -> Chart:
-    """How long the tracker took for a frame; milliseconds (N,), N > 0."""
+    """Return the distribution of the tracker's time for a frame; milliseconds (N,), N > 0."""
     edges = np.histogram_bin_edges(milliseconds, bins=40, range=(0.0, float(np.percentile(milliseconds, 99.5)) or 1.0))
     counts, _ = np.histogram(np.minimum(milliseconds, edges[-1]), edges)
     median, p99 = np.percentile(milliseconds, [50, 99])
@@ -68,7 +68,7 @@ def latency_chart(milliseconds: FloatArray) -> Chart:
 
 
 def _distribution(title: str, unit: str, samples: Sequence[tuple[str, FloatArray]]) -> Chart:
-    """Cumulative distributions, up to the value that 99 % of each stay below."""
+    """Return cumulative distributions up to the 99 % quantile."""
     share = np.linspace(0.0, 0.99, CURVE_POINTS)
     series = [
         Series(name, np.quantile(values, share).tolist(), share.tolist())

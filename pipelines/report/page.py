@@ -21,9 +21,9 @@ from pipelines.report.scenes import ReportScene, scene_data
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a page shows; `facts` are lines under the title, `notes` paragraphs above the player.
+    """Content of a page; `facts` are lines under the title, `notes` paragraphs above the player.
 
-    start  the moment of the first scene at which the player stands at first
+    start  moment of the first scene that the player shows first
     """
 
     title: str
@@ -37,7 +37,7 @@ class Report:
 
 
 def report_page(report: Report) -> str:
-    """The HTML text."""
+    """Return the HTML text."""
     data = {
         "scenes": [scene_data(scene) for scene in report.scenes],
         "charts": [asdict(chart) for chart in report.charts],

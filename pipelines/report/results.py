@@ -1,4 +1,4 @@
-"""Results as they are on disk, as scenes to look at and as a report."""
+"""Results on disk as scenes to view and as reports."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from pipelines.report.scenes import ReportScene
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The scenes of a result, and the record of the run that made it, if there is one beside it.
+    """The scenes of a result, and the record of its run if there is one beside it.
 
-    The edges are those of the rules that are configured for such recordings.
+    Edges are by the rules of the default configuration of such recordings.
     """
 
     name: str

@@ -25,7 +25,7 @@ Colours = list[list[int | None]]
 
 
 def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: FloatArray) -> dict[str, Any] | None:
-    """The road as the module's docstring says, ready for JSON.
+    """Return the data of the road, ready for JSON; see the module's docstring.
 
     detections  of each moment, in world coordinates and in order of time
     origin      (2,) place of the scene's start, m
@@ -35,7 +35,7 @@ def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: Floa
     lights: dict[str, TrafficLight] = {}
     maps = {id(frame.road_map): frame.road_map for frame in frames if frame.road_map is not None}  # most bring the same
     for known in maps.values():
-        for light in known.lights:  # what is known already stays as it is, for the tracker does so, too
+        for light in known.lights:  # the first entry of a name stays, as in the tracker
             lights.setdefault(light.name, light)
         for line in known.stop_lines:
             lines.setdefault(line.name, line)
@@ -54,7 +54,7 @@ def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: Floa
 
 
 def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
-    """Of each moment, the colour last reported of each light; lights (L, 2)."""
+    """Return for each moment the colour last reported of each light; lights (L, 2)."""
     reach = SignalSettings().max_distance
     now: list[int | None] = [None] * len(lights)
     colours = []
@@ -72,6 +72,6 @@ def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
 
 
 def _centimetres(points: Any, origin: FloatArray) -> list[int]:
-    """Points (..., 2) one after another."""
+    """Return points (..., 2), flattened."""
     flat: list[float] = (100 * (np.asarray(points) - origin)).ravel().tolist()
     return [round(value) for value in flat]

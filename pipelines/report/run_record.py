@@ -1,4 +1,4 @@
-"""What a run of the tracker was: written beside its result, so that a report can tell how the result came about.
+"""The record of a run, written beside its result for reports: method, version, configuration and times.
 
 {"method": "saga", "version": "0.1.0", "configuration": YAML, "milliseconds": {scene: [of each frame]}}
 """
@@ -28,7 +28,7 @@ class RunRecord:
 
 
 def record_path(result: Path) -> Path:
-    """Where the record of a result is: beside a file, or in a folder of results."""
+    """Return the path of a result's record: beside a file, or in a folder of results."""
     return result / "run.json" if result.is_dir() else result.with_name(f"{result.stem}.run.json")
 
 
@@ -38,7 +38,7 @@ def write_run_record(result: Path, record: RunRecord) -> None:
 
 
 def read_run_record(result: Path) -> RunRecord | None:
-    """The record of a result, None if it has none. Raises `InputError` for one that is broken."""
+    """Read the record of a result, None if it has none. Raises `InputError` for a broken one."""
     path = record_path(result)
     if not path.is_file():
         return None

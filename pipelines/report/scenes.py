@@ -1,4 +1,4 @@
-"""Scenes as the page's player wants them: rows of whole numbers, centimetres and milliradians, about the scene's start.
+"""Scenes as data of the page's player: rows of whole numbers, centimetres and milliradians, about the scene's start.
 
     scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]]}},
@@ -13,7 +13,7 @@ null is unknown. `ids`, `labels` are counted from 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -21,30 +21,34 @@ from typing import Any
 import numpy as np
 
 from data_tools.metrics import SceneBoxes
-from pipelines.report.edges import edges_of_moments
 from pipelines.report.road import road_data
 from pipelines.tracking import TrackedScene
 from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.node import ConstantVelocity, NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
-from saga_fg.types.frame import Frame
 from saga_fg.types.sensor import Sensor, sensor_model
 
 Rows = list[list[int | None]]
+Edges = tuple[IntArray, IntArray, FloatArray]
+"""Targets and sources (E,), rows of the table, and rates (E,), 1/s."""
+MOVING = 2.0  # m/s, from which a track has moved
+VELOCITY_VARIANCE = 1.0  # (m/s)^2, results do not give it
 UNMEASURED = 1.0  # side of the cube an object of unknown size is drawn as, m
 
 
 @dataclass(frozen=True, eq=False)
 class ReportScene:
-    """A scene and what one or several trackers made of it.
+    """A scene and the tracks of one or several trackers.
 
     scene     with its detections, and ground truth where there is one
     tracks    by the tracker's name
     coasting  by the tracker's name, s since the last detection, (N,) of its tracks; may be left out
-    rules     the edges drawn are those that these rules find between the tracks of a moment
-    sensors   models by name: where their detections are in the world
+    rules     find the edges between the tracks of a moment
+    sensors   models by name, which place detections in the world
     """
 
     scene: Scene
@@ -57,7 +61,7 @@ class ReportScene:
 def scene_of_run(
     runs: Mapping[str, TrackedScene], rules: Sequence[EdgeRule], sensors: Mapping[str, Sensor]
 ) -> ReportScene:
-    """A scene that has just been tracked, by the trackers' names."""
+    """Return a scene with the tracks of `runs`, by the trackers' names."""
     return ReportScene(
         next(iter(runs.values())).scene,
         {name: SceneBoxes.of_tracks(run.tracks) for name, run in runs.items()},
@@ -68,7 +72,7 @@ def scene_of_run(
 
 
 def scene_data(report: ReportScene) -> dict[str, Any]:
-    """The scene as the module's docstring says, ready for JSON."""
+    """Return the data of a scene, ready for JSON; see the module's docstring."""
     scene = report.scene
     origin = scene.world_T_ego[0, :2, 3] if len(scene) else np.zeros(2)
     shown = latest_detections(scene, report.sensors)
@@ -118,7 +122,7 @@ def _method(
         1000 * (np.full(len(table), np.nan) if coasting is None else coasting),
     ]
     rows = _whole(np.column_stack(columns))
-    starts = np.searchsorted(table.moment, np.arange(moments + 1)).tolist()
+    starts = np.searchsorted(table.frame, np.arange(moments + 1)).tolist()
     return {
         "ids": ids.tolist(),
         "moments": [rows[a:b] for a, b in pairwise(starts)],
@@ -130,26 +134,57 @@ def _method(
 
 
 def _box_columns(boxes: Boxes, labels: StrArray, origin: FloatArray) -> FloatArray:
-    """(N, 6): class, x, y, length, width, yaw."""
+    """Return columns (N, 6): class, x, y, length, width, yaw."""
     size = np.where(np.isfinite(boxes.size[:, :2]), boxes.size[:, :2], UNMEASURED)
     place = 100 * (boxes.position[:, :2] - origin)
     return np.column_stack([np.searchsorted(labels, boxes.label), place, 100 * size, 1000 * np.nan_to_num(boxes.yaw)])
 
 
+def edges_of_moments(table: SceneBoxes, moments: int, rules: Sequence[EdgeRule]) -> Iterator[Edges]:
+    """Yield the edges that rules find between the reported tracks of each moment.
+
+    A result does not hold the graph of its tracks; but rules need only what a result has.
+    """
+    node_type = NodeType("track", ConstantVelocity())
+    moved: set[str] = set()
+    for k in range(moments):
+        rows = np.flatnonzero(table.frame == k)
+        boxes = table.boxes.select(rows)
+        velocity = np.nan_to_num(boxes.velocity)
+        ids = table.id[rows]
+        moved.update(ids[np.hypot(*velocity.T) > MOVING].tolist())
+        heading = np.where(np.isfinite(boxes.yaw), boxes.yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
+        nodes = NodeTable(
+            np.arange(len(rows)),
+            boxes.label,
+            (node_type,) * len(rows),
+            boxes.position[:, :2],
+            velocity,
+            heading,
+            np.nan_to_num(boxes.size[:, 0]),
+            np.full(len(rows), VELOCITY_VARIANCE),
+            np.array([id_ in moved for id_ in ids.tolist()], dtype=np.bool_),
+        )
+        pairs = [rule.pairs(nodes) for rule in rules] if len(rows) > 1 else []
+        none = np.empty(0, dtype=np.int64)
+        yield (
+            np.concatenate([none, *(rows[p.target] for p in pairs)]),
+            np.concatenate([none, *(rows[p.source] for p in pairs)]),
+            np.concatenate([np.empty(0), *(p.rate for p in pairs)]),
+        )
+
+
 def latest_detections(scene: Scene, sensors: Mapping[str, Sensor]) -> tuple[list[Boxes], list[FloatArray]]:
-    """Of each moment: the boxes of all frames since the moment before, and their scores."""
+    """Return for each moment the boxes of all frames since the moment before, and their scores."""
     times = np.array([frame.timestamp for frame in scene.frames])
     at = np.searchsorted(scene.timestamps, times - 1e-6)
     boxes, scores = [], []
     for k in range(len(scene)):
-        frames = [sensor_model(sensors, f.sensor).in_world(f) for f in _at(scene.frames, np.flatnonzero(at == k))]
-        boxes.append(Boxes.concatenate([each.boxes for each in frames]))
-        scores.append(np.concatenate([np.empty(0), *(each.score for each in frames)]))
+        frames = [scene.frames[i] for i in np.flatnonzero(at == k).tolist()]
+        found = [sensor_model(sensors, frame.sensor).in_world(frame) for frame in frames]
+        boxes.append(Boxes.concatenate([each.boxes for each in found]))
+        scores.append(np.concatenate([np.empty(0), *(each.score for each in found)]))
     return boxes, scores
-
-
-def _at(frames: Sequence[Frame], rows: IntArray) -> list[Frame]:
-    return [frames[i] for i in rows.tolist()]
 
 
 def _whole(rows: FloatArray) -> Rows:

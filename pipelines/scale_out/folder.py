@@ -1,9 +1,8 @@
 """A folder for results, in which nothing is read, written or removed through a link.
 
-Whoever may write to the folder could plant links in it, or name files elsewhere in its manifest; a run that somebody
-else starts must not follow them. So paths below the folder are walked by descriptors, a part at a time and without
-following links (`O_NOFOLLOW`), and results are renamed into place, which replaces a link instead of what it leads to.
-The folder itself may be a link: its name is the user's.
+Other users with access to the folder could plant links in it, or name files elsewhere in its manifest. So paths below
+the folder are walked by descriptors, a part at a time and without following links (`O_NOFOLLOW`), and results are
+renamed into place, which replaces a link instead of its target. The folder itself may be a link: the user names it.
 """
 
 from __future__ import annotations
@@ -57,24 +56,24 @@ class OutputFolder:
                     os.unlink(temporary, dir_fd=parent)
 
     def remove(self, name: str) -> None:
-        """Remove a file or a link; nothing happens where there is none."""
+        """Remove a file or a link, if there is one."""
         with suppress(OSError), self._parent(name) as (parent, last):
             os.unlink(last, dir_fd=parent)
 
     def remove_folder(self, name: str) -> None:
-        """Remove a folder with all it holds, or what else has its name; nothing happens where there is none."""
+        """Remove a folder with its content, or a file of its name, if there is one."""
         with suppress(OSError), self._parent(name) as (parent, last):
             _remove(parent, last)
 
     def new_folder(self, name: str) -> Path:
-        """An empty folder, whatever was there under its name. Raises `InputError` where that is not possible."""
+        """Make an empty folder in place of anything of its name. Raises `InputError` where that is not possible."""
         self.remove_folder(name)
         with self._writing(name), self._parent(name) as (parent, last):
             os.mkdir(last, dir_fd=parent)
         return self.path / name
 
     def remove_leftovers(self) -> None:
-        """Remove what killed runs left under temporary names, here and in folders below."""
+        """Remove temporary files of killed runs, here and in folders below."""
         with self._parent(".") as (root, _):
             for _, folders, files, parent in os.fwalk(".", dir_fd=root):
                 for name in (*folders, *files):
@@ -138,7 +137,7 @@ def _remove(parent: int, name: str) -> None:
 
 
 def is_inside(name: object) -> bool:
-    """Whether it is the name of a file below a folder: relative, and without `..`."""
+    """Return True for the name of a file below a folder: relative, and without `..`."""
     if not isinstance(name, str) or "\0" in name:
         return False
     path = PurePosixPath(name)

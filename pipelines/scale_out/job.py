@@ -1,7 +1,7 @@
-"""One scene as a job: what goes to a worker, what is done there, and what comes back.
+"""One scene as a job: the message to a worker, the work there, and the outcome.
 
-A job is a pure function of its input and its task's configuration, so that its results are the same bytes wherever and
-beside whatever it is run; only the driver writes to the output. An input that fails costs its own results alone.
+A job is a pure function of its input and its task's configuration: its results are the same bytes on any machine. Only
+the driver writes to the output. An input that fails costs its own results alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Status = Literal["done", "unchanged", "failed"]
 
 
 class SceneTask(Protocol):
-    """What is done with every scene. Picklable."""
+    """The work on every scene. Picklable."""
 
     @property
     def configuration(self) -> str:
@@ -48,7 +48,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a job.
+    """The result of a job.
 
     digests  of the input's parts, by name
     files    content of every result by its path relative to the output
@@ -68,9 +68,9 @@ class Outcome:
 
 
 def perform(job: Job) -> Outcome:
-    """Do a job; whatever it raises becomes a failed outcome.
+    """Perform a job; an exception becomes a failed outcome.
 
-    Linear algebra is kept to one thread: it is the scenes that run in parallel, and sums stay in one order.
+    Linear algebra is kept to one thread: scenes run in parallel, and sums stay in one order.
     """
     name, digests, start = job.input.name, dict[str, str](), time.perf_counter()
     here = version("saga-fg")
@@ -99,6 +99,6 @@ def sha256(content: bytes) -> str:
 
 
 def _last_frame(error: Exception) -> str:
-    """Where an exception that nobody meant was raised: `file.py:12: `."""
+    """Return the place where an unexpected exception was raised: `file.py:12: `."""
     frames = traceback.extract_tb(error.__traceback__)
     return f"{Path(frames[-1].filename).name}:{frames[-1].lineno}: " if frames else ""

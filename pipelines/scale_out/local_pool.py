@@ -34,7 +34,7 @@ class LocalPool:
             raise InputError(f"workers: expected a number >= 0, got {self.workers}")
 
     def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
-        """The outcomes of `total` jobs as they come; no more jobs are taken than there are idle workers."""
+        """Yield the outcomes of `total` jobs as they come; no more jobs are taken than there are idle workers."""
         count = min(self.workers or os.cpu_count() or 1, total)
         idle = [_Worker(self.scratch) for _ in range(count)]
         busy: dict[Connection, _Worker] = {}
@@ -89,7 +89,7 @@ class _Worker:
             return
 
     def outcome(self) -> Outcome | None:
-        """Of the job begun; None if the process has ended without one."""
+        """Return the outcome of the job begun; None if the process has ended without one."""
         try:
             outcome = self.pipe.recv()
         except (EOFError, ConnectionError):
@@ -100,7 +100,7 @@ class _Worker:
 
     @property
     def ending(self) -> str:
-        """How the process ended."""
+        """Signal or exit code by which the process ended."""
         code = self._process.exitcode or 0
         return f"signal {-code}, {signal.strsignal(-code)}" if code < 0 else f"exit code {code}"
 
@@ -112,7 +112,7 @@ class _Worker:
 
 
 def _serve(pipe: Connection, scratch: Path | None) -> None:
-    """What a worker does: jobs, until the pipe closes."""
+    """Perform jobs until the pipe closes: the main function of a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the driver as well, which ends us
     if scratch is not None:
         tempfile.tempdir = str(scratch)

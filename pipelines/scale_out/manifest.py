@@ -1,11 +1,11 @@
-"""The manifest of a run: one JSON file a scene, `manifest/NAME.json`, which says how its results came about.
+"""The manifest of a run: one JSON file a scene, `manifest/NAME.json`, with the origin of its results.
 
     {"scene": "scene-0001", "status": "done", "reason": "", "inputs": {"lidar": SHA256, ...}, "configuration": SHA256,
      "version": "0.1.0", "results": {"tracks/scene-0001.json": SHA256, ...}, "counts": {"tracks": 31, ...},
      "seconds": 1.25}
 
-A record is written, whole or not at all, after the results it names; so results without a valid record are those of a
-run that was killed, and are made anew. Letters that file names cannot have are written as in URLs (%2F).
+A record is written, whole or not at all, after the results it names; results without a valid record are those of a
+killed run, and are made anew. Letters that file names cannot have are written as in URLs (%2F).
 
 Results that a record no longer names are removed when its scene is done again. So that a forged record removes nothing
 else, it may only name files of its own scene: `NAME.SUFFIX` in any folder, or what is below `FOLDER/NAME/`.
@@ -59,7 +59,7 @@ class Manifest:
         self._output = output
 
     def record(self, scene: str) -> Record | None:
-        """What is known of a scene; None where there is no record, or none that can be true."""
+        """Return the record of a scene; None without one, or for an invalid one."""
         try:
             raw = parsed_json(self._output.read(_path(scene)) or b"", scene)
             record = Record(**{field.name: raw[field.name] for field in fields(Record)})
@@ -75,7 +75,7 @@ class Manifest:
         return record if sound else None
 
     def valid(self, scene: str, configuration: str, version: str) -> Mapping[str, str] | None:
-        """The hashes of the inputs whose results are there, complete and unharmed; None if there are none."""
+        """Return the hashes of the inputs whose results are complete and unchanged; None without such results."""
         record = self.record(scene)
         if record is None or (record.status, record.configuration, record.version) != ("done", configuration, version):
             return None
@@ -110,7 +110,7 @@ class Manifest:
 
 
 def _belongs(name: object, scene: str) -> bool:
-    """Whether it is the name of a result of a scene, which has the scene's name in it."""
+    """Return True for the name of a result of a scene, which contains the scene's name."""
     if not isinstance(name, str) or not is_inside(name):
         return False
     *folders, last = name.split("/")

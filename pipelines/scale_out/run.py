@@ -1,7 +1,7 @@
-"""Many scenes: jobs to a pool of workers, results and manifest to a folder, and again only what has to be.
+"""Runs a task over many scenes in a pool of workers; results and manifest go to a folder.
 
-A scene is left as it is if the manifest has it as done with the same inputs, configuration and version, and its
-results are the files that were written then. One run at a time may write to a folder.
+A scene is skipped if the manifest has it as done with the same inputs, configuration and version, and its results are
+unchanged. One run at a time may write to a folder.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ log = logging.getLogger(__name__)
 
 
 class Pool(Protocol):
-    """What does jobs: processes of this machine, or a cluster."""
+    """Workers that perform jobs: processes of this machine, or a cluster."""
 
     def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
-        """The outcomes of all jobs, each as soon as it is there."""
+        """Yield the outcomes of all jobs as they come."""
         ...
 
 
 @dataclass
 class Report:
-    """Names of the scenes by what became of them; reasons of those that failed; counts of all that are there."""
+    """Names of the scenes by status; reasons of the failed ones; counts over all results."""
 
     done: list[str] = field(default_factory=list)
     unchanged: list[str] = field(default_factory=list)
@@ -42,7 +42,7 @@ class Report:
 
     @property
     def scenes(self) -> int:
-        """How many there were."""
+        """Number of scenes."""
         return len(self.done) + len(self.unchanged) + len(self.failed)
 
 
@@ -55,13 +55,13 @@ def run_scenes(
     progress: Callable[[str, int, int], None] | None = None,
     finish: Callable[[Report], None] | None = None,
 ) -> Report:
-    """Do a task with every input, in whichever order; results in `output`, records in `output`/manifest.
+    """Perform a task on every input, in any order; results in `output`, records in `output`/manifest.
 
     new_pool  makes the workers, given a folder for their temporary files
     progress  is called with the name of a scene that is finished, how many are, and `total`
-    finish    is called in the end, while nobody else may write to the folder
+    finish    is called at the end, while no other run may write to the folder
 
-    Scenes that fail are in the report and in the manifest, and stop no other. Raises `InputError` for two inputs of one
+    Failed scenes are in the report and in the manifest; the others go on. Raises `InputError` for two inputs of one
     name, and if another run writes to the folder.
     """
     folder, report = OutputFolder(output), Report()
@@ -98,7 +98,7 @@ def _jobs(inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configura
 
 
 def _count(report: Report, outcome: Outcome, manifest: Manifest, configuration: str) -> None:
-    """Write an outcome down, and count it."""
+    """Write the results and the record of an outcome, and count it."""
     record: Record | None
     if outcome.status == "unchanged":
         report.unchanged.append(outcome.name)

@@ -19,7 +19,7 @@ from saga_fg.tracking.provider_names import made_by_name, new_provider
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """What `saga-fg slam simulated` and `slam kitti` take."""
+    """Settings of `saga-fg slam simulated` and `slam kitti`."""
 
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked at every pose"
@@ -29,11 +29,11 @@ class SlamSettings:
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, objects among it")
 
     def new_providers(self) -> list[FactorProvider]:
-        """Fresh providers. Raises `InputError` for a name that leads to none."""
+        """Fresh providers. Raises `InputError` for a name that cannot be resolved."""
         return [new_provider(name) for name in self.providers]
 
     def new_detectors(self) -> list[LandmarkDetector]:
-        """Fresh detectors of landmarks. Raises `InputError` for a name that leads to none."""
+        """Fresh detectors of landmarks. Raises `InputError` for a name that cannot be resolved."""
         expected = "a detector of landmarks, which has a method observations"
         return [made_by_name("landmarks", name, expected) for name in self.landmarks]
 

@@ -1,4 +1,4 @@
-"""A drive as odometry sees it: where each scan was taken, how surely, and the scans that become keyframes."""
+"""Odometry of a recording: poses of the scans, covariances of the motions, and keyframes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 
-LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: what no registration gets better than, rad and m
+LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy of a registration, rad and m
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Drive:
     points: list[FloatArray]
 
     def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
-        """From each of these scans to the next: motion (4, 4), and its covariance at the end (6, 6), steps added up."""
+        """Return the motion (4, 4) from each of these scans to the next, and its covariance (6, 6) at the end."""
         motions = []
         for a, b in pairwise(rows):
             total = np.zeros((6, 6))
@@ -47,7 +47,7 @@ class Drive:
         return motions
 
     def carried(self, world_T_lidar: FloatArray, rows: Sequence[int] | None = None) -> FloatArray:
-        """Poses (K, 4, 4) of all scans, given those of some, by default the keyframes: each fixed to the one before."""
+        """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before."""
         known = np.array(self.keyframes if rows is None else rows)
         of = np.searchsorted(known, np.arange(len(self.poses)), side="right") - 1
         return np.asarray(world_T_lidar[of] @ inverse_transform(self.poses[known[of]]) @ self.poses)
@@ -56,7 +56,7 @@ class Drive:
 def drive_by_lidar(
     scans: ScanSequence, start: FloatArray, settings: OdometrySettings, progress: Progress | None = None
 ) -> Drive:
-    """By registration of each scan, from the sensor's pose `start` (4, 4) on."""
+    """Return the odometry by registration of each scan, from the sensor's pose `start` (4, 4) on."""
     odometry = LidarOdometry(settings)
     drive = Drive(np.empty((len(scans), 4, 4)), np.empty((len(scans), 6, 6)), [], [])
     for k, timestamp in enumerate(scans.timestamps.tolist()):
@@ -77,7 +77,7 @@ def drive_by_poses(
     settings: OdometrySettings,
     progress: Progress | None = None,
 ) -> Drive:
-    """By the recording's own poses, whose motions between scans deviate by `rotation`, rad, and `translation`, m."""
+    """Return the recording's poses as odometry with deviations of `rotation`, rad, and `translation`, m, a scan."""
     poses = scans.world_T_ego @ scans.ego_T_lidar
     noise = np.diag([rotation] * 3 + [translation] * 3) ** 2
     drive = Drive(poses, np.broadcast_to(noise, (len(scans), 6, 6)), [], [])

@@ -1,7 +1,7 @@
-"""The vehicle's path and the objects around it from one scene: its frames, and odometry between them.
+"""Joint estimation of the vehicle's path and the objects around it, from the frames of one scene.
 
-Ego odometry comes from the scene's own poses, made worse by a stated amount where a poor device shall be studied. What
-is estimated jointly is compared with the decoupled pipeline: the odometry's path, and objects tracked along it.
+Ego odometry comes from the scene's own poses, degraded by a stated amount. The joint estimate is compared with the
+decoupled pipeline: the odometry's path, and objects tracked along it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from saga_fg.slam.joint import (
     JointEstimate,
     JointSettings,
     Observations,
-    Odometry,
+    OdometryIncrements,
     OnlineEstimate,
     estimate_jointly,
     estimate_online,
@@ -33,7 +33,7 @@ from saga_fg.types.frame import Frame
 
 @dataclass(frozen=True, eq=False)
 class JointRun:
-    """One scene: the true path, the odometry's, the estimate, and the online one if it was asked for."""
+    """One scene: the true path, the odometry's, the estimate, and the online one where there is one."""
 
     truth: Trajectory
     odometry: Trajectory
@@ -93,7 +93,7 @@ def run_joint(
 
 def degraded_drive(
     scene: Scene, settings: JointSettings, sensor: str, seed: int
-) -> tuple[list[Frame], Trajectory, Odometry]:
+) -> tuple[list[Frame], Trajectory, OdometryIncrements]:
     """The keyframes of one sensor, their true path, and odometry degraded as `settings.odometry` says.
 
     Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
@@ -105,12 +105,12 @@ def degraded_drive(
     if len(poses) < len(frames):
         raise InputError(f"scene {scene.name}: expected a pose with every frame of {sensor}")
     truth = Trajectory(np.array([frame.timestamp for frame in frames]), np.stack(poses))
-    exact = Odometry.of(truth.timestamps, truth.world_T_ego)
+    exact = OdometryIncrements.of(truth.timestamps, truth.world_T_ego)
     return frames, truth, degraded_odometry(exact, settings.odometry, np.random.default_rng(seed))
 
 
 def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:
-    """The first frame, and each that comes more than `period` s after the last one chosen."""
+    """Return the first frame, and each that comes more than `period` s after the last one chosen."""
     chosen: list[Frame] = []
     for frame in frames:
         if not chosen or frame.timestamp > chosen[-1].timestamp + period:

@@ -69,8 +69,8 @@ class LidarSlamSettings(Settings):
     observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "of landmarks in a scan")
     mapper: MapperSettings = settings_group(lambda: MapperSettings(confirm=4), "telling landmarks apart")
     loops: LoopSettings = settings_group(LoopSettings, "closing loops")
-    landmarks: bool = setting(True, "whether landmarks are nodes of the graph")
-    loop_closures: bool = setting(True, "whether loops are looked for")
+    landmarks: bool = setting(True, "landmarks are nodes of the graph")
+    loop_closures: bool = setting(True, "look for loops")
     robust_scale: Positive = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
     map_spacing: Positive = setting(0.25, "a scan is thinned to this for the accumulated map, m")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "of objects in the same graph")
@@ -80,9 +80,9 @@ class LidarSlamSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class LidarSlam:
-    """What a run made of K scans, M of them keyframes. World coordinates are those of the recording's first pose.
+    """Result for K scans, M of them keyframes. World coordinates are those of the recording's first pose.
 
-    drive        what the odometry says; keyframes (M,) are rows among the scans
+    drive        the odometry; keyframes (M,) are rows among the scans
     odometry     (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
                  when the keyframe came
     covariances  (M, 6, 6) of the sensor's pose at the keyframes, (rotation, translation) in its frame, rad^2, m^2

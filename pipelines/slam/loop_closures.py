@@ -1,9 +1,9 @@
-"""Loop closures: places that the vehicle comes back to, found by distance and proved by registration.
+"""Loop closures: revisited places, found by distance and verified by registration.
 
 A keyframe j is compared with the nearest earlier keyframe i from which it has driven a long way since. Its scan is
 registered with the surfels of the keyframes around i, started where the present estimate says. It is a loop where that
-converges, enough of the points have a surfel, and the residual is no larger than between neighbours. What slips
-through is the business of a robust loss.
+converges, enough of the points have a surfel, and the residual is no larger than between neighbours. A robust
+loss takes care of false loops that remain.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from saga_fg.settings import (
 
 @dataclass(frozen=True)
 class LoopSettings(Settings):
-    """When two keyframes are looked at, and when they are taken for one place."""
+    """Conditions for comparing two keyframes, and for taking them for one place."""
 
     distance: Positive = setting(8.0, "largest distance of the two places by the present estimate, m")
     path: Positive = setting(30.0, "least way driven between them, m")
@@ -57,7 +57,7 @@ class LoopClosure:
 def find_loops(
     clouds: Sequence[FloatArray], world_T_lidar: FloatArray, settings: LoopSettings | None = None
 ) -> list[LoopClosure]:
-    """The loops of K keyframes: points (N, 3) of each in its sensor's frame, and estimated poses (K, 4, 4)."""
+    """Find the loops of K keyframes: points (N, 3) of each in its sensor's frame, and estimated poses (K, 4, 4)."""
     s = settings or LoopSettings()
     places = world_T_lidar[:, :3, 3]
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])

@@ -1,4 +1,4 @@
-"""LiDAR odometry: where the sensor moves to, scan by scan.
+"""LiDAR odometry: the motion of the sensor, scan by scan.
 
     predict    T- = T_(k-1) exp(dt xi_(k-1))                     the velocity of the step before goes on
     de-skew    by xi_(k-1), where the points have times
@@ -78,7 +78,7 @@ class OdometryStep:
 
 
 class LidarOdometry:
-    """Takes scans in order of time and says where each was taken."""
+    """Takes scans in order of time and returns the pose of each."""
 
     def __init__(self, settings: OdometrySettings | None = None) -> None:
         self.settings = settings or OdometrySettings()
@@ -90,7 +90,7 @@ class LidarOdometry:
 
     @property
     def deviation(self) -> float:
-        """Sigma: how far a typical point lies from where the constant velocity says, m."""
+        """Sigma: typical distance of a point from its prediction by constant velocity, m."""
         return max(self.settings.deviation_floor, float(np.sqrt(self._squares / self._count)))
 
     def step(self, scan: Scan, timestamp: float) -> OdometryStep:

@@ -39,13 +39,13 @@ _CALIBRATION = key_of(EGO_ERROR, 0, None)
 
 @dataclass(frozen=True)
 class PlazaSettings(Settings):
-    """How odometry and ranges are believed."""
+    """Noise of odometry and ranges."""
 
     distance_noise: Positive = setting(0.05, "standard deviation of the distance of a step, as a share of it")
     least_noise: Positive = setting(0.005, "m, of a step's distance, and sideways, at least")
     turn_noise: Positive = setting(0.01, "rad, of a step's heading change")
     range_noise: Positive = setting(0.5, "m, standard deviation of a range")
-    robust: Positive = setting(2.0, "standard deviations beyond which ranges are believed less (Cauchy)")
+    robust: Positive = setting(2.0, "standard deviations beyond which ranges get less weight (Cauchy)")
     scale_noise: Positive = setting(0.1, "standard deviation of the radio's scale before anything is measured")
     offset_noise: Positive = setting(1.0, "m, the same of its offset")
     beginning: Positive = setting(100.0, "m driven before the beacons are placed")
@@ -163,13 +163,13 @@ def _root_mean_square(errors: FloatArray) -> float:
 
 
 def trilateration(places: FloatArray, ranges: FloatArray) -> FloatArray:
-    """The point (2,) at these ranges (K,) from these places (K, 2), m, in the sense of linear least squares."""
+    """Return the point (2,) at these ranges (K,) from these places (K, 2), m, in the sense of linear least squares."""
     b = (ranges**2).mean() - ranges**2 + (places**2).sum(axis=1) - (places**2).sum(axis=1).mean()
     return np.asarray(np.linalg.lstsq(2 * (places - places.mean(axis=0)), b, rcond=None)[0])
 
 
 def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
-    """The increment (N, 3, 3) that each row of odometry reports: half the turn, the distance, the other half."""
+    """Return the increment (N, 3, 3) of each row of odometry: half the turn, the distance, the other half."""
     T = np.tile(np.eye(3), (len(turn), 1, 1))
     T[:, :2, :2] = np.stack([np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)], axis=1).reshape(-1, 2, 2)
     T[:, :2, 2] = distance[:, None] * np.stack([np.cos(turn / 2), np.sin(turn / 2)], axis=1)

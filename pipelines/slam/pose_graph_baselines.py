@@ -1,4 +1,4 @@
-"""What GTSAM's own optimisers make of a pose graph: the baselines for ours, on the same factors.
+"""Baselines for the optimisation of pose graphs: GTSAM's own optimisers on the same factors.
 
 * Levenberg-Marquardt from the guess in the graph;
 * iSAM2 with QR factorisation (with Cholesky it throws on badly conditioned graphs), a few poses at a time, each
@@ -68,7 +68,7 @@ def isam2(graph: PoseGraph, batch: int = 10) -> float:
 
 
 def _arrivals(graph: PoseGraph) -> Iterator[tuple[int, list[int]]]:
-    """Each row but the first, the lowest that is connected with earlier ones, and its edges to those (latest first)."""
+    """Yield each row but the first, lowest of those next to earlier ones, and its edges to these (latest first)."""
     edges_of: list[list[tuple[int, int]]] = [[] for _ in range(len(graph))]
     for edge, (i, j) in enumerate(zip(graph.first.tolist(), graph.second.tolist(), strict=True)):
         edges_of[i].append((j, edge))

@@ -36,7 +36,7 @@ LINE = LineLandmark()
 
 @dataclass(frozen=True)
 class ScanLandmarkSettings:
-    """Which landmarks are looked for, and how."""
+    """Settings of the detection of landmarks in a scan."""
 
     ground: bool = setting(False, "the ground as one plane: for level places only")
     walls: int = setting(6, "walls of a scan at most, the largest ones")

@@ -1,6 +1,6 @@
-"""Poles beside a simulated road: where they stand and how a LiDAR sees them.
+"""Poles beside a simulated road, and their observations by a LiDAR.
 
-They stand on both sides of the driven path, `offset` m from it, `gap` m apart with some scatter. From each pose those
+Poles are on both sides of the driven path, `offset` m from it, `gap` m apart with some scatter. From each pose those
 within `reach` are observed, each with the chance `seen`, with independent noise ahead and to the left.
 """
 
@@ -22,7 +22,7 @@ from saga_fg.types.landmark import Observation
 
 @dataclass(frozen=True)
 class SimulatedPoleSettings(Settings):
-    """Poles and how they are seen."""
+    """Poles and their observation."""
 
     gap: Positive = setting(25.0, "mean distance between poles of one side, m")
     offset: Positive = setting(9.0, "mean distance of a pole from the path, m")
@@ -32,7 +32,7 @@ class SimulatedPoleSettings(Settings):
 
 
 def observe_poles(world_T_ego: FloatArray, seed: int, settings: SimulatedPoleSettings | None = None) -> Observations:
-    """What is seen of poles from true poses (n, 4, 4); the same for the same seed."""
+    """Observe poles from true poses (n, 4, 4); the same seed gives the same poles and noise."""
     settings = settings or SimulatedPoleSettings()
     rng = np.random.default_rng(seed)
     poles = _poles(world_T_ego, settings, rng)
@@ -47,12 +47,12 @@ def observe_poles(world_T_ego: FloatArray, seed: int, settings: SimulatedPoleSet
 
 
 def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
-    """What is seen of poles at frames, which have true poses."""
+    """Observe poles at frames with true poses."""
     return observe_poles(np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None]), seed)
 
 
 def _poles(world_T_ego: FloatArray, settings: SimulatedPoleSettings, rng: np.random.Generator) -> FloatArray:
-    """(m, 3) places at a man's height, along the path and straight on beyond its end."""
+    """Return places (m, 3), 1.5 m high, along the path and straight on beyond its end."""
     steps = np.linalg.norm(np.diff(world_T_ego[:, :3, 3], axis=0), axis=1)
     driven = np.concatenate([[0.0], np.cumsum(steps)])
     places = []

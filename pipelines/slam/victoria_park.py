@@ -1,8 +1,8 @@
-"""A drive past trees whose identities nobody tells, from odometry that is worse than it says.
+"""SLAM past trees of unknown identity, with odometry that is worse than its covariances.
 
-The covariances of a recording's odometry are those of errors that come and go from step to step. True ones persist
-(a wheel slips through the whole bend), which adds up to more. So their scale is chosen first, as the likeliest of a few
-on the beginning of the drive (`LandmarkMapper.log_evidence`); the identities in the file have no part in that.
+The covariances of a recording's odometry assume independent errors. True errors persist (a wheel slips through the
+whole bend), and add up to more. So a scale of the covariances is chosen first, the likeliest of a few on the beginning
+of the drive (`LandmarkMapper.log_evidence`); the identities in the file are not used.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _START = 1e-6  # variance of the first pose, m^2 and rad^2
 
 @dataclass(frozen=True)
 class ParkSettings(Settings):
-    """How a drive past trees is mapped."""
+    """Settings of mapping a drive past trees."""
 
     mapper: MapperSettings = settings_group(lambda: MapperSettings(smooth_every=300), "how trees are told apart")
     tree: PointLandmark = settings_group(
@@ -38,7 +38,7 @@ class ParkSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class ParkMap:
-    """map: of trees; odometry_scale: what was chosen; log_evidence: of each scale that was tried."""
+    """map: of trees; odometry_scale: the chosen one; log_evidence: of each scale that was tried."""
 
     map: LandmarkMap
     odometry_scale: float
@@ -64,7 +64,7 @@ def _driven(
     poses: int | None,
     progress: Progress | None,
 ) -> LandmarkMapper:
-    """The mapper after the first poses, or all of them."""
+    """Return the mapper after the first poses, or all of them."""
     mapper = LandmarkMapper(np.eye(3), _START * np.eye(3), settings.mapper)
     total = min(poses or len(drive.a_T_b) + 1, len(drive.a_T_b) + 1)
     begin = np.searchsorted(drive.pose, np.arange(total + 1))

@@ -106,7 +106,7 @@ def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path: 
     assert 0 < overall["tracked"] <= overall["labels"]
     assert 0 < overall["position"] < 1
     assert 0 < overall["detection"] < 1
-    assert 0 < figures["calibration"]["overall"]["held"]["0.9"] <= 1
+    assert 0 < figures["calibration"]["overall"]["coverage"]["0.9"] <= 1
     assert figures["hota"]["car"]["2D"]["hota"] >= figures["hota"]["car"]["3D"]["hota"] > 0.2
     assert "HOTA, CLEAR and Identity" in result.stdout
     assert figures["innovations"]["car"]["matches"] > 20

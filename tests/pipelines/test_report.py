@@ -30,9 +30,8 @@ from pipelines.report import (
     scene_of_run,
 )
 from pipelines.report.charts import SHARES
-from pipelines.report.edges import edges_of_moments
 from pipelines.report.run_record import record_path, write_run_record
-from pipelines.report.scenes import scene_data
+from pipelines.report.scenes import edges_of_moments, scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
 

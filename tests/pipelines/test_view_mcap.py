@@ -109,10 +109,10 @@ def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path: Path, show
     write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown)))
     topics = read_back(tmp_path / "a.mcap")
     boxes = topics[f"{ROOT}/saga/boxes"]
-    assert [len(each.content.entities) for each in boxes] == np.bincount(table.moment, minlength=len(scene)).tolist()
+    assert [len(each.content.entities) for each in boxes] == np.bincount(table.frame, minlength=len(scene)).tolist()
     np.testing.assert_allclose([each.time / 1e9 for each in boxes], scene.timestamps - scene.timestamps[0], atol=1e-6)
     origin, k = scene.world_T_ego[0, :3, 3], len(scene) - 1
-    rows = np.flatnonzero(table.moment == k)
+    rows = np.flatnonzero(table.frame == k)
     entities = boxes[k].content.entities
     assert len(entities) > 5
     assert [entity.id for entity in entities] == table.id[rows].tolist()

@@ -92,7 +92,7 @@ def _with_motion(found: SceneBoxes, table: TrackRows, scene: str) -> SceneBoxes:
     rows = np.flatnonzero(table.scene == scene)
     frame = np.rint(table.timestamp[rows] / FRAME_PERIOD).astype(np.int64)
     row_of = dict(zip(zip(frame.tolist(), table.id[rows].tolist(), strict=True), rows.tolist(), strict=True))
-    wanted = zip(found.moment.tolist(), found.id.tolist(), strict=True)
+    wanted = zip(found.frame.tolist(), found.id.tolist(), strict=True)
     at = np.array([row_of.get(key, -1) for key in wanted], dtype=np.int64)
     known = at >= 0
     velocity, covariance = found.boxes.velocity.copy(), found.position_covariance.copy()

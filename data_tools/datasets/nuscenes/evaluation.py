@@ -83,7 +83,7 @@ def _in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
 
     def near(table: SceneBoxes) -> SceneBoxes:
         reach = np.array([limits.get(label, 0.0) for label in table.boxes.label.tolist()])
-        offset = table.boxes.position[:, :2] - scene.ego_position[table.moment]
+        offset = table.boxes.position[:, :2] - scene.ego_position[table.frame]
         return table.select(np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) < reach))
 
     return near(scene.truth), near(scene.found)

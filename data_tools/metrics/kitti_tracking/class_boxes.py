@@ -1,9 +1,9 @@
-"""The rows of one class, and which of them count: the rules of the KITTI tracking benchmark.
+"""The boxes of one class, and those exempt from evaluation by the rules of the KITTI tracking benchmark.
 
-A class is scored together with its neighbour (car: van; pedestrian: person sitting), so that a detector which cannot
-tell them apart is not charged. True boxes count unless they are of the neighbour class, truncated, or occluded beyond
-"largely"; those may be matched but are neither found nor missed. Found boxes that match nothing are let pass if they
-are of the neighbour class, at most 25 px high in the image, or lie for more than half in a DontCare area.
+A class is scored together with its neighbour (car: van; pedestrian: person sitting), so that confusing the two is not
+an error. True boxes count unless they are of the neighbour class, truncated, or occluded beyond "largely"; those may be
+matched but count neither as found nor as missed. Unmatched found boxes are not false positives if they are of the
+neighbour class, at most 25 px high in the image, or lie by more than half in a DontCare area.
 
 Source: Geiger et al., Are we ready for autonomous driving?, CVPR 2012, and the benchmark's evaluation rules,
 https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
@@ -18,6 +18,7 @@ import numpy as np
 
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
 
 NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting"}
@@ -39,12 +40,12 @@ class KittiTrackingSequence:
 
 
 @dataclass(frozen=True, eq=False)
-class ClassBoxes:
+class ClassBoxes(Columns):
     """N rows of one class (and its neighbour) over all sequences, in order of frame key.
 
     frame_key  (N,) number of sequence and frame, the same for true and found rows
     identity   (N,) number of the object or track, from 0, over all sequences
-    exempt     (N,) true boxes that need not be found; found boxes that need not match
+    exempt     (N,) true boxes that are no misses, found boxes that are no false positives
     boxes      in an upright frame
     score      (N,) of found boxes
     """
@@ -55,18 +56,15 @@ class ClassBoxes:
     boxes: Boxes
     score: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.frame_key)
 
-
-def true_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
+def true_boxes(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
     """The true boxes of a class (name in lower case)."""
     kept = [_of_class(sequence.truth, label) for sequence in sequences]
-    exempt = [hardly_seen(rows) | _neighbour(rows, label) for rows in kept]
+    exempt = [is_hidden(rows) | _neighbour(rows, label) for rows in kept]
     return _joined(kept, exempt, _frames(sequences))
 
 
-def found_rows(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
+def found_boxes(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
     """The found boxes of a class (name in lower case)."""
     kept = [_of_class(sequence.found, label) for sequence in sequences]
     exempt = [
@@ -92,20 +90,20 @@ def _neighbour(objects: KittiObjects, label: str) -> BoolArray:
     return np.asarray(np.char.lower(objects.type) != label)
 
 
-def hardly_seen(objects: KittiObjects) -> BoolArray:
-    """(N,) which true objects are truncated, or occluded beyond "largely"."""
+def is_hidden(objects: KittiObjects) -> BoolArray:
+    """(N,) True for objects that are truncated, or occluded beyond "largely"."""
     return np.asarray(
         (np.trunc(objects.truncated) > MAX_TRUNCATION) | (np.trunc(objects.occluded) > MAX_OCCLUSION), dtype=np.bool_
     )
 
 
 def is_small(objects: KittiObjects) -> BoolArray:
-    """(N,) which objects are too low in the image to be asked for."""
+    """(N,) True for objects too low in the image to be evaluated."""
     return np.asarray(np.abs(objects.bbox[:, 1] - objects.bbox[:, 3]) <= MIN_HEIGHT, dtype=np.bool_)
 
 
 def _frames(sequences: Sequence[KittiTrackingSequence]) -> int:
-    """More than the highest frame number."""
+    """Number of frames: one more than the highest frame number."""
     return 1 + max((int(o.frame.max(initial=0)) for s in sequences for o in (s.truth, s.found)), default=0)
 
 
@@ -117,18 +115,13 @@ def _joined(parts: Sequence[KittiObjects], exempt: Sequence[BoolArray], frames: 
     _, identity = np.unique(owner, axis=0, return_inverse=True)
     score = np.concatenate([np.empty(0), *(part.score for part in parts)])
     boxes = Boxes.concatenate([camera_boxes_to_world(part.boxes, part.type, UPRIGHT_T_CAMERA) for part in parts])
-    order = np.argsort(frame_key, kind="stable")
-    return ClassBoxes(
-        frame_key[order],
-        identity.reshape(-1)[order],
-        np.concatenate([np.empty(0, dtype=np.bool_), *exempt])[order],
-        boxes.select(order),
-        np.nan_to_num(score, nan=NO_SCORE)[order],
-    )
+    exempt_rows = np.concatenate([np.empty(0, dtype=np.bool_), *exempt])
+    joined = ClassBoxes(frame_key, identity.reshape(-1), exempt_rows, boxes, np.nan_to_num(score, nan=NO_SCORE))
+    return joined.select(np.argsort(frame_key, kind="stable"))
 
 
 def in_ignored_area(rows: KittiObjects, truth: KittiObjects) -> BoolArray:
-    """(N,) which rows lie with more than half of their image box in one DontCare area of their frame."""
+    """(N,) True for boxes with more than half of their image box in one DontCare area of their frame."""
     areas = truth.select(np.char.lower(truth.type) == "dontcare")
     order = np.argsort(areas.frame, kind="stable")
     frame = areas.frame[order]

@@ -1,12 +1,12 @@
-"""Which boxes HOTA judges on KITTI: what the benchmark does not ask for is neither found nor false.
+"""The objects that HOTA evaluates on KITTI, by the rules of the benchmark.
 
 Frame by frame, found boxes of the class are matched to true ones of the class and its neighbour (car: van; pedestrian:
-person sitting) by the overlap of their image boxes, at least 0.5, with the largest sum. Found boxes are taken out
+person sitting) by the overlap of their image boxes, at least 0.5, with the largest sum. Found boxes are removed
 
 * that match a true one which is of the neighbour class, truncated, or occluded beyond "largely";
-* that match nothing and are at most 25 px high in the image, or lie for more than half in a DontCare area.
+* that match nothing and are at most 25 px high in the image, or lie by more than half in a DontCare area.
 
-Then such true boxes are taken out. What is left is compared by any similarity: "image", the overlap of the image boxes,
+Then such true boxes are removed. The others are compared by any similarity: "image", the overlap of the image boxes,
 is that of the benchmark. Source: preprocessing of the benchmark's evaluation, `trackeval.datasets.Kitti2DBox`.
 """
 
@@ -24,8 +24,8 @@ from data_tools.metrics.kitti_tracking.class_boxes import (
     NEIGHBOUR,
     UPRIGHT_T_CAMERA,
     KittiTrackingSequence,
-    hardly_seen,
     in_ignored_area,
+    is_hidden,
     is_small,
 )
 from saga_fg.numerics.arrays import BoolArray, FloatArray
@@ -41,11 +41,13 @@ def kitti_hota_metrics(
     similarity: KittiSimilarity = "image",
     threshold: float = 0.5,
 ) -> HotaMetrics:
-    """Figures of class `label` (in lower case) over all sequences; CLEAR and Identity count pairs from `threshold` on.
+    """Metrics of class `label` (in lower case) over all sequences; CLEAR and Identity count pairs from `threshold` on.
 
     Objects without a 3D box overlap with nothing in space. Raises `MissingExtraError` without trackeval.
     """
-    return similarity_metrics([_compared(*_judged(each, label), similarity) for each in sequences], threshold)
+    return similarity_metrics(
+        [_scene_similarities(*_evaluated(each, label), similarity) for each in sequences], threshold
+    )
 
 
 def image_overlaps(a: KittiObjects, b: KittiObjects) -> FloatArray:
@@ -61,20 +63,20 @@ def _areas(objects: KittiObjects) -> FloatArray:
     return np.asarray((objects.bbox[:, 2:] - objects.bbox[:, :2]).prod(axis=1))
 
 
-def _judged(sequence: KittiTrackingSequence, label: str) -> tuple[KittiObjects, KittiObjects]:
-    """The true and the found objects that count."""
+def _evaluated(sequence: KittiTrackingSequence, label: str) -> tuple[KittiObjects, KittiObjects]:
+    """The true and the found objects that are evaluated."""
     types = np.char.lower(sequence.truth.type)
     asked = (types == label) | (types == NEIGHBOUR.get(label, label))
     truth = sequence.truth.select(asked & (sequence.truth.track_id >= 0))
     found = sequence.found.select((np.char.lower(sequence.found.type) == label) & (sequence.found.track_id >= 0))
-    exempt = hardly_seen(truth) | (np.char.lower(truth.type) != label)
+    exempt = is_hidden(truth) | (np.char.lower(truth.type) != label)
     matched, out = _matches(truth, found, exempt)
     out |= ~matched & (is_small(found) | in_ignored_area(found, sequence.truth))
     return truth.select(~exempt), found.select(~out)
 
 
 def _matches(truth: KittiObjects, found: KittiObjects, exempt: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """(M,) which found boxes match a true one, and which of these one that is exempt (N,)."""
+    """(M,) found boxes that match a true one, and those that match an exempt one; exempt (N,)."""
     matched, of_exempt = np.zeros(len(found), dtype=np.bool_), np.zeros(len(found), dtype=np.bool_)
     for frame in np.intersect1d(truth.frame, found.frame).tolist():
         i, j = np.flatnonzero(truth.frame == frame), np.flatnonzero(found.frame == frame)
@@ -87,8 +89,8 @@ def _matches(truth: KittiObjects, found: KittiObjects, exempt: BoolArray) -> tup
     return matched, of_exempt
 
 
-def _compared(truth: KittiObjects, found: KittiObjects, similarity: KittiSimilarity) -> SceneSimilarities:
-    """Frame by frame."""
+def _scene_similarities(truth: KittiObjects, found: KittiObjects, similarity: KittiSimilarity) -> SceneSimilarities:
+    """Names and similarities, frame by frame."""
     frames = range(1 + max(int(truth.frame.max(initial=-1)), int(found.frame.max(initial=-1))))
     pairs = [(truth.select(truth.frame == k), found.select(found.frame == k)) for k in frames]
     return SceneSimilarities(

@@ -1,4 +1,4 @@
-"""KITTI 3D multi-object tracking metrics, averaged over recall: sAMOTA, AMOTA, AMOTP and the CLEAR figures.
+"""KITTI 3D multi-object tracking metrics, averaged over recall: sAMOTA, AMOTA, AMOTP and the CLEAR metrics.
 
 True and found boxes of a class are matched frame by frame: as many pairs of at least the wanted 3D IoU as possible, and
 among those the largest sum of IoU. Thresholds on the mean score of a track are set where the recall comes nearest to
@@ -9,9 +9,9 @@ among those the largest sum of IoU. Thresholds on the mean score of a track are 
     MOTP   = mean 3D IoU of the pairs
     sAMOTA, AMOTA, AMOTP: sums of sMOTA, MOTA, MOTP over the thresholds that are reached, divided by 40
 
-and the CLEAR figures at the threshold with the highest MOTA. Written anew from the paper and made to agree with its
-authors' evaluation, whose peculiarity it keeps: thresholds are run from few tracks to many, after a run with all, and a
-found box that matched in any of these runs is never let pass (`class_boxes`) in a later one.
+and the CLEAR metrics at the threshold with the highest MOTA. Implemented from the paper, with results equal to its
+authors' evaluation: thresholds are run from few tracks to many, after a run with all, and a found box that matched in
+any of these runs is never exempt (`class_boxes`) in a later one.
 
 Source: Weng et al., 3D Multi-Object Tracking: A Baseline and New Evaluation Metrics, IROS 2020, section IV.
 """
@@ -23,13 +23,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.metrics.assignment import Candidates, optimal_pairs
+from data_tools.metrics.assignment import Candidates, best_pairs, optimal_pairs
 from data_tools.metrics.kitti_tracking.class_boxes import (
     ClassBoxes,
     KittiTrackingSequence,
-    found_rows,
+    found_boxes,
     joined_ranges,
-    true_rows,
+    true_boxes,
 )
 from data_tools.metrics.kitti_tracking.track_scores import track_scores
 from data_tools.metrics.kitti_tracking.trajectory_counts import TrajectoryCounts, trajectory_counts
@@ -41,7 +41,7 @@ RECALLS = 40
 
 @dataclass(frozen=True)
 class KittiTrackingMetrics:
-    """Figures of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
+    """Metrics of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
 
     gt: true boxes that count; mt, ml: shares of trajectories mostly tracked, mostly lost; tp, recall and precision
     include pairs with true boxes that don't count. All but samota, amota, amotp are at the `threshold` on a track's
@@ -69,17 +69,17 @@ class KittiTrackingMetrics:
 def kitti_tracking_metrics(
     sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float
 ) -> KittiTrackingMetrics | None:
-    """Figures of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
+    """Metrics of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
 
     Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. Raises `InputError` for objects
     of the class without a 3D box.
     """
-    true, found = true_rows(sequences, label.lower()), found_rows(sequences, label.lower())
+    true, found = true_boxes(sequences, label.lower()), found_boxes(sequences, label.lower())
     gt = int((~true.exempt).sum())
     if gt == 0:
         return None
     candidates = _candidates(true, found, min_iou)
-    everything = optimal_pairs(candidates, np.ones((len(candidates), 1), dtype=np.bool_))[:, 0]
+    everything = best_pairs(candidates)
     mean = track_scores(found.score, found.identity, 1)[:, 0]
     thresholds, recalls = _thresholds(true, candidates, everything, mean)
 
@@ -113,7 +113,7 @@ def kitti_tracking_metrics(
 
 @dataclass(frozen=True, eq=False)
 class _Runs:
-    """Counts of R runs, each with other tracks left in.
+    """Counts of R runs, each with other tracks present.
 
     tp, fn, fp, trajectories, overlap (sum of the pairs' IoU)  (R,)
     matched  (M,) found boxes that matched in any run up to the last

@@ -3,7 +3,7 @@
 The reference evaluation replaces the score of every box by the mean over its track, and does so again before each
 further run. The mean of n equal numbers, added up one after the other, need not be that number in its last bit; and
 since every threshold *is* the score of some track, that track then fails its own threshold or passes it. With few
-tracks this moves the averages by whole points, so figures are comparable only if the rounding is repeated.
+tracks this changes the averages by whole points, so results are comparable only if the rounding is repeated.
 """
 
 from __future__ import annotations

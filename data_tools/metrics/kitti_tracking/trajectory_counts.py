@@ -30,9 +30,9 @@ class TrajectoryCounts:
 
 
 def trajectory_counts(track: IntArray, identity: IntArray, exempt: BoolArray) -> TrajectoryCounts:
-    """Figures of `track` (N, T), the track matched to each row or -1, rows sorted by `identity` (N,), then frame.
+    """Counts for `track` (N, T), the track matched to each row or -1, rows sorted by `identity` (N,), then frame.
 
-    exempt (N,): rows in which the object does not count. N > 0.
+    exempt (N,): rows in which the object is exempt. N > 0.
     """
     start = np.flatnonzero(np.diff(identity, prepend=identity[0] - 1))
     length = np.diff(start, append=len(identity))

@@ -1,4 +1,4 @@
-"""How good are labels? Detections, online tracks and smoothed labels side by side, and what they say without truth."""
+"""Metrics of labels: detections, online tracks and smoothed labels against ground truth, and without it."""
 
 from data_tools.metrics.labels.common_boxes import (
     QUANTITIES,

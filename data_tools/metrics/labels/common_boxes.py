@@ -1,8 +1,8 @@
-"""Errors of several systems on the same true boxes: those that every one of them matches.
+"""Errors of several systems on common true boxes: those that every system matches.
 
-Pairs are the nearest within a gate, moment by moment and class by class (`nearest_pairs`): first with the visible
-objects, then, of the boxes left over, with the hidden ones. Whoever finds more boxes finds the hard ones, so that only
-the boxes that all have found compare the systems.
+Pairs are the nearest within a gate, frame by frame and class by class (`nearest_pairs`): first with the visible
+objects, then, of the remaining boxes, with the hidden ones. A system that finds more boxes also finds more difficult
+ones, so systems are compared on the boxes that all of them find.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 from data_tools.metrics.consistency import nees
+from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.nearest_pairs import nearest_pairs
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
@@ -24,10 +25,10 @@ QUANTITIES = ("position", "heading", "size", "velocity", "nees")
 
 @dataclass(frozen=True, eq=False)
 class LabelledScene:
-    """One scene: N true boxes and what several systems say.
+    """One scene: N true boxes, and the boxes of several systems.
 
     truth     all objects, hidden ones too
-    visible   (N,) whether a sensor could see the object
+    visible   (N,) True for objects that a sensor could see
     velocity  (N, 2) m/s, NaN where unknown
     distance  (N,) from the vehicle, m
     systems   boxes by name of the system
@@ -77,19 +78,13 @@ class CommonBoxes:
             errors,
         )
 
-    def known(self, system: str, quantity: str) -> FloatArray:
-        """The errors that are known."""
-        column = self.errors[system][quantity]
-        return column[np.isfinite(column)]
-
-    def rmse(self, system: str, quantity: str) -> float:
-        """Root of the mean square of what is known, NaN without any."""
-        known = self.known(system, quantity)
-        return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+    def sample(self, system: str, quantity: str) -> ErrorSample:
+        """The known errors of a system."""
+        return ErrorSample.known(self.errors[system][quantity])
 
 
 def common_boxes(scene: LabelledScene, gate: float) -> CommonBoxes:
-    """The true boxes that every system has within `gate` (m), with the errors of each."""
+    """The true boxes that every system matches within `gate` (m), with the errors of each system."""
     errors = {name: _errors(scene, table, gate) for name, table in scene.systems.items()}
     found = np.ones(len(scene.truth), dtype=np.bool_)
     for of in errors.values():
@@ -101,12 +96,12 @@ def common_boxes(scene: LabelledScene, gate: float) -> CommonBoxes:
 def visible_then_hidden(
     truth: SceneBoxes, visible: BoolArray, found: SceneBoxes, gate: float
 ) -> tuple[IntArray, IntArray]:
-    """Rows of true boxes and of found boxes that are pairs: visible objects first, hidden ones of what is left."""
+    """Rows of matched true and found boxes: visible objects are matched first, then hidden ones."""
     free = np.arange(len(found))
     pairs = []
     for rows in (np.flatnonzero(visible), np.flatnonzero(~visible)):
         a, b = truth.select(rows), found.select(free)
-        i, j, _ = nearest_pairs((a.moment, a.boxes), (b.moment, b.boxes), gate)
+        i, j, _ = nearest_pairs((a.frame, a.boxes), (b.frame, b.boxes), gate)
         pairs.append((rows[i], free[j]))
         free = np.setdiff1d(free, free[j])
     return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
@@ -122,7 +117,5 @@ def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> dict[str, F
     columns["heading"][row] = np.abs(wrap_angle(b.yaw - a.yaw))
     columns["size"][row] = np.abs(b.size - a.size).mean(axis=1)
     columns["velocity"][row] = np.hypot(*(b.velocity - scene.velocity[row]).T)
-    P = found.position_covariance[column]
-    known = np.isfinite(P).all(axis=(1, 2))
-    columns["nees"][row[known]] = nees(offset[known], P[known])
+    columns["nees"][row] = nees(offset, found.position_covariance[column])
     return columns

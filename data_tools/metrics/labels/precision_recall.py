@@ -1,8 +1,8 @@
-r"""Precision and recall of boxes at a distance, and the recall of several systems at one precision.
+"""Precision and recall of boxes within a matching distance.
 
-A box is true if it is matched to a visible object within the distance: boxes of the same moment and class choose in
-order of their scores, each the nearest object that is free (the matching of the nuScenes detection benchmark,
-https://www.nuscenes.org/object-detection, "Matching"). Boxes at hidden objects count neither way. Over a threshold on
+A box is a true positive if it is matched to a visible object within the distance: in order of their scores, boxes take
+the nearest free object of their frame and class (the matching of the nuScenes detection benchmark,
+https://www.nuscenes.org/object-detection, "Matching"). Boxes matched to hidden objects are ignored. Over a threshold on
 the score,
 
     precision = true / (true + false),   recall = true / visible objects
@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from data_tools.metrics.nearest_pairs import near_pairs
 from data_tools.metrics.scene_boxes import SceneBoxes
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 
 class ScoredPairs(NamedTuple):
-    """The boxes of a system that count: score (B,), whether each is true (B,), and how many objects there were."""
+    """Boxes of a system that count: score (B,), true (B,) for true positives, and the number of visible objects."""
 
     score: FloatArray
     true: BoolArray
@@ -30,7 +30,7 @@ class ScoredPairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecall:
-    """The curve from the highest score down: precision (B,) and recall (B,)."""
+    """Precision (B,) and recall (B,) for falling score thresholds."""
 
     precision: FloatArray
     recall: FloatArray
@@ -50,21 +50,23 @@ class PrecisionRecall:
         return float(self.precision[k]), float(self.recall[k])
 
     def recall_at(self, precision: float) -> float:
-        """The largest recall with at least this precision, 0 if it is never reached."""
+        """The largest recall with at least this precision; 0 if there is none."""
         return float(self.recall[self.precision >= precision].max(initial=0.0))
 
 
 def scored_pairs(truth: SceneBoxes, visible: BoolArray, found: SceneBoxes, distance: float) -> ScoredPairs:
     """Match the boxes of one scene within `distance`, m; visible (N,) of the true boxes."""
-    object_, box = _candidates(truth, found, distance)
+    i, j, apart = near_pairs((truth.frame, truth.boxes), (found.frame, found.boxes), distance)
+    order = np.lexsort((apart, j, -found.score[j]))  # by falling score, then by distance
     taken = np.zeros(len(truth), dtype=np.bool_)
     true = np.zeros(len(found), dtype=np.bool_)
     counts = np.ones(len(found), dtype=np.bool_)
     last = -1
-    for i, j in zip(object_.tolist(), box.tolist(), strict=True):  # in order of score, then of distance
-        if j == last or taken[i]:
+    for row, column in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        if column == last or taken[row]:
             continue
-        taken[i], true[j], counts[j], last = True, visible[i], visible[i], j
+        taken[row], last = True, column
+        true[column] = counts[column] = visible[row]
     return ScoredPairs(found.score[counts], true[counts], int(visible.sum()))
 
 
@@ -75,25 +77,5 @@ def precision_recall(scenes: list[ScoredPairs]) -> PrecisionRecall:
     objects = sum(scene.objects for scene in scenes)
     order = np.argsort(-score, kind="stable")
     hits = np.cumsum(true[order])
-    last = np.flatnonzero(np.diff(score[order], append=-np.inf) < 0)  # boxes of equal score come together
+    last = np.flatnonzero(np.diff(score[order], append=-np.inf) < 0)  # boxes of equal score share one threshold
     return PrecisionRecall(hits[last] / (last + 1), hits[last] / max(objects, 1))
-
-
-def _candidates(truth: SceneBoxes, found: SceneBoxes, distance: float) -> tuple[IntArray, IntArray]:
-    """Rows of objects and boxes of one moment and class within the distance, by falling score, then by distance."""
-    if len(truth) == 0 or len(found) == 0:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    labels = np.unique(np.concatenate([truth.boxes.label, found.boxes.label]))
-    origin = truth.boxes.position[0, :2]
-    a, b = (
-        np.column_stack(
-            [
-                table.boxes.position[:, :2] - origin,
-                3.0 * distance * (table.moment * len(labels) + np.searchsorted(labels, table.boxes.label)),
-            ]
-        )
-        for table in (truth, found)
-    )
-    near = cKDTree(a).sparse_distance_matrix(cKDTree(b), distance, output_type="ndarray")
-    order = np.lexsort((near["v"], near["j"], -found.score[near["j"]]))
-    return near["i"][order], near["j"][order]

@@ -1,4 +1,4 @@
-"""The figures that the nuScenes tracking task reports, for one class and over all classes."""
+"""The metrics of the nuScenes tracking task, for one class and over all classes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SUMMED = frozenset({"gt", "tp", "fp", "fn", "ids", "frag", "mt", "ml"})
 
 @dataclass(frozen=True)
 class NuScenesClassMetrics:
-    """Figures of one class, at the threshold with the highest MOTA (amota and amotp: over all); NaN where undefined.
+    """Metrics of one class, at the threshold with the highest MOTA (amota and amotp: over all); NaN where undefined.
 
     amota   mean over the sweep of MOTAR = max(0, 1 - (ids + fp + fn - (1 - r) gt) / (r gt)), r = tp / gt
     amotp   mean over the sweep of MOTP, m
     mota    max(0, 1 - (ids + fp + fn) / gt);  motp  mean distance of the pairs, m;  recall  (tp + ids) / gt
-    gt      true boxes, those put into gaps included
+    gt      true boxes, including those interpolated in gaps
     tp      matches that are no switches;  fp, fn  false and missed boxes;  ids  identity switches;  frag  fragments
     mt, ml  objects mostly tracked, mostly lost;  faf  false alarms per 100 frames
     tid, lgd  mean time to the first match, mean longest gap, s

@@ -1,4 +1,4 @@
-"""Figures that follow one object over time, at all thresholds at once: coverage, fragments, delays and gaps.
+"""Coverage of each object over time, at all thresholds at once: tracked share, fragments, delays and gaps.
 
     ratio   frames with a track / frames of the object       mostly tracked: >= 0.8, mostly lost: < 0.2
     FRAG    changes from tracked to missed between the first and the last tracked frame
@@ -20,7 +20,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class TrackCoverage:
-    """Each (T,): of the objects of one class, at T thresholds."""
+    """Coverage of the objects of one class at T thresholds, each (T,)."""
 
     mostly_tracked: IntArray
     mostly_lost: IntArray
@@ -30,7 +30,7 @@ class TrackCoverage:
 
 
 def track_coverage(tracked: BoolArray, identity: IntArray, period: float) -> TrackCoverage:
-    """Figures of `tracked` (N, T), whose rows are sorted by `identity` (N,), then time; `period` in s. N > 0."""
+    """Coverage from `tracked` (N, T), whose rows are sorted by `identity` (N,), then time; `period` in s. N > 0."""
     start = np.flatnonzero(np.diff(identity, prepend=identity[0] - 1))
     length = np.diff(start, append=len(identity))
     owner = np.repeat(np.arange(len(start)), length)

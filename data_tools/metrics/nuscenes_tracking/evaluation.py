@@ -1,9 +1,9 @@
-"""The nuScenes tracking metrics: AMOTA, AMOTP and the figures at the best threshold, per class and over all.
+"""The nuScenes tracking metrics: AMOTA, AMOTP and the metrics at the best threshold, per class and over all.
 
 For each class, thresholds on the track score are chosen such that recall takes 40 values from 0.1 to 1, by
-interpolating the scores of the matched boxes; a threshold that several recalls share is run once and counted several
-times; where a recall is not reached the worst value is charged. Written anew from the task's definition and equal to
-the official evaluation (`nuscenes.eval.tracking`, configuration `tracking_nips_2019`), whose peculiarities it keeps.
+interpolating the scores of the matched boxes; a threshold shared by several recalls is evaluated once and counted
+several times; a recall that is not reached counts with the worst value. Implemented from the definition of the task,
+with results equal to the official evaluation (`nuscenes.eval.tracking`, configuration `tracking_nips_2019`).
 
 Sources: https://www.nuscenes.org/tracking; Caesar et al., nuScenes, CVPR 2020; Weng et al., AB3DMOT, IROS 2020.
 """
@@ -34,7 +34,7 @@ class NuScenesTrackingScene:
     ego_position  (K, 2) of the vehicle when its LiDAR fired, m
     truth         true boxes with at least one LiDAR or radar point
     found         the tracker's boxes
-    racks         boxes of bicycle racks at each of the K moments; empty: there are none
+    racks         boxes of bicycle racks at each of the K frames; empty: there are none
     """
 
     timestamps: FloatArray
@@ -45,22 +45,22 @@ class NuScenesTrackingScene:
 
     def __post_init__(self) -> None:
         timestamps = checked("timestamps", self.timestamps, (None,))
-        moments = len(timestamps)
+        frames = len(timestamps)
         object.__setattr__(self, "timestamps", timestamps)
-        object.__setattr__(self, "ego_position", checked("ego_position", self.ego_position, (moments, 2)))
+        object.__setattr__(self, "ego_position", checked("ego_position", self.ego_position, (frames, 2)))
         if (np.diff(timestamps) <= 0).any():
             raise InputError("timestamps: expected increasing times")
-        if len(self.racks) not in (0, moments):
-            raise InputError(f"racks: expected one entry per moment ({moments}) or none, got {len(self.racks)}")
+        if len(self.racks) not in (0, frames):
+            raise InputError(f"racks: expected one entry per frame ({frames}) or none, got {len(self.racks)}")
         for name in ("truth", "found"):
-            last = int(getattr(self, name).moment.max(initial=-1))
-            if last >= moments:
-                raise InputError(f"{name}: expected moments below {moments}, got {last}")
+            last = int(getattr(self, name).frame.max(initial=-1))
+            if last >= frames:
+                raise InputError(f"{name}: expected frames below {frames}, got {last}")
 
 
 @dataclass(frozen=True, eq=False)
 class NuScenesTrackingMetrics:
-    """The result: `overall` figures, figures `per_class`, and the `curves` they are drawn from (scored classes)."""
+    """Metrics over all classes and `per_class`, and the recall `curves` of classes with true boxes."""
 
     overall: NuScenesClassMetrics
     per_class: Mapping[str, NuScenesClassMetrics]
@@ -70,7 +70,7 @@ class NuScenesTrackingMetrics:
 def nuscenes_tracking_metrics(
     scenes: Sequence[NuScenesTrackingScene], settings: NuScenesTrackingSettings | None = None
 ) -> NuScenesTrackingMetrics:
-    """Score the tracks of `scenes` together. Classes without true boxes have no figures (NaN) and no curves."""
+    """Score the tracks of `scenes` together. Classes without true boxes have NaN metrics and no curves."""
     settings = settings or NuScenesTrackingSettings()
     class_range = dict(settings.class_range)
     true, found = (
@@ -114,7 +114,7 @@ def _thresholds(true: Rows, found: Rows, everything: Sweep, label: int, recalls:
 
 
 def _without_repeats(thresholds: FloatArray) -> FloatArray:
-    """Thresholds (classes, T), in order, with NaN in place of each repeated one: nothing is present there."""
+    """Thresholds (classes, T), in order, with NaN in place of repeated ones, where no box is present."""
     repeated = np.diff(thresholds, axis=1, prepend=np.nan) == 0
     return np.where(repeated, np.nan, thresholds)
 
@@ -122,9 +122,9 @@ def _without_repeats(thresholds: FloatArray) -> FloatArray:
 def _columns(
     true: Rows, found: Rows, matched: Sweep, thresholds: FloatArray, label: int, settings: NuScenesTrackingSettings
 ) -> dict[str, FloatArray]:
-    """The figures of one class at each threshold (T,), NaN where the recall is not reached; a repeat like its first."""
+    """The metrics of one class at each threshold (T,), NaN where the recall is not reached."""
     rows = np.flatnonzero(true.boxes.label == label)
-    rows = rows[np.lexsort((true.boxes.moment[rows], true.boxes.identity[rows]))]
+    rows = rows[np.lexsort((true.boxes.frame[rows], true.boxes.identity[rows]))]
     partner, switched = matched.partner[rows], matched.switched[rows]
     tracked = partner >= 0
     detections, ids = tracked.sum(axis=0), switched.sum(axis=0)
@@ -166,7 +166,7 @@ def _columns(
 def _frames_and_boxes(true: Rows, found: Rows, thresholds: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
     """At each threshold (T,): frames with a true or found box of the class, and found boxes."""
     scenes = int(max(true.scene.max(initial=0), found.scene.max(initial=0))) + 1
-    frame_of = [rows.boxes.moment * scenes + rows.scene for rows in (true, found)]
+    frame_of = [rows.boxes.frame * scenes + rows.scene for rows in (true, found)]
     with_truth = np.unique(frame_of[0][true.boxes.label == label])
     rows = np.flatnonzero(found.boxes.label == label)
     present = found.boxes.score[rows][:, None] >= thresholds
@@ -179,7 +179,7 @@ def _frames_and_boxes(true: Rows, found: Rows, thresholds: FloatArray, label: in
 
 
 def _never_matched(gt: int, objects: int, settings: NuScenesTrackingSettings) -> dict[str, float]:
-    """The figures charged to a class of which no box is ever matched."""
+    """The metrics of a class of which no box is ever matched."""
     unknown = dict.fromkeys(("fp", "ids", "frag"), float("nan"))
     nothing = dict.fromkeys(("recall", "motar", "mota", "mt", "tp"), 0.0)
     duration = dict.fromkeys(("tid", "lgd"), settings.worst_duration)
@@ -188,7 +188,7 @@ def _never_matched(gt: int, objects: int, settings: NuScenesTrackingSettings) ->
 
 
 def _summary(columns: Mapping[str, FloatArray], settings: NuScenesTrackingSettings) -> NuScenesClassMetrics:
-    """The figures at the first threshold with the highest MOTA, and the means over the sweep."""
+    """The metrics at the first threshold with the highest MOTA, and the means over the sweep."""
     best = int(np.nanargmax(columns["mota"]))
     return NuScenesClassMetrics(
         amota=float(np.mean(np.nan_to_num(columns["motar"], nan=0.0))),

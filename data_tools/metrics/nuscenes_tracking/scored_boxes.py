@@ -1,4 +1,4 @@
-"""The boxes that are scored: filtered as the official evaluation filters them, gaps within tracks filled.
+"""The scored boxes: filtered as in the official evaluation, with gaps within tracks interpolated.
 
 Filter (`nuscenes/eval/common/loaders.py`, `filter_eval_boxes`): true boxes and tracks alike are kept within their
 class's distance from the vehicle, in the horizontal plane; bicycles and motorcycles whose centre lies in a box of
@@ -6,12 +6,12 @@ category `static_object.bicycle_rack` are dropped. True boxes without a LiDAR or
 
 Score: each box gets the mean score of its track over the kept boxes.
 
-Gaps (`nuscenes/eval/tracking/loaders.py`, `interpolate_tracks`): where a track skips moments, boxes are put in,
+Gaps (`nuscenes/eval/tracking/loaders.py`, `interpolate_tracks`): where a track skips frames, boxes are interpolated,
 
     x(t) = (1 - r) x_left + r x_right        r = (t_right - t) / (t_right - t_left)
 
-The weights are the wrong way round (r is near 1 next to the left box); the official evaluation has it so, and figures
-are comparable only if it stays so.
+The weights are reversed (r is near 1 next to the left box) like those of the official evaluation, so that metrics are
+comparable.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ RACKED = ("bicycle", "motorcycle")
 class ScoredBoxes(Columns):
     """N scored boxes of one scene, in order of time.
 
-    moment    (N,)   which moment, from 0
+    frame     (N,)   index of the frame, from 0
     identity  (N,)   number of the object or track, from 0 in order of first appearance
     label     (N,)   number of the class
     xy        (N, 2) horizontal centre, m
     score     (N,)   mean score of the track
     """
 
-    moment: IntArray
+    frame: IntArray
     identity: IntArray
     label: IntArray
     xy: FloatArray
@@ -56,31 +56,31 @@ def scored_boxes(
 ) -> ScoredBoxes:
     """Filter a table, average its scores over tracks and fill its gaps.
 
-    ego_position  (K, 2) of the vehicle, m; timestamps (K,) s; racks: bicycle racks at each moment, none if empty.
+    ego_position  (K, 2) of the vehicle, m; timestamps (K,) s; racks: bicycle racks in each frame, empty for none.
     Labels are numbered in the order of `class_range` (label -> m); other classes are dropped.
     """
-    position, moment = table.boxes.position, table.moment
+    position, frame = table.boxes.position, table.frame
     names = list(class_range)
     number = {name: n for n, name in enumerate(names)}
     kinds, which = np.unique(table.boxes.label, return_inverse=True)
     label = np.array([number.get(kind, -1) for kind in kinds.tolist()], dtype=np.int64)[which]
     limit = np.array([*class_range.values(), -np.inf])[label]
-    offset = position[:, :2] - ego_position[moment]
+    offset = position[:, :2] - ego_position[frame]
     kept = np.sqrt(np.sum(offset**2, axis=1)) < limit
     racked = np.isin(label, [number[name] for name in RACKED if name in number])
     for k, boxes in enumerate(racks):
         if len(boxes):
-            near = np.flatnonzero(kept & racked & (moment == k))
+            near = np.flatnonzero(kept & racked & (frame == k))
             kept[near] = ~_inside_any(position[near], boxes)
     rows = np.flatnonzero(kept)
     identity = _numbered(table.id[rows])
     score = _track_means(table.score[rows], identity)
     micros = np.rint(timestamps * 1e6).astype(np.int64)  # the unit of the tables, so that ratios round as they do
-    return _filled(ScoredBoxes(moment[rows], identity, label[rows], position[rows, :2], score), micros)
+    return _filled(ScoredBoxes(frame[rows], identity, label[rows], position[rows, :2], score), micros)
 
 
 def _inside_any(points: FloatArray, boxes: Boxes) -> BoolArray:
-    """Which points (N, 3) lie in at least one of the boxes, faces included."""
+    """Mask of the points (N, 3) that lie in at least one of the boxes, faces included."""
     offset = points[:, None] - boxes.position[None]
     c, s = np.cos(boxes.yaw), np.sin(boxes.yaw)
     local = np.stack(
@@ -107,17 +107,17 @@ def _track_means(score: FloatArray, identity: IntArray) -> FloatArray:
 
 
 def _filled(rows: ScoredBoxes, micros: IntArray) -> ScoredBoxes:
-    """Rows with the gaps of each track filled; what is put in comes last within its moment, by identity."""
-    order = np.lexsort((rows.moment, rows.identity))
+    """Rows with the gaps of each track filled; interpolated rows come last within their frame, by identity."""
+    order = np.lexsort((rows.frame, rows.identity))
     by_track = rows.select(order)
-    gap = np.where(np.diff(by_track.identity) == 0, np.diff(by_track.moment) - 1, 0)
+    gap = np.where(np.diff(by_track.identity) == 0, np.diff(by_track.frame) - 1, 0)
     left = np.repeat(np.arange(len(gap)), gap)
     start = np.repeat(np.cumsum(gap) - gap, gap)
-    moment = by_track.moment[left] + 1 + np.arange(len(left)) - start
+    frame = by_track.frame[left] + 1 + np.arange(len(left)) - start
     a, b = by_track.select(left), by_track.select(left + 1)
-    ratio = (micros[b.moment] - micros[moment]) / (micros[b.moment] - micros[a.moment])
+    ratio = (micros[b.frame] - micros[frame]) / (micros[b.frame] - micros[a.frame])
     xy = (1.0 - ratio[:, None]) * a.xy + ratio[:, None] * b.xy
     score = (1.0 - ratio) * a.score + ratio * b.score
-    added = ScoredBoxes(moment, b.identity, b.label, xy, score)
+    added = ScoredBoxes(frame, b.identity, b.label, xy, score)
     both = rows.extended(added)
-    return both.select(np.argsort(both.moment, kind="stable"))
+    return both.select(np.argsort(both.frame, kind="stable"))

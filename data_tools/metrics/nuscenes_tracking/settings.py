@@ -20,7 +20,7 @@ CLASS_RANGE = {
 
 @dataclass(frozen=True)
 class NuScenesTrackingSettings:
-    """What the nuScenes tracking metrics depend on; the defaults are the official ones."""
+    """Settings of the nuScenes tracking metrics; the defaults are the official ones."""
 
     class_range: Mapping[str, float] = settings_group(
         lambda: dict(CLASS_RANGE), "classes scored, and the distance from the vehicle up to which they are, m"
@@ -31,4 +31,4 @@ class NuScenesTrackingSettings:
     worst_motp: float = setting(2.0, "charged where a recall is not reached, m")
     worst_faf: float = setting(500.0, "reported for a class that is never matched, false alarms per 100 frames")
     worst_duration: float = setting(20.0, "initialisation and gap duration of a class that is never matched, s")
-    sample_period: float = setting(0.5, "time that one frame counts in TID and LGD, s")
+    sample_period: float = setting(0.5, "time thin one frame counts in TID and LGD, s")

@@ -1,19 +1,19 @@
 """CLEAR matching at many score thresholds at once.
 
-At each moment and threshold, tracks below the threshold are absent, and (as in py-motmetrics, whose accumulator the
+In each frame and threshold, tracks below the threshold are absent, and (as in py-motmetrics, whose accumulator the
 official evaluation uses)
 
 1. an object, in order of the table, keeps the track it was matched to last, if that is within the gate;
 2. the rest is assigned by the Hungarian method, as many pairs as possible first, then the least sum of distances;
    a pair whose object was last matched to another track is an identity switch.
 
-Everything but time is vectorised: all scenes, classes and thresholds advance by one moment together.
+Everything but time is vectorised: all scenes, classes and thresholds advance by one frame together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """`ScoredBoxes` of all scenes, in order of moment, then scene; identities are unique over all scenes."""
+    """`ScoredBoxes` of all scenes, in order of frame, then scene; identities are unique over all scenes."""
 
     scene: IntArray
     boxes: ScoredBoxes
@@ -34,19 +34,17 @@ class Rows:
     def of(cls, scenes: Sequence[ScoredBoxes]) -> Rows:
         counts = [int(s.identity.max(initial=-1)) + 1 for s in scenes]
         offset = np.cumsum([0, *counts])
-        joined = ScoredBoxes(
-            np.concatenate([s.moment for s in scenes]),
-            np.concatenate([s.identity + first for s, first in zip(scenes, offset, strict=False)]),
-            *(np.concatenate([getattr(s, name) for s in scenes]) for name in ("label", "xy", "score")),
+        joined = ScoredBoxes.concatenate(
+            [replace(s, identity=s.identity + first) for s, first in zip(scenes, offset, strict=False)]
         )
-        scene = np.repeat(np.arange(len(scenes)), [len(s.moment) for s in scenes])
-        order = np.lexsort((scene, joined.moment))
+        scene = np.repeat(np.arange(len(scenes)), [len(s.frame) for s in scenes])
+        order = np.lexsort((scene, joined.frame))
         return cls(scene[order], joined.select(order), int(offset[-1]))
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """P pairs of a true row and a found row of the same scene, moment and class, in order of found, then true row."""
+    """P pairs of a true row and a found row of the same scene, frame and class, in order of found, then true row."""
 
     true: IntArray
     found: IntArray
@@ -58,7 +56,7 @@ class Sweep:
     """The matching of N true rows at T thresholds.
 
     partner   (N, T) found row, -1 where missed
-    switched  (N, T) whether the match is an identity switch
+    switched  (N, T) identity switches
     distance  (classes, T) sum of the distances of all pairs, m
     """
 
@@ -74,8 +72,8 @@ def candidate_pairs(true: Rows, found: Rows, gate: float) -> Pairs:
     1e-5 m in a distance near zero, in the official figures as in these (there it also depends on the processor).
     """
     scenes = int(max(true.scene.max(initial=0), found.scene.max(initial=0))) + 1
-    true_frame = true.boxes.moment * scenes + true.scene
-    found_frame = found.boxes.moment * scenes + found.scene
+    true_frame = true.boxes.frame * scenes + true.scene
+    found_frame = found.boxes.frame * scenes + found.scene
     frames = np.intersect1d(true_frame, found_frame)
     t0, t1 = np.searchsorted(true_frame, frames), np.searchsorted(true_frame, frames, side="right")
     f0, f1 = np.searchsorted(found_frame, frames), np.searchsorted(found_frame, frames, side="right")
@@ -101,15 +99,15 @@ def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Swee
     last = np.full((true.identities, T), -1, dtype=np.int64)
     label, identity = true.boxes.label, true.boxes.identity
     track, score = found.boxes.identity, found.boxes.score
-    bounds = np.searchsorted(true.boxes.moment[pairs.true], np.arange(true.boxes.moment.max(initial=-1) + 2))
+    bounds = np.searchsorted(true.boxes.frame[pairs.true], np.arange(true.boxes.frame.max(initial=-1) + 2))
     for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         if start == stop:
             continue
         here = Pairs(pairs.true[start:stop], pairs.found[start:stop], pairs.distance[start:stop])
         present = score[here.found][:, None] >= thresholds[label[here.true]]
         remembered = last[identity[here.true]]
-        kept = _first_claims(present & (remembered == track[here.found][:, None]), here.found)
-        free = present & ~_taken(kept, here.true) & ~_taken(kept, here.found)
+        kept = _first_of_each(present & (remembered == track[here.found][:, None]), here.found)
+        free = present & ~_used(kept, here.true) & ~_used(kept, here.found)
         group = true.scene[here.true] * classes + label[here.true]
         pair, at = np.nonzero(optimal_pairs(Candidates(here.true, here.found, here.distance, group), free))
         rows = here.true[pair]
@@ -123,18 +121,18 @@ def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Swee
     return Sweep(partner, switched, total.reshape(classes, T))
 
 
-def _first_claims(claims: BoolArray, found: IntArray) -> BoolArray:
-    """Of the claims (P, T) on each found row (P,), sorted, only the first stays."""
+def _first_of_each(wanted: BoolArray, found: IntArray) -> BoolArray:
+    """The first of the wanted (P, T) on each found row (P,); the rows are sorted."""
     start = np.flatnonzero(np.diff(found, prepend=-1))
-    count = np.cumsum(claims, axis=0, dtype=np.int32)
-    before = (count[start] - claims[start])[np.repeat(np.arange(len(start)), np.diff(start, append=len(found)))]
-    return np.asarray(claims & (count - before == 1))
+    count = np.cumsum(wanted, axis=0, dtype=np.int32)
+    before = (count[start] - wanted[start])[np.repeat(np.arange(len(start)), np.diff(start, append=len(found)))]
+    return np.asarray(wanted & (count - before == 1))
 
 
-def _taken(kept: BoolArray, row: IntArray) -> BoolArray:
-    """(P, T): whether the pair's row is part of a kept pair."""
+def _used(kept: BoolArray, row: IntArray) -> BoolArray:
+    """(P, T): True if the pair's row is part of a kept pair."""
     first = int(row.min())
-    taken = np.zeros((int(row.max()) - first + 1, kept.shape[1]), dtype=np.bool_)
+    used = np.zeros((int(row.max()) - first + 1, kept.shape[1]), dtype=np.bool_)
     pair, at = np.nonzero(kept)
-    taken[row[pair] - first, at] = True
-    return np.asarray(taken[row - first])
+    used[row[pair] - first, at] = True
+    return np.asarray(used[row - first])

@@ -1,4 +1,4 @@
-"""A pose graph: poses, and what was measured between pairs of them.
+"""A pose graph: poses, and measurements between pairs of them.
 
     first_T_second = world_T_first^-1 world_T_second,     measured with information Omega
 
@@ -63,12 +63,12 @@ class PoseGraph:
 
     @property
     def rotation(self) -> slice:
-        """Where the rotation sits in the tangent."""
+        """Entries of the rotation in the tangent."""
         return slice(2, 3) if self.dim == 2 else slice(0, 3)
 
     @property
     def translation(self) -> slice:
-        """Where the translation sits in the tangent."""
+        """Entries of the translation in the tangent."""
         return slice(0, 2) if self.dim == 2 else slice(3, 6)
 
     @property
@@ -80,11 +80,11 @@ class PoseGraph:
         return len(self.ids)
 
     def at(self, world_T_pose: FloatArray) -> PoseGraph:
-        """The same graph with its poses elsewhere."""
+        """Return this graph with other poses."""
         return PoseGraph(self.ids, world_T_pose, self.first, self.second, self.first_T_second, self.information)
 
     def components(self) -> IntArray:
-        """Which connected part each pose belongs to, (N,), numbered from 0 in the order of their first poses."""
+        """Return the connected component (N,) of each pose, numbered from 0 in the order of their first poses."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 

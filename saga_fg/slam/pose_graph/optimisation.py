@@ -1,8 +1,8 @@
 """The minimum of a pose graph, from several starts.
 
-Pose graphs have many local minima, and which one a solver finds is decided by where it starts. A guess by dead
-reckoning may lie in the basin of a bad one; the chordal start (`chordal_poses`) uses every measurement and no guess,
-and does so in closed form. So both are tried, and the lower error is kept. The first pose stays where it is.
+Pose graphs have many local minima, and the start decides which one a solver finds. Dead reckoning may lie in the basin
+of a bad one; the chordal start (`chordal_poses`) uses every measurement and no guess, in closed form. Both are tried,
+and the lower error is kept. The first pose is fixed.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class OptimisedPoses:
 
 
 def optimise_poses(graph: PoseGraph, robust: Robust | None = None) -> OptimisedPoses:
-    """The poses of least error, from the guess in the graph and from the chordal start.
+    """Return the poses of least error, from the guess in the graph and from the chordal start.
 
     robust: a loss over the measurements that do not join successive poses, which may be false loop closures; the errors
     then are robust costs. Raises `InputError` for a graph that is not connected, or too badly conditioned.

@@ -37,7 +37,7 @@ def test_results_in_the_world_are_where_the_labels_are(root: Path, tmp_path: Pat
     (scored,) = read_scored_sequences(tmp_path / "out", root, detections=root / "found").values()
     assert len(scored.labels) == 5  # with the DontCare region
     assert len(scored.result) == len(scored.truth) == len(scored.found) == 4
-    np.testing.assert_array_equal(scored.found.moment, scored.truth.moment)
+    np.testing.assert_array_equal(scored.found.frame, scored.truth.frame)
     np.testing.assert_allclose(scored.found.boxes.position, scored.truth.boxes.position, atol=1e-5)
     np.testing.assert_allclose(scored.found.boxes.yaw, scored.truth.boxes.yaw, atol=1e-5)
     np.testing.assert_array_equal(scored.found.boxes.velocity, np.tile([10.0, 0.0], (4, 1)))

@@ -42,9 +42,9 @@ def test_truth_tracks_and_racks_of_each_sample(tmp_path: Path) -> None:
     assert [len(truth) for truth in scored.scene.ground_truth or ()] == [2, 1, 2]  # seen or not
     assert np.diff(scene.timestamps) == pytest.approx([0.5, 0.5])
     assert scene.ego_position.tolist() == [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]]
-    assert scene.truth.moment.tolist() == [0, 0, 2, 2]  # the car has no point at a1, the barrier is not tracked
+    assert scene.truth.frame.tolist() == [0, 0, 2, 2]  # the car has no point at a1, the barrier is not tracked
     assert sorted(scene.truth.id.tolist()) == ["i-car", "i-car", "i-ped", "i-ped"]
-    assert scene.found.moment.tolist() == [0, 0, 2]
+    assert scene.found.frame.tolist() == [0, 0, 2]
     assert scene.found.id.tolist() == ["t", "u", "t"]
     assert [len(racks) for racks in scene.racks] == [0, 1, 0]
     rack = scene.racks[1]

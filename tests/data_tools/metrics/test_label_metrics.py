@@ -18,7 +18,7 @@ from saga_fg.types.boxes import Boxes
 
 
 def table(
-    moment: list[int],
+    frame: list[int],
     ids: list[str],
     x: list[float],
     score: list[float] | None = None,
@@ -30,7 +30,7 @@ def table(
     position = np.column_stack([x, np.zeros(n), np.zeros(n)])
     boxes = Boxes.of(["car"] * n, position, np.tile([4.0, 2.0, 1.5], (n, 1)), yaw or np.zeros(n), np.zeros((n, 2)))
     P = np.empty((0, 2, 2)) if variance is None else np.tile(variance * np.eye(2), (n, 1, 1))
-    return SceneBoxes(np.array(moment), np.array(ids), boxes, np.array(score or [0.0] * n), P)
+    return SceneBoxes(np.array(frame), np.array(ids), boxes, np.array(score or [0.0] * n), P)
 
 
 TRUTH = table([0, 0, 1], ["a", "b", "a"], [0.0, 10.0, 1.0])
@@ -77,8 +77,8 @@ def test_systems_are_compared_where_all_have_a_box() -> None:
     assert same.errors["one"]["nees"].tolist() == pytest.approx([1.0, 0.0])
     pooled = CommonBoxes.pool([same, same])
     assert len(pooled) == 4
-    assert pooled.rmse("one", "position") == pytest.approx(0.3 / np.sqrt(2))
-    assert np.isnan(pooled.select(pooled.distance > 100).rmse("one", "position"))
+    assert pooled.sample("one", "position").rmse == pytest.approx(0.3 / np.sqrt(2))
+    assert np.isnan(pooled.select(pooled.distance > 100).sample("one", "position").rmse)
 
 
 def test_a_box_stays_with_the_visible_object() -> None:

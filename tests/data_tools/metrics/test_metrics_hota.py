@@ -10,7 +10,7 @@ from saga_fg import Boxes, InputError, MissingExtraError
 
 
 def table(rows, label="car"):
-    """SceneBoxes from (moment, id, x); boxes of 4 x 2 x 1.5 m."""
+    """SceneBoxes from (frame, id, x); boxes of 4 x 2 x 1.5 m."""
     n = len(rows)
     return SceneBoxes(
         np.array([row[0] for row in rows], dtype=np.int64),

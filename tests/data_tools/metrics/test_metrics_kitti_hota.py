@@ -77,7 +77,7 @@ def test_persons_who_sit_go_with_pedestrians(tmp_path: Path) -> None:
         assert figures(tmp_path, [line(0, 2, name, ELSEWHERE)], found, "pedestrian").fp == 0
 
 
-def test_in_space_the_same_objects_are_judged(tmp_path: Path) -> None:
+def test_in_space_the_same_objects_are_evaluated(tmp_path: Path) -> None:
     truth = [line(0, 1, "Car", CAR), line(0, 2, "Van", ELSEWHERE, x=10.0)]
     found = [line(0, 7, "Car", CAR, x=1.0), line(0, 9, "Car", ELSEWHERE, x=14.0)]
     both = sequence(tmp_path, truth, found)

@@ -25,7 +25,7 @@ from saga_fg import Boxes
 
 
 def table(rows, covariance=None):
-    """Rows (moment, id, x, y) or (moment, id, x, y, {label, yaw, v})."""
+    """Rows (frame, id, x, y) or (frame, id, x, y, {label, yaw, v})."""
     full = [((*row, {})[:5]) for row in rows]
     boxes = Boxes.of(
         [o.get("label", "car") for *_, o in full],
@@ -34,15 +34,15 @@ def table(rows, covariance=None):
         [o.get("yaw", 0.0) for *_, o in full],
         [o.get("v", (math.nan, math.nan)) for *_, o in full],
     )
-    moment, names = np.array([row[0] for row in full]), np.array([row[1] for row in full], dtype=str)
+    frame, names = np.array([row[0] for row in full]), np.array([row[1] for row in full], dtype=str)
     given = {} if covariance is None else {"position_covariance": np.tile(covariance, (len(full), 1, 1))}
-    return SceneBoxes(moment, names, boxes, np.ones(len(full)), **given)
+    return SceneBoxes(frame, names, boxes, np.ones(len(full)), **given)
 
 
 def errors(truth, found, detections=None, covariance=None, reach=1):
     labels = table(truth)
     velocity = label_velocities(labels, np.arange(40) * 0.5, reach)
-    seen = None if detections is None else (table(detections).moment, table(detections).boxes)
+    seen = None if detections is None else (table(detections).frame, table(detections).boxes)
     return label_errors(labels, table(found, covariance), velocity, seen)
 
 
@@ -109,16 +109,16 @@ def test_calibration_of_errors_drawn_from_the_covariance() -> None:
     shaken = np.array([row[2:] for row in rows]) + rng.multivariate_normal(np.zeros(2), P, len(rows))
     found = [(k, n, x, y) for (k, n, *_), (x, y) in zip(rows, shaken, strict=True)]
     c = calibration(errors(rows, found, covariance=P))
-    assert c.judged
-    assert c.honest
+    assert c.enough_data
+    assert c.consistent
     assert c.anees == pytest.approx(1, abs=0.1)
     assert c.median_nees == pytest.approx(1, abs=0.1)
-    for p, share in c.held.items():
+    for p, share in c.coverage.items():
         assert share == pytest.approx(p, abs=0.03)
     overconfident = calibration(errors(rows, found, covariance=P / 4))
-    assert not overconfident.honest
-    assert overconfident.held[0.9] == pytest.approx(chi2.cdf(chi2.ppf(0.9, 2) / 4, 2), abs=0.03)
-    assert not calibration(errors(rows[:100], found[:100], covariance=P)).judged
+    assert not overconfident.consistent
+    assert overconfident.coverage[0.9] == pytest.approx(chi2.cdf(chi2.ppf(0.9, 2) / 4, 2), abs=0.03)
+    assert not calibration(errors(rows[:100], found[:100], covariance=P)).enough_data
 
 
 def test_without_covariances_there_is_no_calibration() -> None:
@@ -132,9 +132,9 @@ def test_pairs_are_as_many_as_can_be_and_the_nearest_of_these(seed: int) -> None
     rng = np.random.default_rng(seed)
     sides = []
     for count in rng.integers(0, 12, 2):
-        moment = np.sort(rng.integers(0, 3, count))
+        frame = np.sort(rng.integers(0, 3, count))
         labels = rng.choice(["car", "bus"], count).tolist()
-        sides.append((moment, Boxes.of(labels, 1e6 + rng.uniform(0, 6, (count, 3)))))
+        sides.append((frame, Boxes.of(labels, 1e6 + rng.uniform(0, 6, (count, 3)))))
     a, b = sides
     row, column, distance = nearest_pairs(a, b, 2.0)
     assert len(set(row.tolist())) == len(row)

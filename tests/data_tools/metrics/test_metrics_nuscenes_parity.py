@@ -91,17 +91,17 @@ def noisy_tracks(truth: Sequence[Annotations], rng: np.random.Generator) -> list
     """The truth, shaken, a quarter of it missing, tracks broken now and then."""
     numbers: dict[str, int] = {}
     fresh = count()
-    moments = []
-    for k, moment in enumerate(truth):
-        rows = np.flatnonzero(rng.random(len(moment)) < 0.75)
-        names = moment.id[rows].tolist()
+    frames = []
+    for k, frame in enumerate(truth):
+        rows = np.flatnonzero(rng.random(len(frame)) < 0.75)
+        names = frame.id[rows].tolist()
         for name in names:
             if name not in numbers or rng.random() < 0.05:
                 numbers[name] = next(fresh)
-        boxes, n = moment.boxes.select(rows), len(rows)
+        boxes, n = frame.boxes.select(rows), len(rows)
         position = boxes.position + rng.normal(0, 0.4, (n, 3))
         identity = np.array([numbers[name] for name in names], dtype=np.int64)
         unknown = np.tile(np.eye(2), (n, 1, 1))
         shaken = Boxes(boxes.label, position, boxes.size, boxes.yaw, boxes.velocity)
-        moments.append(Tracks(0.5 * k, identity, shaken, rng.random(n).round(1), unknown, unknown, np.zeros(n)))
-    return moments
+        frames.append(Tracks(0.5 * k, identity, shaken, rng.random(n).round(1), unknown, unknown, np.zeros(n)))
+    return frames

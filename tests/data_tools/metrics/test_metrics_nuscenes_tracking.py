@@ -20,17 +20,17 @@ from saga_fg import Annotations, Boxes, InputError, Tracks
 
 
 def table(rows):
-    """SceneBoxes from (moment, id, label, x, y, score), in order of moment."""
-    moment, names, label, x, y, score = zip(*rows, strict=True) if rows else ((),) * 6
+    """SceneBoxes from (frame, id, label, x, y, score), in order of frame."""
+    frame, names, label, x, y, score = zip(*rows, strict=True) if rows else ((),) * 6
     position = np.stack([x, y, np.zeros(len(x))], axis=1) if rows else np.empty((0, 3))
     return SceneBoxes(
-        np.array(moment, dtype=np.int64), np.array(names, dtype=str), Boxes.of(label, position), np.array(score, float)
+        np.array(frame, dtype=np.int64), np.array(names, dtype=str), Boxes.of(label, position), np.array(score, float)
     )
 
 
-def scene(truth, found, moments=None, **options):
+def scene(truth, found, frames=None, **options):
     """A scene at 2 Hz with the vehicle in the origin."""
-    n = moments or 1 + max(row[0] for row in (*truth, *found))
+    n = frames or 1 + max(row[0] for row in (*truth, *found))
     return NuScenesTrackingScene(
         np.arange(n) * 0.5,
         np.zeros((n, 2)),
@@ -55,7 +55,7 @@ def test_perfect_tracks():
 
 
 def test_counts_by_hand():
-    # The object is found at moments 1 and 3 by different tracks, 0.5 m off; a false alarm at moment 0.
+    # The object is found at frames 1 and 3 by different tracks, 0.5 m off; a false alarm at frame 0.
     found = [
         (0, "x", "car", 40.0, 0.0, 0.9),
         (1, "t", "car", 11.0, 0.5, 0.9),
@@ -92,7 +92,7 @@ def test_a_low_score_is_left_out_at_low_recall():
 
 
 def test_gaps_are_filled_with_the_official_weights():
-    # Truth is unseen at moment 1, 1 / 4 of the way from x = 10 to x = 20; the official weights put it at 3 / 4.
+    # Truth is unseen at frame 1, 1 / 4 of the way from x = 10 to x = 20; the official weights put it at 3 / 4.
     truth = [(0, "a", "car", 10.0, 0.0), (4, "a", "car", 20.0, 0.0)]
     found = [(1, "t", "car", 17.5, 0.0, 0.9)]
     f = figures(truth, found)
@@ -155,7 +155,7 @@ def test_classes_without_truth_do_not_count():
 
 
 def test_nothing_at_all():
-    metrics = nuscenes_tracking_metrics([scene([], [], moments=2)])
+    metrics = nuscenes_tracking_metrics([scene([], [], frames=2)])
     assert math.isnan(metrics.overall.amota)
     assert metrics.overall.gt == 0
 
@@ -166,12 +166,12 @@ def test_tables_from_annotations_and_tracks():
         [Annotations(np.array(["a", "b"]), boxes, np.array([True, False]))] * 2, hidden=False
     )
     assert truth.id.tolist() == ["a", "a"]
-    assert truth.moment.tolist() == [0, 1]
+    assert truth.frame.tolist() == [0, 1]
     covariance = np.tile(np.eye(2), (2, 1, 1))
     tracks = Tracks(0.0, np.array([4, 5]), boxes, np.array([0.5, 0.7]), covariance, covariance, np.zeros(2))
     found = SceneBoxes.of_tracks([tracks, Tracks.empty(1.0), tracks])
     assert found.id.tolist() == ["4", "5", "4", "5"]
-    assert found.moment.tolist() == [0, 0, 2, 2]
+    assert found.frame.tolist() == [0, 0, 2, 2]
     assert len(SceneBoxes.of_tracks([])) == len(SceneBoxes.of_annotations([])) == 0
 
 
@@ -188,10 +188,10 @@ def test_bad_tables(rows, text):
 
 
 def test_bad_scenes():
-    with pytest.raises(InputError, match="found: expected moments below 2, got 3"):
-        scene([], [(3, "t", "car", 0.0, 0.0, 0.9)], moments=2)
+    with pytest.raises(InputError, match="found: expected frames below 2, got 3"):
+        scene([], [(3, "t", "car", 0.0, 0.0, 0.9)], frames=2)
     with pytest.raises(InputError, match="racks"):
-        scene([], [], moments=2, racks=[Boxes.empty()])
+        scene([], [], frames=2, racks=[Boxes.empty()])
     with pytest.raises(InputError, match="increasing"):
         NuScenesTrackingScene(np.zeros(2), np.zeros((2, 2)), table([]), table([]))
 
@@ -199,7 +199,7 @@ def test_bad_scenes():
 def plain_match(truth, found, threshold):
     """CLEAR matching of one scene, one threshold, one class, object by object.
 
-    truth and found: {moment: {id: (x, y)}}, found with scores: {moment: {id: (x, y, score)}}. Returns, per object, its
+    truth and found: {frame: {id: (x, y)}}, found with scores: {frame: {id: (x, y, score)}}. Returns, per object, its
     events in order: None (missed) or (track, switched, distance); the scores of the plain matches; false alarms.
     """
     memory, events, scores, false_alarms = {}, {}, [], 0
@@ -291,12 +291,12 @@ def plain_figures(truth, found):
 @given(st.integers(0, 2**32 - 1))
 def test_equals_a_plain_reading_of_the_definition(seed):
     rng = np.random.default_rng(seed)
-    moments, objects, false = rng.integers(1, 9), rng.integers(1, 7), rng.integers(0, 4)
+    frames, objects, false = rng.integers(1, 9), rng.integers(1, 7), rng.integers(0, 4)
     start, speed = rng.uniform(-4, 4, (objects, 2)), rng.uniform(-1, 1, (objects, 2))
     score = rng.integers(0, 8, size=4 * objects + false) / 8  # few values: thresholds repeat; means are exact
     truth, found = {}, {}
     names = list(range(objects))
-    for k in range(moments):
+    for k in range(frames):
         truth[k] = {o: tuple(start[o] + k * speed[o]) for o in range(objects)}
         swap = rng.random(objects) < 0.2
         names = [n + objects if s and n + objects < 4 * objects else n for n, s in zip(names, swap, strict=True)]

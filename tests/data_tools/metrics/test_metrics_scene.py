@@ -166,5 +166,5 @@ def test_empty_scenes():
 
 
 def test_numbers_of_moments_must_agree():
-    with pytest.raises(InputError, match=r"expected one entry per moment of the ground truth \(1\), got 2"):
+    with pytest.raises(InputError, match=r"expected one entry per frame of the ground truth \(1\), got 2"):
         scene_metrics([truth({})], [tracks({}), tracks({})])

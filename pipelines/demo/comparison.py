@@ -1,11 +1,11 @@
-"""Several methods on the same scenes, side by side, and the table that says how they compare."""
+"""Comparison of several methods on the same scenes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import SceneMetrics, SceneMetricSettings, scene_metrics
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, TrackedScene, track_scene
@@ -50,25 +50,15 @@ def compare(
     )
 
 
-COLUMNS = (
-    "method",
-    "position RMSE, m",
-    "velocity RMSE, m/s",
-    "occluded position RMSE, m",
-    "MOTA",
-    "ID switches",
-    "ms per frame",
-)
+def comparison_table(comparison: Comparison, title: str) -> FigureTable:
+    """Return a table with a row for each method.
 
-
-def table_rows(comparison: Comparison) -> list[tuple[str, ...]]:
-    """One row of texts a method, in the order of `COLUMNS`.
-
-    Occluded: of objects that were tracked while in view and are hidden now; a lost one counts with the cap.
+    Occluded: objects that were tracked while in view and are hidden now; a lost one counts with the cap.
     """
+    columns = ("method", "position RMSE, m", "velocity RMSE, m/s", "occluded position RMSE, m", "MOTA")
     rows = []
     for method, m in comparison.metrics.items():
         numbers = (m.position.rmse, m.velocity.rmse, m.carried.rmse, m.mota)
-        texts = ["-" if math.isnan(x) else f"{x:.3f}" for x in numbers]
-        rows.append((method, *texts, str(m.switches), f"{comparison.milliseconds_per_frame(method):.1f}"))
-    return rows
+        texts = (*map(cell, numbers), str(m.switches), f"{comparison.milliseconds_per_frame(method):.1f}")
+        rows.append((method, *texts))
+    return FigureTable(title, (*columns, "ID switches", "ms per frame"), tuple(rows))
