@@ -52,10 +52,10 @@ READERS: dict[str, Callable[[Path], object]] = {
 def _bounded() -> Iterator[None]:
     """A reader that waits for ever, or fills the memory, fails its test instead of the machine."""
 
-    def give_up(*_: object) -> None:
+    def delete_below(*_: object) -> None:
         raise TimeoutError("the reader waits, or reads on and on")
 
-    before, limits = signal.signal(signal.SIGALRM, give_up), resource.getrlimit(resource.RLIMIT_DATA)
+    before, limits = signal.signal(signal.SIGALRM, delete_below), resource.getrlimit(resource.RLIMIT_DATA)
     signal.alarm(20)
     resource.setrlimit(resource.RLIMIT_DATA, (8 << 30, limits[1]))
     yield

@@ -1,33 +1,34 @@
-"""Which objects stand? The discrete part of the joint estimation, decided from where they were detected.
+"""Stationarity of objects: the probability that each one is at rest, from its detections along a path.
 
 Around each detection of an object, within a window, D is the mean place of the later half of the detections less that
-of the earlier half, in the world along the path assumed so far, and T the time between the two. An object that stands
+of the earlier half, in the world along the path assumed so far, and T the time between the two. A stationary object
 has D ~ N(0, S): noise of the detections and of the odometry over the T seconds and s metres in between,
 
     S = R (1/n_1 + 1/n_2) + shift + (scale^2 + course^2) s^2 + range^2 (turn + (bias T)^2)
 
-where shift and turn are the variances that the increments in between add up to in translation and in heading; scale,
-bias and course the odometry's deviations as known so far. One that moves has D ~ N(0, S + (u T)^2), with the speed u
-usual for its class (`moving_speed`). By Bayes, with a share q of objects that stand, one half in a whole recording,
+where shift and turn are the summed variances of the increments in between, in translation and in heading; scale, bias
+and course are the odometry's deviations as known so far. A moving object has D ~ N(0, S + (u T)^2), with the usual
+speed u of its class (`moving_speed`). By Bayes, with a share q of stationary objects, one half in a whole recording,
 
-    P(stands | D) = q N(D; 0, S) / (q N(D; 0, S) + (1 - q) N(D; 0, S + (u T)^2))
+    P(stationary | D) = q N(D; 0, S) / (q N(D; 0, S) + (1 - q) N(D; 0, S + (u T)^2))
 
-The odds weigh the time by themselves: where T is short, S and S + (u T)^2 are nearly the same, and P about one half. So
-they do the speed: who walks far away is not taken for a car that stands.
+Where T is short, S and S + (u T)^2 are nearly equal, and P is about one half; so it is for slow classes far away.
 
-Online the window ends now, T is short, and queues that creep look parked: q is `online_standing_share`, and the last
-term of S, errors of the heading, counts across the line of sight only.
+Online the window ends now, T is short, and creeping queues look parked: q is `online_standing_share`, and the last term
+of S, errors of the heading, counts across the line of sight only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.slam.joint.record import EgoMoment, motion_covariances
+from saga_fg.slam.joint.record import RecordedEpoch, motion_covariances
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.types.by_class import class_numbers
 
@@ -42,20 +43,20 @@ class SlowErrors:
 
     @classmethod
     def at_start(cls, settings: JointSettings) -> SlowErrors:
-        """What is known beforehand."""
+        """The deviations of the settings, before any measurement."""
         return cls(settings.odometry.scale, settings.odometry.bias, settings.odometry.course)
 
 
 @dataclass(frozen=True, eq=False)
-class _Sightings:
-    """All detections, by object and time: object, moment, time (N,), place (N, 2), variance, range, speed u (N,).
+class _PlacedDetections(Columns):
+    """All detections, by object and time: object, row of the record, time (N,), place (N, 2), variance, range, u (N,).
 
     sight (N, 2): the place less the vehicle's, m
-    drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first moment on
+    drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first epoch on
     """
 
     object: IntArray
-    moment: IntArray
+    row: IntArray
     time: FloatArray
     place: FloatArray
     sight: FloatArray
@@ -65,32 +66,32 @@ class _Sightings:
     drift: FloatArray
 
 
-def standing_probabilities(
-    record: list[EgoMoment], path: FloatArray, slow: SlowErrors, settings: JointSettings, online: bool = False
+def stationary_probabilities(
+    record: Sequence[RecordedEpoch], path: FloatArray, slow: SlowErrors, settings: JointSettings, online: bool = False
 ) -> list[FloatArray]:
-    """For each moment the probabilities (n,) that its objects stand; path (K, 4, 4) assumed so far.
+    """For each epoch the probabilities (n,) that its objects are stationary; path (K, 4, 4) assumed so far.
 
-    0 where too little was seen to tell. Between two detections it is the smaller one of theirs.
+    0 where there are too few detections. Between two detections it is the smaller one of theirs.
     """
-    seen = _sightings(record, path, settings)
+    seen = _placed(record, path, settings)
     p = _probabilities(seen, slow, settings, online)
-    result = [np.zeros(len(moment.objects.id)) for moment in record]
+    result = [np.zeros(len(now.objects.id)) for now in record]
     if not len(p):
         return result
     first = np.flatnonzero(np.append(True, seen.object[1:] != seen.object[:-1]))
     for start, end in zip(first, np.append(first[1:], len(p)), strict=True):
-        name, moments, mine = seen.object[start], seen.moment[start:end], p[start:end]
-        for k in range(int(moments[0]), int(moments[-1]) + 1):
-            after = int(np.searchsorted(moments, k))
-            value = mine[after] if moments[after] == k else min(mine[after - 1], mine[after])
+        name, rows, mine = seen.object[start], seen.row[start:end], p[start:end]
+        for k in range(int(rows[0]), int(rows[-1]) + 1):
+            after = int(np.searchsorted(rows, k))
+            value = mine[after] if rows[after] == k else min(mine[after - 1], mine[after])
             row = int(np.searchsorted(record[k].objects.id, name))
             if row < len(record[k].objects.id) and record[k].objects.id[row] == name:
                 result[k][row] = value
     return result
 
 
-def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings, online: bool) -> FloatArray:
-    """P(stands) (N,) of the object of each detection, around it."""
+def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSettings, online: bool) -> FloatArray:
+    """P(stationary) (N,) of the object of each detection, around it."""
     n = len(seen.object)
     if n == 0:
         return np.empty(0)
@@ -100,7 +101,7 @@ def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings, 
     high = np.searchsorted(axis, axis + settings.standing_window / 2, "right")
     start = np.searchsorted(seen.object, seen.object, "left")
     end = np.searchsorted(seen.object, seen.object, "right")
-    # at an end of its life the window is shifted into it
+    # at the ends of its lifespan the window is shifted into it
     low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.standing_window, "left"), low)
     low = np.maximum(low, start)
     high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.standing_window, "right"), high)
@@ -130,32 +131,25 @@ def _probabilities(seen: _Sightings, slow: SlowErrors, settings: JointSettings, 
     return np.where(n1 > 0, p, 0.0)
 
 
-def _sightings(record: list[EgoMoment], path: FloatArray, settings: JointSettings) -> _Sightings:
-    moments = np.repeat(np.arange(len(record)), [len(moment.seen.id) for moment in record]).astype(np.int64)
-    names = np.concatenate([moment.seen.id for moment in record])
-    order = np.lexsort((moments, names))
-    place = [transform_points(pose, moment.seen.z)[:, :2] for moment, pose in zip(record, path, strict=True)]
+def _placed(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:
+    row = np.repeat(np.arange(len(record)), [len(now.seen.id) for now in record]).astype(np.int64)
+    place = [transform_points(pose, now.seen.z)[:, :2] for now, pose in zip(record, path, strict=True)]
     sight = [one - pose[:2, 3] for one, pose in zip(place, path, strict=True)]
-    variance = np.concatenate([np.trace(moment.seen.R, axis1=1, axis2=2) / 2 for moment in record])
-    distance = np.concatenate([np.hypot(moment.seen.z[:, 0], moment.seen.z[:, 1]) for moment in record])
-    label = np.concatenate(
-        [np.array(moment.objects.label)[np.isin(moment.objects.id, moment.seen.id)] for moment in record]
-    )
-    driven = np.array([np.linalg.norm(moment.a_T_b[:3, 3]) for moment in record])
+    label = [np.array(now.objects.label)[np.isin(now.objects.id, now.seen.id)] for now in record]
     P = motion_covariances(record, settings)
     drift = np.zeros((len(record), 3))
-    drift[:, 0] = np.cumsum(driven)
+    drift[:, 0] = np.cumsum([np.linalg.norm(now.a_T_b[:3, 3]) for now in record])
     drift[1:, 1] = np.cumsum((P[:, 3, 3] + P[:, 4, 4]) / 2)
     drift[1:, 2] = np.cumsum(P[:, 2, 2])
-    time = np.array([moment.time for moment in record])[moments]
-    return _Sightings(
-        names[order],
-        moments[order],
-        time[order],
-        np.concatenate(place)[order],
-        np.concatenate(sight)[order],
-        variance[order],
-        distance[order],
-        class_numbers(settings.moving_speed, float, label)[order],
-        drift[moments][order],
+    placed = _PlacedDetections(
+        np.concatenate([now.seen.id for now in record]),
+        row,
+        np.array([now.time for now in record])[row],
+        np.concatenate(place),
+        np.concatenate(sight),
+        np.concatenate([np.trace(now.seen.R, axis1=1, axis2=2) / 2 for now in record]),
+        np.concatenate([np.hypot(now.seen.z[:, 0], now.seen.z[:, 1]) for now in record]),
+        class_numbers(settings.moving_speed, float, np.concatenate(label)),
+        drift[row],
     )
+    return placed.select(np.lexsort((placed.row, placed.object)))
