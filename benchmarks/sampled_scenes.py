@@ -94,7 +94,7 @@ def sampled_config(
         classes={DEFAULT: of_class},
         edges=(settings.rule,) if edges is None else edges,
         association=AssociationSettings(clutter_area=CLUTTER_AREA, existence_weight=0.1, score_weight=1.0),
-        existence=ExistenceSettings(report=0.9, confirm=0.95),
+        existence=ExistenceSettings(report_above=0.9, confirm_above=0.95),
         report_coasting=2 * INTERVAL,
         max_out_of_view=4 * settings.hidden_for,
     )

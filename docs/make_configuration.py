@@ -27,7 +27,7 @@ tracker:
   classes:
     pedestrian: {max_distance: 2.0}   # the rest as in `default`
   existence:
-    report: 0.3
+    report_above: 0.3
 sensors:
   camera:
     time_offset: -0.04

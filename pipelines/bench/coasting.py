@@ -30,8 +30,8 @@ NEVER_GIVEN_UP = {
     "tracker.report_coasting": 2 * HIDDEN,
     "tracker.classes.*.max_coasting": 2 * HIDDEN,
     "tracker.max_out_of_view": inf,
-    "tracker.existence.give_up": 0.0,
-    "tracker.existence.report": 0.0,
+    "tracker.existence.delete_below": 0.0,
+    "tracker.existence.report_above": 0.0,
 }
 CAP = SceneMetricSettings(cap=10.0)
 

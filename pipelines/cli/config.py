@@ -14,7 +14,7 @@ from saga_fg.errors import InputError
 FIRST = {
     "tracking": (
         "tracker.estimator",
-        "tracker.existence.report",
+        "tracker.existence.report_above",
         "tracker.classes.*.motion",
         "tracker.classes.*.max_coasting",
         "sensors.*.noise.*.position",

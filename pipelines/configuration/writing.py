@@ -29,7 +29,7 @@ from pipelines.configuration.schema import (
     settings_of,
 )
 
-WIDTH = 110
+WIDTH = 120
 EVERYTHING = ("",)  # the selection of a whole section
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./ -]*(?<! )")
 

@@ -31,8 +31,7 @@ class StreamSettings(Settings):
         1000, "sensors whose frames are numbered at most; beyond, the one silent for longest loses its number"
     )
     max_seq_jump: PositiveInt = setting(
-        1_000_000,
-        "a `seq` further than this beyond the last one of its sensor is refused; the first may be any",
+        1_000_000, "a `seq` further than this beyond the last one of its sensor is refused; the first may be any"
     )
     max_detections: PositiveInt = setting(
         500, "detections of a frame at most; one frame of so many takes up to 0.2 s, for which all clients wait"

@@ -101,7 +101,7 @@ def smooth_objects(
     score = evidence_scores(evidence, object_of, lives, within, settings.prior_time)
     kept = score >= settings.min_score
     object_of = np.where(np.isin(object_of, lives.id[kept]), object_of, -1)
-    standing = standing_states(within, lives, evidence, object_of, settings.standing, settings.classes)
+    standing = standing_states(within, lives, evidence, object_of, settings.stationary, settings.classes)
     final = rounds.final(lives.select(kept), object_of, states, standing)
     return SmoothedObjects(
         lives.select(kept),
@@ -122,7 +122,7 @@ def smooth_known_objects(
     rounds = _Rounds(evidence, settings, tracker, ())
     lives = lives_of_evidence(object_of, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, object_of, lives, rounds.velocity_prior(lives), settings.classes)
-    return rounds.final(lives, object_of, states, Standing(settings.standing))
+    return rounds.final(lives, object_of, states, Standing(settings.stationary))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,18 +24,22 @@ Facts = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True, eq=False)
-class Cubes:
-    """N boxes: centre, size (length, width, height) (N, 3), m, yaw (N,), rad; facts of each, or none."""
+class Solids:
+    """N boxes, or ellipsoids if `round`: centre and size (N, 3), m, yaw (N,), rad; facts of each, or none.
+
+    size: length, width, height
+    """
 
     centre: FloatArray
     size: FloatArray
     yaw: FloatArray
     colour: IntArray
     facts: Facts = field(default_factory=dict)
+    round: bool = False
 
     @property
     def labels(self) -> list[str]:
-        """The facts of each box in a line; empty without facts."""
+        """The facts of each solid in a line; empty without facts."""
         return [" ".join(row) for row in zip(*self.facts.values(), strict=True)]
 
 
@@ -59,32 +63,13 @@ class Arrows:
 
 
 @dataclass(frozen=True, eq=False)
-class Ellipses:
-    """N ellipses in the plane: centre (N, 3), half axes (N, 2), m, yaw (N,) of the first axis, rad."""
-
-    centre: FloatArray
-    half: FloatArray
-    yaw: FloatArray
-    colour: IntArray
-
-
-@dataclass(frozen=True, eq=False)
-class Marks:
-    """N places (N, 3), m, with their names."""
-
-    place: FloatArray
-    names: Sequence[str]
-    colour: IntArray
-    radius: float
-
-
-@dataclass(frozen=True, eq=False)
 class Points:
-    """A cloud of points (N, 3), m."""
+    """N points (N, 3), m, drawn with a radius, m; with their names, or a cloud without."""
 
     points: FloatArray
     colour: IntArray
     radius: float
+    names: Sequence[str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +79,7 @@ class Pose:
     parent_T_child: FloatArray
 
 
-Shape = Cubes | Lines | Arrows | Ellipses | Marks | Points | Pose
+Shape = Solids | Lines | Arrows | Points | Pose
 
 
 @dataclass(frozen=True, eq=False)

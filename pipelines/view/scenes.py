@@ -29,22 +29,20 @@ from typing import Any
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
+from data_tools.lidar.scan_sequence import ScanSequence
 from data_tools.metrics import SceneBoxes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections
-from pipelines.scan_sequence import ScanSequence
 from pipelines.view.drawing import (
     VEHICLE,
     Arrows,
     Colour,
-    Cubes,
     Drawing,
-    Ellipses,
     Facts,
     Lines,
-    Marks,
     Points,
     Pose,
     Shape,
+    Solids,
     in_order,
     one_colour,
 )
@@ -53,6 +51,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 
 HISTORY = 4.0  # s, of trajectories
+FLAT = 0.04  # m, height of an ellipse
 SUNK = 2.0  # m, earlier states below the newest ones
 HELD = 2 * np.log(10.0)  # squared sigmas of the ellipse that holds 90 % in the plane
 DETECTION, SEEN, HIDDEN, PATH, EDGE, POINT, NODE = map(
@@ -81,7 +80,7 @@ def draw_scene(view: SceneView) -> Iterator[Drawing]:
     path = scene.world_T_ego[:, :3, 3] - origin
     centre = np.array([[VEHICLE[0] / 2 - 1.0, 0.0, VEHICLE[2] / 2]])
     yield Drawing(root, "ego_path", Lines([path] if len(path) else [], PATH, np.array([0.05])))
-    yield Drawing(f"{root}/ego", "body", Cubes(centre, np.array([VEHICLE]), np.zeros(1), PATH, {"id": ["ego"]}))
+    yield Drawing(f"{root}/ego", "body", Solids(centre, np.array([VEHICLE]), np.zeros(1), PATH, {"id": ["ego"]}))
     scans = view.scans if view.scans is not None and len(view.scans) else None
     start = min(
         [*scene.timestamps[:1].tolist(), *(scans.timestamps[:1].tolist() if scans is not None else ())], default=0
@@ -139,7 +138,7 @@ def _graphs(view: SceneView, origin: FloatArray, start: float) -> Iterator[Drawi
             yield Drawing(root, f"graph/{re.sub('[^A-Za-z0-9]+', '_', kind)}", shape, *when)
 
 
-def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Marks, dict[str, list[FloatArray]]]:
+def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Points, dict[str, list[FloatArray]]]:
     """Return variables, and by kind lines from the middle of each factor to its variables, up from a single one."""
     nodes = graph["nodes"]
     newest = max((node["time"] for node in nodes if node["time"] is not None), default=None)
@@ -154,7 +153,7 @@ def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Marks, dict[st
             acting = n >= 2 and "edges" in factor
             kind = f"{factor['kind']} {factor['edges'][n - 2][0]}" if acting else factor["kind"]
             lines.setdefault(kind, []).append(np.stack([middle, end]))
-    return Marks(places, [node["name"] for node in nodes], NODE, 0.25), lines
+    return Points(places, NODE, 0.25, [node["name"] for node in nodes]), lines
 
 
 class _Method:
@@ -181,8 +180,8 @@ class _Method:
         yield "trajectories", Lines(self._trajectories(moment, rows), colour, np.array([0.05]))
         yield "velocities", Arrows(place[rows], np.nan_to_num(boxes.velocity), colour, 0.08)
         known = np.isfinite(table.position_covariance[rows]).all(axis=(1, 2))
-        half, yaw = ellipses(table.position_covariance[rows[known]])
-        yield "ellipses", Ellipses(place[rows[known]], half, yaw, colour[known])
+        size, yaw = ellipses(table.position_covariance[rows[known]])
+        yield "ellipses", Solids(place[rows[known]], size, yaw, colour[known], round=True)
         target, source, rate = edges
         strips = np.stack([place[source], place[target]], axis=1)
         yield "edges", Lines(list(strips), EDGE, 0.05 + 0.1 * np.minimum(rate, 2.0))
@@ -198,9 +197,10 @@ class _Method:
 
 
 def ellipses(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return half axes (N, 2), m, and yaw (N,) of the first one, of the 90 % ellipses of covariances (N, 2, 2)."""
+    """Return the size (N, 3), m, and the yaw (N,) of flat 90 % ellipses of covariances (N, 2, 2)."""
     variance, axes = np.linalg.eigh(covariance)
-    return np.sqrt(HELD * np.maximum(variance, 0.0)), np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+    size = np.column_stack([2 * np.sqrt(HELD * np.maximum(variance, 0.0)), np.full(len(variance), FLAT)])
+    return size, np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
 
 
 def colour_of(number: int) -> Colour:
@@ -209,6 +209,6 @@ def colour_of(number: int) -> Colour:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def _boxes(boxes: Boxes, origin: FloatArray, colour: IntArray, facts: Facts | None = None) -> Cubes:
+def _boxes(boxes: Boxes, origin: FloatArray, colour: IntArray, facts: Facts | None = None) -> Solids:
     size = np.where(np.isfinite(boxes.size), boxes.size, UNMEASURED)
-    return Cubes(boxes.position - origin, size, np.nan_to_num(boxes.yaw), colour, facts or {})
+    return Solids(boxes.position - origin, size, np.nan_to_num(boxes.yaw), colour, facts or {})

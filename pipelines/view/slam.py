@@ -20,7 +20,7 @@ from data_tools.files.input_files import read_bytes
 from data_tools.files.json_stream import parsed_json
 from data_tools.lidar import read_scan
 from data_tools.trajectories import Trajectory, read_tum_poses
-from pipelines.view.drawing import VEHICLE, Cubes, Drawing, Lines, Marks, Points, Pose, one_colour
+from pipelines.view.drawing import VEHICLE, Drawing, Lines, Points, Pose, Solids, one_colour
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 
@@ -70,8 +70,8 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
         radius, colour = (0.03, MAP) if name == "map" else (0.08, LANDMARK)
         yield Drawing(root, name, Points(points - origin, colour, radius))
     if view.names:
-        yield Drawing(root, "names", Marks(view.places - origin, view.names, LANDMARK, 0.15))
-    body = Cubes(np.zeros((1, 3)), np.array([VEHICLE]), np.zeros(1), PATHS["trajectory"])
+        yield Drawing(root, "names", Points(view.places - origin, LANDMARK, 0.15, view.names))
+    body = Solids(np.zeros((1, 3)), np.array([VEHICLE]), np.zeros(1), PATHS["trajectory"])
     yield Drawing(f"{root}/pose", "body", body)
     times = trajectory.timestamps - trajectory.timestamps[0]
     for time, world_T_ego in zip(times.tolist(), trajectory.world_T_ego, strict=True):

@@ -1,8 +1,8 @@
 """Drawings as a file of MCAP (https://mcap.dev) for Foxglove, and for other readers of its messages.
 
-A pose is a `FrameTransforms`, a cloud a `PointCloud` of float32 x, y, z, every other shape a `SceneUpdate` that first
-deletes all its layer showed before: each message is complete, so that playback may begin anywhere. Boxes with facts are
-an entity each, named by the first fact and with all of them as metadata; other shapes are one entity together.
+A pose is a `FrameTransforms`, points without names a `PointCloud` of float32 x, y, z, every other shape a `SceneUpdate`
+that first deletes all its layer showed before: each message is complete, so that playback may begin anywhere. Solids
+with facts are an entity each, named by the first fact and with all of them as metadata; other shapes are one entity.
 
 The path of a drawing is the topic of its messages, its frame the message's. Messages are protobuf with the fields that
 Foxglove publishes (https://docs.foxglove.dev/docs/sdk/schemas); times are nanoseconds from the scene's start.
@@ -17,12 +17,11 @@ from typing import Any, assert_never
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_file
-from pipelines.view.drawing import Arrows, Cubes, Drawing, Ellipses, Lines, Marks, Points, Pose
+from pipelines.view.drawing import Arrows, Drawing, Lines, Points, Pose, Solids
 from saga_fg.errors import MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import rotation_quaternion, yaw_quaternion
 
-FLAT = 0.04  # height of an ellipse, m
 OPACITY = 0.4  # of solids
 TEXT_SIZE, TEXT_GAP = 12.0, 0.3  # pixels; m above the named thing
 UP = np.array([0.0, 0.0, 1.0])
@@ -79,7 +78,7 @@ def _message(drawing: Drawing) -> Any:
         frames = {"parent_frame_id": drawing.frame, "child_frame_id": drawing.path}
         fields = {"transforms": [{**stamp, **frames, "translation": translation, "rotation": rotation}]}
         return FrameTransforms(**fields)
-    if isinstance(shape, Points):
+    if isinstance(shape, Points) and shape.names is None:
         xyz = [{"name": name, "offset": 4 * k, "type": PackedElementField.FLOAT32} for k, name in enumerate("xyz")]
         points = shape.points.astype("<f4").tobytes()
         fields = {"frame_id": drawing.frame, "pose": IDENTITY, "point_stride": 12, "fields": xyz, "data": points}
@@ -92,31 +91,28 @@ def _message(drawing: Drawing) -> Any:
     return SceneUpdate(**fields)
 
 
-def _entities(layer: str, shape: Cubes | Lines | Arrows | Ellipses | Marks) -> list[Fields]:
+def _entities(layer: str, shape: Solids | Lines | Arrows | Points) -> list[Fields]:
     """Identifiers, metadata and primitives of a shape's entities."""
     match shape:
-        case Cubes():
-            cubes = _solids(shape.centre, shape.size, shape.yaw, shape.colour)
+        case Solids():
+            kind = "spheres" if shape.round else "cubes"
+            solids = _solids(shape.centre, shape.size, shape.yaw, shape.colour)
             if not shape.facts:
-                return [{"id": layer, "cubes": cubes}]
+                return [{"id": layer, kind: solids}]
             texts = _texts(shape.centre + UP * (shape.size / 2 + TEXT_GAP), shape.labels, shape.colour)
             return [
                 {
                     "id": row[0],
                     "metadata": [{"key": key, "value": value} for key, value in zip(shape.facts, row, strict=True)],
-                    "cubes": [cube],
+                    kind: [solid],
                     "texts": [text],
                 }
-                for row, cube, text in zip(zip(*shape.facts.values(), strict=True), cubes, texts, strict=True)
+                for row, solid, text in zip(zip(*shape.facts.values(), strict=True), solids, texts, strict=True)
             ]
-        case Ellipses():
-            size = np.column_stack([2 * shape.half, np.full(len(shape.half), FLAT)])
-            return [{"id": layer, "spheres": _solids(shape.centre, size, shape.yaw, shape.colour)}]
-        case Marks():
-            places = len(shape.place)
-            size, yaw = np.full((places, 3), 2 * shape.radius), np.zeros(places)
-            texts = _texts(shape.place + TEXT_GAP * UP, shape.names, shape.colour)
-            return [{"id": layer, "spheres": _solids(shape.place, size, yaw, shape.colour), "texts": texts}]
+        case Points():
+            size, yaw = np.full(shape.points.shape, 2 * shape.radius), np.zeros(len(shape.points))
+            texts = _texts(shape.points + TEXT_GAP * UP, shape.names or (), shape.colour)
+            return [{"id": layer, "spheres": _solids(shape.points, size, yaw, shape.colour), "texts": texts}]
         case Lines():
             return [{"id": layer, "lines": _lines(shape)}]
         case Arrows():

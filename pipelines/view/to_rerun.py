@@ -13,13 +13,11 @@ from typing import Any, assert_never
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_file
-from pipelines.view.drawing import Arrows, Cubes, Drawing, Ellipses, Lines, Marks, Points, Pose, Shape
+from pipelines.view.drawing import Arrows, Drawing, Lines, Points, Pose, Shape, Solids
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_quaternion
 
 APPLICATION = "saga-fg"
-FLAT = 0.02  # half height of an ellipse, m
 
 
 def load_rerun() -> ModuleType:
@@ -91,11 +89,12 @@ def _log(stream: Any, roots: Sequence[str], drawings: Iterable[Drawing]) -> None
 def _archetype(shape: Shape) -> Any:
     rerun = load_rerun()
     match shape:
-        case Cubes():
-            return rerun.Boxes3D(
+        case Solids():
+            solids = rerun.Ellipsoids3D if shape.round else rerun.Boxes3D
+            return solids(
                 centers=shape.centre,
                 half_sizes=shape.size / 2,
-                quaternions=_about_z(shape.yaw),
+                quaternions=np.roll(yaw_quaternion(shape.yaw), -1, axis=1),  # x y z w
                 colors=_colours(shape),
                 labels=shape.labels or None,
                 show_labels=False,
@@ -105,25 +104,13 @@ def _archetype(shape: Shape) -> Any:
         case Arrows():
             vector = np.column_stack([shape.vector, np.zeros(len(shape.vector))])
             return rerun.Arrows3D(vectors=vector, origins=shape.tail, colors=_colours(shape), radii=[shape.radius])
-        case Ellipses():
-            half = np.column_stack([shape.half, np.full(len(shape.half), FLAT)])
-            return rerun.Ellipsoids3D(
-                centers=shape.centre, half_sizes=half, quaternions=_about_z(shape.yaw), colors=_colours(shape)
-            )
-        case Marks():
-            return rerun.Points3D(shape.place, radii=[shape.radius], colors=_colours(shape), labels=shape.names)
         case Points():
-            return rerun.Points3D(shape.points, radii=[shape.radius], colors=_colours(shape))
+            return rerun.Points3D(shape.points, radii=[shape.radius], colors=_colours(shape), labels=shape.names)
         case Pose():
             pose = shape.parent_T_child
             return rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
     assert_never(shape)
 
 
-def _colours(shape: Cubes | Lines | Arrows | Ellipses | Marks | Points) -> Any:
+def _colours(shape: Solids | Lines | Arrows | Points) -> Any:
     return shape.colour.astype(np.uint8)
-
-
-def _about_z(yaw: FloatArray) -> FloatArray:
-    """Quaternions (N, 4), x y z w, of rotations about z."""
-    return np.roll(yaw_quaternion(yaw), -1, axis=1)

@@ -115,8 +115,7 @@ class Following(Settings):
     news: EdgeInformation | None = information_setting()
     parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
     apart: NonNegative = setting(
-        0.0,
-        "leaders are ahead by at least this share of half of both lengths: nearer is itself, tracked twice",
+        0.0, "leaders are ahead by at least this share of half of both lengths: nearer is itself, tracked twice"
     )
     leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
     cones: ConeGeometry | None = settings_group(

@@ -15,7 +15,7 @@ from saga_fg.smoothing.settings import (
     OfflineClass,
     QualitySettings,
     SmoothingSettings,
-    StandingSettings,
+    StationarySettings,
 )
 from saga_fg.smoothing.sizes import constant_sizes, size_weights, weighted_medians
 from saga_fg.smoothing.standing import standing_states
@@ -36,8 +36,8 @@ __all__ = [
     "SmoothingSettings",
     "Source",
     "Standing",
-    "StandingSettings",
     "StateTable",
+    "StationarySettings",
     "attribute",
     "claim_detections",
     "constant_sizes",

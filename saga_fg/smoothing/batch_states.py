@@ -29,7 +29,7 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.graph_states import Epoch, states_in_graph
-from saga_fg.smoothing.settings import OfflineClass, StandingSettings
+from saga_fg.smoothing.settings import OfflineClass, StationarySettings
 from saga_fg.smoothing.states import Lives, StateTable
 from saga_fg.types.by_class import class_settings
 
@@ -50,7 +50,7 @@ def no_edges(moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGr
 class Standing:
     """States (m,) of objects that stand: their moments in ascending order, and ids; settings of how firmly."""
 
-    settings: StandingSettings = field(default_factory=StandingSettings)
+    settings: StationarySettings = field(default_factory=StationarySettings)
     moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 

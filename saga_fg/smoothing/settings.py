@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from factors import Robust
@@ -54,7 +54,7 @@ class JoiningSettings(Settings):
 
 
 @dataclass(frozen=True)
-class StandingSettings(Settings):
+class StationarySettings(Settings):
     """Objects that stand still (see the classes for how slow that is), and how firmly they are pinned."""
 
     min_time: NonNegative = setting(1.0, "shortest time it stands, s")
@@ -76,12 +76,11 @@ class QualitySettings(Settings):
 class SmoothingSettings(Settings):
     """Everything that turns online tracks into labels."""
 
-    classes: Mapping[str, OfflineClass] = field(
-        default_factory=lambda: {DEFAULT: OfflineClass()},
-        metadata={"comment": "by class; the entry named default serves all others"},
+    classes: Mapping[str, OfflineClass] = settings_group(
+        lambda: {DEFAULT: OfflineClass()}, "by class; the entry named default serves all others"
     )
     joining: JoiningSettings = settings_group(JoiningSettings, "joining of tracklets across gaps")
-    standing: StandingSettings = settings_group(StandingSettings, "objects that stand still")
+    stationary: StationarySettings = settings_group(StationarySettings, "objects that stand still")
     loss: Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"] = setting(
         "huber", "robust loss of the detections"
     )

@@ -17,7 +17,7 @@ import numpy as np
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.smoothing.batch_states import Standing
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.settings import OfflineClass, StandingSettings
+from saga_fg.smoothing.settings import OfflineClass, StationarySettings
 from saga_fg.smoothing.states import Lives, StateTable
 from saga_fg.types.by_class import class_values
 
@@ -27,7 +27,7 @@ def standing_states(
     lives: Lives,
     evidence: Evidence,
     object_of: IntArray,
-    settings: StandingSettings,
+    settings: StationarySettings,
     classes: Mapping[str, OfflineClass],
 ) -> Standing:
     """The states in which objects stand."""

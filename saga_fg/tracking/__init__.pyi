@@ -9,10 +9,10 @@ from .settings import (
     ClockSettings,
     EgoNodeSettings,
     ExistenceSettings,
-    FlowSettings,
     GreedySettings,
-    StandingSettings,
+    StationaritySettings,
     TrackerSettings,
+    TrafficFlowSettings,
 )
 from .tracker import Tracker
 
@@ -24,15 +24,15 @@ __all__ = [
     "EgoNodeSettings",
     "EstimatorName",
     "ExistenceSettings",
-    "FlowSettings",
     "GreedySettings",
     "GreedyTracker",
     "Journal",
     "Observer",
     "Stage",
-    "StandingSettings",
+    "StationaritySettings",
     "TimeVerdict",
     "Tracker",
     "TrackerSettings",
     "TrackerView",
+    "TrafficFlowSettings",
 ]

@@ -10,10 +10,10 @@ late; and a clock that was set must not stop the tracking. With `apart` the time
 After a single frame nobody knows which of two times of a sensor is wrong, and the second is believed. A stream whose
 steps are longer than `max_jump` is known by two steps alike, and then has its own limit.
 
-A sensor whose own frames go back in time, `late_run` new ones in a row, has had its clock set back; the tracker
+A sensor whose own frames go back in time, `reset_after` new ones in a row, has had its clock set back; the tracker
 follows. Frames of others that come late, in a burst after a stall for instance, and frames that are sent again say
-nothing of the clock. A sensor that was never in time, since its own clock is wrong, confirms a jump only by `late_run`
-frames in a row.
+nothing of the clock. A sensor that was never in time, since its own clock is wrong, confirms a jump only by
+`reset_after` frames in a row.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ class Clock:
         before = self.run if self._doubts_far(max_jump) == far else 0
         if far:
             run = before + 1 if self._agrees(timestamp, max_jump) else 1
-            needed = settings.late_run if not own else 1 if len(self.accepted) == 1 else 2
+            needed = settings.reset_after if not own else 1 if len(self.accepted) == 1 else 2
         else:
             run = before + (bool(own) and timestamp < max(own))
-            needed = settings.late_run
+            needed = settings.reset_after
         if run < needed:
             return "unconfirmed" if far else "late", replace(self, doubtful=stamp, run=run)
         last = self.newest if self.doubtful is None else self.doubtful[1]

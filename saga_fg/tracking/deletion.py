@@ -22,7 +22,7 @@ def delete_tracks(state: TrackerState) -> None:
     max_coasting, merging = state.class_values(table.label, "max_coasting", "merge_distance")
     deleted = coasting > max_coasting
     deleted |= np.round(state.time - table.last_in_view, 6) > settings.max_out_of_view
-    deleted |= ~table.confirmed & (table.existence < settings.existence.give_up)
+    deleted |= ~table.confirmed & (table.existence < settings.existence.delete_below)
     deleted |= untrackable(state)
     if (merging > 0).any():
         deleted |= duplicate_tracks(state.kinematics().position, table.label, coasting <= 0, merging)

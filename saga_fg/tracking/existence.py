@@ -44,9 +44,9 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     visible = sensor.sees(now.position + state.origin, measurements.world_T_ego)
     table.last_in_view[visible] = state.time
     p_detect = np.where(visible, sensor.detection_chance(table.label), 0.0)
-    if settings.occlusion > 0 and measurements.viewpoint is not None and missed.any():
+    if settings.occlusion_weight > 0 and measurements.viewpoint is not None and missed.any():
         boxes = state.boxes(now.position, now.velocity)
-        hidden = settings.occlusion * covered(boxes, measurements.viewpoint, ~missed)
+        hidden = settings.occlusion_weight * covered(boxes, measurements.viewpoint, ~missed)
         p_detect, visible = p_detect * (1 - hidden), visible & (hidden < HIDDEN)
     # a track that another sensor has just detected exists, whether this one misses it or not
     excused = table.sensors.detected_by_others(measurements.name, time, memory)
@@ -54,13 +54,13 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     p = measurements.probability[d]
     table.existence[missed] = after_miss(table.existence[missed], p_miss, elapsed, settings)
     table.existence[t] = after_hit(table.existence[t], p, settings)
-    table.confirmed |= table.existence >= settings.confirm
+    table.confirmed |= table.existence >= settings.confirm_above
     table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
     fused = table.sensors.probability(state.time, max(memory, measurements.delay))
     table.score = np.where(np.isfinite(fused), fused, table.score)
     table.hits, table.opportunities = table.sensors.best_hits()
-    table.accepted |= table.sensors.confirmed(state.settings.confirmations)
-    table.covariance_scale[t], table.shared_error[t] = measurements.covariance_scale[d], measurements.shared_error[d]
+    table.accepted |= table.sensors.confirmed(state.settings.confirming_detections)
+    table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
     table.last_detected[t] = np.maximum(table.last_detected[t], time)
     table.last_in_view[t] = state.time
 
@@ -73,7 +73,7 @@ def after_miss(existence: FloatArray, p_detect: FloatArray, elapsed: float, sett
 
 def after_hit(existence: FloatArray, probability: FloatArray, settings: ExistenceSettings) -> FloatArray:
     """Existence (k,) of tracks matched to a detection of some `probability` (k,)."""
-    odds = probability / (1 - probability) * (1 - settings.clutter_score) / settings.clutter_score
+    odds = probability / (1 - probability) * (1 - settings.neutral_score) / settings.neutral_score
     before = np.clip(existence, 1e-3, 1 - 1e-3)
     after = before / (1 - before) * odds
     return np.clip(after / (1 + after), 0.0, 0.999)

@@ -39,10 +39,10 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         existence=p.copy(),
         score=p.copy(),
         covariance_scale=measurements.covariance_scale[rows],
-        shared_error=measurements.shared_error[rows],
+        position_bias=measurements.position_bias[rows],
         last_detected=np.full(k, time),
         last_in_view=np.full(k, state.time),
-        confirmed=p >= state.settings.existence.confirm,
+        confirmed=p >= state.settings.existence.confirm_above,
         has_moved=np.zeros(k, dtype=bool),
         opportunities=np.ones(k),
         hits=np.ones(k),
@@ -63,7 +63,7 @@ def initial_kinematics(
     """The kinematics of new tracks from the measurements `rows` (k,), if they move; and the probability (k,) that they
     are stationary."""
     boxes, measured = measurements.boxes.select(rows), measurements.with_velocity[rows]
-    R, prior = measurements.R[rows], state.settings.standing.prior
+    R, prior = measurements.R[rows], state.settings.stationarity.prior
     velocity, P_velocity, stationary = _unmeasured_velocity(state, boxes, prior)
     if prior > 0:
         z, R_v = np.nan_to_num(boxes.velocity), R[:, 2:, 2:]

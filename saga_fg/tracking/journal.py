@@ -164,8 +164,8 @@ class Journal:
                 reason = f"not detected for longer than {of_class.max_coasting:g} s"
             elif out_of_view > settings.max_out_of_view:
                 reason = f"outside every sensor's view for longer than {settings.max_out_of_view:g} s"
-            elif existence < settings.existence.give_up:
-                reason = f"existence below {settings.existence.give_up:g} before it was confirmed"
+            elif existence < settings.existence.delete_below:
+                reason = f"existence below {settings.existence.delete_below:g} before it was confirmed"
             else:
                 reason = "another track took its place"
             self._write(event | {"coasting": coasting, "existence": existence, "reason": reason})

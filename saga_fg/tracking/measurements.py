@@ -44,7 +44,7 @@ class FrameMeasurements:
     range_rate                   (m,) m/s, NaN where not to be used
     range_rate_variance          (m,) (m/s)^2
     covariance_scale             (m,) factor on the reported deviation of positions, see `saga_fg.tracking.reporting`
-    shared_error                 (m,) part of the reported error of positions that does not average out, m
+    position_bias                 (m,) part of the reported error of positions that does not average out, m
     delay                        time by which the frame is older than the state, s
     class_likelihood             (m, C) of the classes of `saga_fg.tracking.class_belief`
     relative                     positions seen from a vehicle whose pose is estimated, else None
@@ -64,7 +64,7 @@ class FrameMeasurements:
     range_rate: FloatArray
     range_rate_variance: FloatArray
     covariance_scale: FloatArray
-    shared_error: FloatArray
+    position_bias: FloatArray
     delay: float = 0.0
     class_likelihood: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     relative: RelativePositions | None = None
@@ -92,7 +92,7 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     limit = sensor.max_speed if sensor.use_velocity else -1.0
-    covariance_scale, shared_error = sensor.told(boxes.label, probability)
+    covariance_scale, position_bias = sensor.told(boxes.label, probability)
     return FrameMeasurements(
         sensor,
         frame.sensor,
@@ -108,7 +108,7 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
         range_rate=np.where(np.abs(detections.range_rate) <= limit, detections.range_rate, np.nan),
         range_rate_variance=sensor.range_rate_variance(boxes.label, probability),
         covariance_scale=covariance_scale,
-        shared_error=shared_error,
+        position_bias=position_bias,
     )
 
 

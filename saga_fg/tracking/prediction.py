@@ -50,7 +50,7 @@ def _predict_step(state: TrackerState, dt: float) -> None:
 
 def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
     """Predict which tracks are stationary; return the factors on the process noise of all nodes."""
-    settings, stationarity = state.settings.standing, state.table.stationarity
+    settings, stationarity = state.settings.stationarity, state.table.stationarity
     if settings.prior == 0:
         return None
     stationarity.predict(dt, state.kinematics(), settings)

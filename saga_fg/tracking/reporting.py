@@ -1,7 +1,7 @@
 r"""Report: the tracks that are believed and were detected recently, with a score and a calibrated covariance.
 
-    score       p ( hits / (opportunities + newness) )^w           when detected; while coasting times r and
-                                                                   coasting_score
+    score       p ( hits / (opportunities + prior_opportunities) )^w           when detected; while coasting times r and
+                                                                   coasting_score_factor
     P_reported  = ( c (1 + h (1 - p)) )^2 P + ( e (1 + g (1 - p)) )^2 u u^T
 
 A filter's noise is wider than its errors where it also has to let the right detections through the gate, which are not
@@ -28,17 +28,17 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     table, settings = state.table, state.settings
     coasting = table.coasting(state.time)
     rows = np.flatnonzero(
-        (table.accepted | (settings.unconfirmed_share > 0))
-        & (table.confirmed | (table.existence >= settings.existence.report))
+        (table.accepted | (settings.unconfirmed_score_factor > 0))
+        & (table.confirmed | (table.existence >= settings.existence.report_above))
         & (coasting <= settings.report_coasting)
         & table.ready
     )
     table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
     boxes = table.boxes(now.position + state.origin, now.velocity)
-    P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.shared_error)
+    P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.position_bias)
     certainty = state.class_groups.certainty(table.class_belief)
     score = reported_score(table, certainty, coasting > 0, settings.existence)
-    score = np.where(table.accepted, score, settings.unconfirmed_share * score)
+    score = np.where(table.accepted, score, settings.unconfirmed_score_factor * score)
     return Tracks(timestamp, table.id, boxes, score, P, now.P_velocity, coasting)
 
 
@@ -47,8 +47,8 @@ def reported_score(
 ) -> FloatArray:
     """(n,) score of the tracks' boxes: of the latest detection, times the certainty (n,) of the class and the hit
     ratio; less while coasting."""
-    hit_ratio = (table.hits / (table.opportunities + settings.newness)) ** settings.steadiness_weight
-    unseen = table.existence * settings.coasting_score
+    hit_ratio = (table.hits / (table.opportunities + settings.prior_opportunities)) ** settings.hit_ratio_weight
+    unseen = table.existence * settings.coasting_score_factor
     return np.asarray(table.score * certainty * hit_ratio * np.where(coasting, unseen, 1.0))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -37,37 +37,52 @@ from saga_fg.types.signal import SignalSettings
 
 @dataclass(frozen=True)
 class ClassSettings(Settings):
-    """How objects of one class move, are born, matched and given up."""
+    """Motion, initiation, association and deletion of the tracks of one class."""
 
     motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
-        lambda: ConstantVelocity(acceleration_noise=2.0), "own motion; random_walk for what stands, such as cones"
+        lambda: ConstantVelocity(acceleration_noise=2.0),
+        "motion model of the class; random_walk for objects that never move, such as cones",
     )
     initial_speed_deviation: Positive = setting(
-        5.0, "standard deviation of an unmeasured velocity at birth, along the heading, m/s"
+        5.0, "standard deviation of the velocity of a new track along its heading, m/s; usual 1 (pedestrians) to 8"
     )
     initial_lateral_speed_deviation: Positive = setting(
-        1.0, "standard deviation of an unmeasured velocity at birth, across the heading, m/s"
+        1.0, "standard deviation of the velocity of a new track across its heading, m/s; usual 0.7 to 1.2"
     )
-    min_score: Fraction = setting(0.0, "detections with a lower probability are not used at all")
-    initiation_score: Fraction = setting(0.1, "detections with a lower probability start no track")
-    nms_distance: NonNegative = setting(0.5, "of two detections of the class closer than this the weaker goes, m")
+    min_score: Fraction = setting(
+        0.0, "discard detections with a lower probability; higher: fewer false tracks, more misses"
+    )
+    initiation_score: Fraction = setting(
+        0.1, "detections with a lower probability initiate no track; usual 0.02 to 0.3; higher: fewer false tracks"
+    )
+    nms_distance: NonNegative = setting(
+        0.5, "non-maximum suppression: discard the weaker of two detections closer than this, m; usual 0.3 to 1.5"
+    )
     weak_nms_distance: NonNegative = setting(
-        0.0, "a detection this close to a much stronger one of the class is its shadow, m"
+        0.0, "discard a detection this close to a much more probable one, m; usual 1 to 4, 0: never"
     )
-    weak_nms_ratio: Fraction = setting(0.5, "much stronger: the weaker has less than this share of its probability")
+    weak_nms_ratio: Fraction = setting(0.5, "much more probable: the other has less than this share of its probability")
     merge_distance: NonNegative = setting(
-        0.0, "a track that is not seen ends this close to one of the class that is, m"
+        0.0, "delete a coasting track when a detected track of its class is closer than this, m; 0: never"
     )
     cross_class_nms_iou: Fraction = setting(
-        1.0, "a detection whose IoU, from above, with a more probable one of another class is larger goes; 1: never"
+        1.0, "discard a detection whose IoU, from above, with a surer one of another class is larger; 1: never"
     )
     giou_weight: NonNegative = setting(
-        0.0, "what a whole unit of 3D GIoU counts in matching, as a squared distance in sigmas"
+        0.0, "weight of the 3D GIoU in the association cost, squared deviations; 0: compare centres only"
     )
-    gate: Fraction = setting(0.999, "share of true pairs that the chi-square gate lets through")
-    max_distance: PositiveOrInf = setting(4.0, "no match beyond this distance between prediction and detection, m")
-    max_coasting: PositiveOrInf = setting(1.2, "a track without detection is given up after this time, s")
-    yaw_drift: NonNegative = setting(0.3, "how fast the heading changes, standard deviation after one second, rad")
+    gate: Fraction = setting(
+        0.999, "gate probability: share of true pairs inside the chi-square gate; usual 0.99 to 0.9999; higher: wider"
+    )
+    max_distance: PositiveOrInf = setting(
+        4.0, "largest distance between a prediction and its detection, whatever the gate says, m; usual 1.5 to 12"
+    )
+    max_coasting: PositiveOrInf = setting(
+        1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
+    )
+    yaw_drift: NonNegative = setting(
+        0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,167 +92,199 @@ class ClassSettings(Settings):
 
 @dataclass(frozen=True)
 class AssociationSettings(Settings):
-    """How detections are matched to tracks, see `saga_fg.tracking.association`; gates and caps are the classes'."""
+    """Association of detections to tracks, see `saga_fg.tracking.association`; gates are settings of the classes."""
 
     method: AssociationName = setting(
-        "hungarian", "least total cost, the cheapest pair first, or graph: what pairs say of each other counts too"
+        "hungarian", "hungarian: least total cost; greedy: cheapest pair first; graph: distances of pairs count too"
     )
-    pair_weight: NonNegative = setting(1.0, "how much that counts, 1 by its face value, 0 not; used with method: graph")
+    pair_weight: NonNegative = setting(
+        1.0, "weight of the distances between objects with method graph; 0: none, 1: as the model says"
+    )
     clutter_area: PositiveOrInf = setting(
-        math.inf, "what is false in a frame is spread over this area, m^2; .inf: any pair inside the gate is a match"
+        math.inf, "area over which false detections spread, m^2; usual 3000 to 10000; .inf: accept any pair in the gate"
     )
-    existence_weight: NonNegative = setting(0.3, "how much the existence of a track counts, 1 by its face value, 0 not")
+    existence_weight: NonNegative = setting(
+        0.3, "weight of the existence probability of a track in the cost; 0: none, 1: as the model says"
+    )
     score_weight: NonNegative = setting(
-        0.5, "how much the probability of a detection counts, 1 by its face value, 0 not"
+        0.5, "weight of the probability of a detection in the cost; 0: none, 1: as the model says"
     )
 
 
 @dataclass(frozen=True)
 class ExistenceSettings(Settings):
-    """The probability that a track is a real object."""
+    """Existence probability of a track: when it is confirmed, reported and deleted."""
 
-    lifetime: PositiveOrInf = setting(30.0, "mean time after which an object leaves unseen, s")
-    clutter_score: Fraction = setting(0.2, "probability score at which a matched detection neither helps nor hurts")
-    report: Fraction = setting(0.0, "tracks are reported from this existence probability on")
-    confirm: Fraction = setting(0.9, "from here on a track is confirmed: misses no longer end it, only time does")
-    newness: NonNegative = setting(0.0, "looks in vain a new track starts with in the share of looks that saw it")
-    steadiness_weight: NonNegative = setting(
-        0.0, "power of that share that a track's score is multiplied by, 0 for none"
+    lifetime: PositiveOrInf = setting(
+        30.0, "mean time until an undetected object has left the scene, s; higher: undetected tracks live longer"
     )
-    coasting_score: Fraction = setting(1.0, "what a track's score is worth without a detection, besides its existence")
-    occlusion: Fraction = setting(
-        0.0, "share of the chance of a detection that a track wholly hidden behind another loses; 0: hidden is as seen"
+    neutral_score: Fraction = setting(
+        0.2, "detection probability that leaves the existence unchanged; higher: weak detections count against"
     )
-    give_up: Fraction = setting(0.02, "unconfirmed tracks below this existence probability are removed")
+    report_above: Fraction = setting(
+        0.0, "report tracks from this existence probability on; usual 0 to 0.99; higher: fewer, surer tracks"
+    )
+    confirm_above: Fraction = setting(
+        0.9, "confirm a track at this existence probability: misses no longer delete it, only time does"
+    )
+    prior_opportunities: NonNegative = setting(
+        0.0, "missed detection opportunities that each new track starts with in its hit ratio; usual 0 to 1"
+    )
+    hit_ratio_weight: NonNegative = setting(
+        0.0, "power of the hit ratio (hits / opportunities) in the score of a track; 0: it does not count"
+    )
+    coasting_score_factor: Fraction = setting(
+        1.0, "factor on the score of a track that was not detected in the frame; lower: coasting tracks rank lower"
+    )
+    occlusion_weight: Fraction = setting(
+        0.0, "share by which full occlusion by another track lowers the detection probability; 0: occlusion is ignored"
+    )
+    delete_below: Fraction = setting(
+        0.02, "delete an unconfirmed track below this existence probability; higher: false tracks end sooner"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.clutter_score in (0, 1):
-            raise InputError(f"clutter_score: expected a probability inside 0 to 1, got {self.clutter_score!r}")
+        if self.neutral_score in (0, 1):
+            raise InputError(f"neutral_score: expected a probability inside 0 to 1, got {self.neutral_score!r}")
 
 
 @dataclass(frozen=True)
-class FlowSettings(Settings):
-    """What a new track takes over from traffic that heads the same way, see `saga_fg.tracking.traffic_flow`."""
+class TrafficFlowSettings(Settings):
+    """Prior speed of a new track from traffic that heads the same way, see `saga_fg.tracking.traffic_flow`."""
 
-    weight: NonNegative = setting(
-        0.0, "what a neighbour counts for the speed of a new track against knowing nothing; 0: off"
-    )
+    weight: NonNegative = setting(0.0, "weight of one neighbour against the prior without traffic; 0: off, usual 5")
     ahead_scale: PositiveOrInf = setting(15.0, "sigma of the kernel on the distance along the heading, m")
-    lateral_scale: PositiveOrInf = setting(2.0, "sigma of the kernel on the distance across the heading, m")
+    lateral_scale: PositiveOrInf = setting(
+        2.0, "sigma of the kernel on the distance across the heading, m; about half a lane"
+    )
     heading_scale: PositiveOrInf = setting(0.3, "sigma of the kernel on the difference of headings, rad")
-    spread: NonNegative = setting(2.0, "standard deviation of the difference between the speeds of neighbours, m/s")
-    known_speed: PositiveOrInf = setting(1.5, "tracks whose speed is less certain than this teach nothing, m/s")
-    memory: NonNegative = setting(5.0, "where tracks passed is remembered for this long, s")
+    spread: NonNegative = setting(
+        2.0, "standard deviation of the difference between the speeds of neighbours, m/s; higher: a weaker prior"
+    )
+    max_speed_deviation: PositiveOrInf = setting(
+        1.5, "use only tracks whose speed has a standard deviation below this, m/s"
+    )
+    memory: NonNegative = setting(5.0, "remember where tracks have passed for this long, s; usual 5 to 10")
 
 
 @dataclass(frozen=True)
-class StandingSettings(Settings):
-    """The belief that an object stands still, see `saga_fg.tracking.stationarity`."""
+class StationaritySettings(Settings):
+    """Probability that an object is stationary, see `saga_fg.tracking.stationarity`."""
 
-    prior: Fraction = setting(0.0, "share of new objects that stand; 0: standing is no case of its own")
-    depart: NonNegative = setting(0.02, "rate at which what stands starts to move, 1/s")
-    halt: NonNegative = setting(0.05, "rate at which what moves comes to stand, 1/s")
-    drift: NonNegative = setting(
-        0.02, "how far the place of what stands drifts, standard deviation after one second, m"
+    prior: Fraction = setting(
+        0.0, "share of new objects that are stationary; 0: off; usual 0.5 where many cars are parked"
     )
-    noise: Fraction = setting(0.05, "share of the process noise that is left to what stands")
+    start_rate: NonNegative = setting(
+        0.02, "rate at which stationary objects start to move, 1/s; higher: departing cars are followed sooner"
+    )
+    stop_rate: NonNegative = setting(0.05, "rate at which moving objects stop, 1/s")
+    drift: NonNegative = setting(0.02, "standard deviation of the drift of a stationary position in one second, m")
+    noise_scale: Fraction = setting(
+        0.05, "factor on the process noise of a surely stationary object; lower: steadier velocities, later departures"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.prior == 1 or self.noise == 0:
-            raise InputError("prior and noise: expected a prior below 1 and some noise, since everything may move")
+        if self.prior == 1 or self.noise_scale == 0:
+            raise InputError(
+                "prior and noise_scale: expected a prior below 1 and a scale above 0, since everything may move"
+            )
 
 
 @dataclass(frozen=True)
 class ClockSettings(Settings):
-    """Which timestamps are believed, see `saga_fg.tracking.clock`."""
+    """Handling of implausible timestamps, see `saga_fg.tracking.clock`."""
 
     max_jump: PositiveOrInf = setting(
-        10.0, "a frame further than this from the newest time is left out until a second one confirms its time, s"
+        10.0, "leave out a frame further than this from the newest time until a second frame confirms its time, s"
     )
-    late_run: PositiveInt = setting(
-        3, "new frames in a row by which a sensor goes back in time, after which the clock is set back"
+    reset_after: PositiveInt = setting(
+        3, "set the clock back after this many frames in a row in which the time of a sensor decreases"
     )
 
 
 @dataclass(frozen=True)
 class EgoNodeSettings(Settings):
-    """The vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
+    """The ego vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
 
     estimated: bool = setting(
-        False,
-        "its pose is a variable of the running graph, which providers move, and detections in its frame are seen from "
-        "there; false: it is where frames say",
+        False, "true: estimate the ego pose with the objects, by factor providers; false: use that of the frames"
     )
-    label: str = setting("car", "its class for edge rules")
-    length: Positive = setting(4.5, "m")
-    deviation: Positive = setting(0.02, "standard deviation of its place about its pose, m")
+    label: str = setting("car", "class of the ego vehicle in edge rules")
+    length: Positive = setting(4.5, "length of the ego vehicle, m")
+    deviation: Positive = setting(0.02, "standard deviation of the ego position about its pose, m")
 
 
 @dataclass(frozen=True)
 class TrackerSettings(Settings):
-    """Everything the tracker can be told; `edges` empty is the classical filter of independent objects.
+    """All settings of the tracker; with `edges` empty it is the classical filter of independent objects.
 
     Raises `InputError` for edge rules that make the dynamics, or a step of up to a second, unstable.
     """
 
-    classes: Mapping[str, ClassSettings] = field(
-        default_factory=lambda: {DEFAULT: ClassSettings()},
-        metadata={"comment": "by class; the entry named default serves all others"},
+    classes: Mapping[str, ClassSettings] = settings_group(
+        lambda: {DEFAULT: ClassSettings()}, "settings by class of object; the entry named default serves all others"
     )
     edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
-        settings_group(lambda: (Following(), Neighbours()), "edge rules of the scene graph; [] for independent objects")
+        settings_group(
+            lambda: (Following(), Neighbours()),
+            "edge rules of the scene graph: who interacts with whom; []: no interactions",
+        )
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
-        (),
-        "groups of classes that detectors mistake for each other: tracks believe in all of a group, and a detection of "
-        "one may be of a track of another; []: a track has the class it was born with",
+        (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"
     )
     explained_noise: NonNegative = setting(
-        0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
+        0.0, "process noise is scaled by exp(-explained_noise K) at the total rate K of interactions, s; usual 0 to 2"
     )
     max_step: PositiveOrInf = setting(
-        math.inf,
-        "a longer interval is predicted in several steps, at most 100, each with edges of its own, s; .inf: in one",
+        math.inf, "longest prediction step, s; longer intervals are split, with edges of their own; .inf: never split"
     )
-    signals: SignalSettings = settings_group(SignalSettings, "traffic lights, where a map knows of any")
+    signals: SignalSettings = settings_group(SignalSettings, "traffic lights of a map")
     road_map: RoadMap | None = settings_group(
-        lambda: None, "lights, stop lines and lanes, world coordinates; null: none but those that frames bring along"
+        lambda: None, "lights, stop lines, lanes and walls in world coordinates; null: those that frames bring along"
     )
-    estimator: EstimatorName = setting("kalman", "what holds the joint state of the tracks")
+    estimator: EstimatorName = setting(
+        "kalman", "estimator of the joint state: kalman (fastest), isam2 (whole past), fixed-lag (window that smooths)"
+    )
     providers: tuple[str | FactorProvider, ...] = setting(
-        (),
-        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, of saga_fg.providers or your "
-        "own; the modules are imported",
+        (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, of saga_fg.providers or your own"
     )
     ego: EgoNodeSettings | None = settings_group(
-        lambda: None, "the vehicle as a node that leads and follows; null: it is none"
+        lambda: None, "ego vehicle as a node that leads and follows others; null: not in the graph"
     )
     lag: NonNegative = setting(
-        2.0, "window of the fixed-lag estimator, s; without providers, frames this late are put where they belong"
+        2.0, "window of the fixed-lag estimator, s; usual 0.5 to 5; higher: better states behind the present, slower"
     )
-    association: AssociationSettings = settings_group(AssociationSettings, "how detections are matched to tracks")
-    existence: ExistenceSettings = settings_group(ExistenceSettings, "when a track is believed")
-    flow: FlowSettings = settings_group(FlowSettings, "the speed of new tracks from traffic around them")
-    standing: StandingSettings = settings_group(StandingSettings, "whether an object stands or moves")
-    report_speed_known: PositiveOrInf = setting(
-        math.inf,
-        "a track is first reported when the standard deviation of its velocity is below this, m/s; .inf: at once",
+    association: AssociationSettings = settings_group(AssociationSettings, "association of detections to tracks")
+    existence: ExistenceSettings = settings_group(ExistenceSettings, "when tracks are confirmed, reported and deleted")
+    traffic_flow_prior: TrafficFlowSettings = settings_group(
+        TrafficFlowSettings, "speed of new tracks from the traffic around them"
     )
-    score_memory: NonNegative = setting(0.15, "what a sensor said of a track counts for its score for this long, s")
-    confirmations: PositiveInt = setting(
-        3, "detections that confirm a track born of a weak sensor; another sensor's one does"
+    stationarity: StationaritySettings = settings_group(StationaritySettings, "whether objects are stationary or move")
+    report_speed_deviation_below: PositiveOrInf = setting(
+        math.inf, "first report a track when its velocity is known to this standard deviation, m/s; .inf: at once"
     )
-    unconfirmed_share: Fraction = setting(
-        0.0, "share of its score with which a track is reported that waits for confirmation; 0: not at all"
+    score_memory: NonNegative = setting(
+        0.15, "time for which the latest detection of each sensor counts in the score of a track, s; about one frame"
     )
-    clock: ClockSettings = settings_group(ClockSettings, "which timestamps are believed")
-    max_delay: NonNegative = setting(0.5, "a frame that comes later than this is left out, s")
+    confirming_detections: PositiveInt = setting(
+        3, "detections that confirm a track initiated by a sensor with `initiation: confirmed`"
+    )
+    unconfirmed_score_factor: Fraction = setting(
+        0.0, "factor on the score of tracks that wait for confirmation; 0: do not report them"
+    )
+    clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
+    max_delay: NonNegative = setting(
+        0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
+    )
     max_out_of_view: PositiveOrInf = setting(
-        0.5, "a track outside every sensor's field of view is given up after this time, s"
+        0.5, "delete a track this long after it left every sensor's field of view, s"
     )
-    report_coasting: NonNegative = setting(0.6, "tracks are reported for this long after their last detection, s")
+    report_coasting: NonNegative = setting(
+        0.6, "report a track for this long after its last detection, s; higher: fewer gaps, more false positives"
+    )
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
         """Whether any class moves nonlinearly, or any of the edge rules acts so."""
@@ -272,12 +319,14 @@ class TrackerSettings(Settings):
 class GreedySettings(Settings):
     """The greedy nearest-centre tracker (Yin et al., CenterPoint, CVPR 2021, section 4.2)."""
 
-    max_distance: Mapping[str, float] = field(
-        default_factory=lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
-        metadata={"comment": "largest distance between prediction and detection by class, m"},
+    max_distance: Mapping[str, float] = settings_group(
+        lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
+        "largest distance of prediction and detection by class, m; default serves all others",
     )
-    max_coasting: PositiveOrInf = setting(1.2, "a track without detection is kept this long, s")
-    baseline: NonNegative = setting(0.2, "velocities are differences of positions at least this far apart in time, s")
-    min_score: Fraction = setting(0.0, "detections with a lower probability are not used")
-    clock: ClockSettings = settings_group(ClockSettings, "which timestamps are believed")
-    max_delay: NonNegative = setting(0.5, "a frame that comes later than this is left out, s")
+    max_coasting: PositiveOrInf = setting(1.2, "delete a track this long after its last detection, s")
+    baseline: NonNegative = setting(
+        0.2, "least time between two positions whose difference gives a velocity, s; higher: smoother, later velocities"
+    )
+    min_score: Fraction = setting(0.0, "discard detections with a lower probability")
+    clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
+    max_delay: NonNegative = setting(0.5, "discard frames that are older than the newest by more than this, s")

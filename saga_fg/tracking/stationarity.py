@@ -1,6 +1,6 @@
 r"""Stationary or moving: a discrete state of every track beside its Gaussian one, and its use.
 
-    s <- b + (s - b) exp(-(depart + halt) dt),   b = halt / (depart + halt)     prediction over dt
+    s <- b + (s - b) exp(-(start + stop) dt),   b = stop / (start + stop)     prediction over dt
     s / (1 - s) <- s / (1 - s)  N(z; a, D + R) / N(z; H m, H P H^T + R)         update with a detection z
 
 s is the probability that the object is stationary. If it moves, its state is that of the joint filter, N(m, P). If it
@@ -30,7 +30,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import mahalanobis_of_pairs
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.tracking.settings import StandingSettings
+from saga_fg.tracking.settings import StationaritySettings
 
 _MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
 
@@ -53,10 +53,10 @@ class Stationarity(Columns):
         """Return the rows of new tracks."""
         return cls(now.position.copy(), now.P.copy(), probability)
 
-    def predict(self, dt: float, moving: Kinematics, settings: StandingSettings) -> None:
+    def predict(self, dt: float, moving: Kinematics, settings: StationaritySettings) -> None:
         """Predict by `dt` s; `moving` is the joint filter's state before."""
-        rate = settings.depart + settings.halt
-        balance, lost = settings.halt / max(rate, 1e-12), -math.expm1(-rate * dt)
+        rate = settings.start_rate + settings.stop_rate
+        balance, lost = settings.stop_rate / max(rate, 1e-12), -math.expm1(-rate * dt)
         stays, halts = self.probability * (1 - (1 - balance) * lost), (1 - self.probability) * balance * lost
         self.probability = stays + halts
         new = (halts / np.maximum(self.probability, 1e-12))[:, None]
@@ -89,9 +89,9 @@ class Stationarity(Columns):
         self.P[rows] = self.P[rows] - gain @ self.P[rows]
         self.probability[rows] = after_evidence(self.probability[rows], evidence)
 
-    def noise_scale(self, settings: StandingSettings) -> FloatArray:
+    def noise_scale(self, settings: StationaritySettings) -> FloatArray:
         """(n,) factor on the process noise, expected over both states."""
-        return np.asarray(1 - self.probability * (1 - settings.noise))
+        return np.asarray(1 - self.probability * (1 - settings.noise_scale))
 
     def reported(self, moving: Kinematics) -> Kinematics:
         """The joint filter's state with the velocity that is reported."""

@@ -27,7 +27,7 @@ class TrackTable(Columns):
     existence         (n,) probability that the track is a real object
     score             (n,) probability of its latest detection
     covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
-    shared_error      (n,) error of the position that all detections of the track share, m
+    position_bias      (n,) error of the position that all detections of the track share, m
     last_detected     (n,) time of its latest detection
     last_in_view      (n,) time when it was last inside a sensor's field of view
     confirmed         (n,) whether misses no longer delete it
@@ -47,7 +47,7 @@ class TrackTable(Columns):
     existence: FloatArray
     score: FloatArray
     covariance_scale: FloatArray
-    shared_error: FloatArray
+    position_bias: FloatArray
     last_detected: FloatArray
     last_in_view: FloatArray
     confirmed: BoolArray

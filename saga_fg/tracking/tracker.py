@@ -154,7 +154,7 @@ class Tracker:
         ids = np.concatenate([state.table.id[matching.track], state.table.id[len(state) - len(rows) :]])
 
         delete_tracks(state)
-        state.table.ready |= state.reported_kinematics().speed_deviation <= self.settings.report_speed_known
+        state.table.ready |= state.reported_kinematics().speed_deviation <= self.settings.report_speed_deviation_below
         self._notify("delete", state, frame.sensor, measurements, matching)
         self._notify("report", state, frame.sensor, measurements, matching)
         return Assignment(ids, measurements.row[np.concatenate([matching.detection, rows])])

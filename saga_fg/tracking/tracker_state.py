@@ -98,7 +98,7 @@ class TrackerState:
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
         self.table = TrackTable.empty(len(self.class_groups))
         self.map_nodes, self.ego = MapNodes(settings.signals), EgoNode.of(settings)
-        self.traffic = TrafficFlowPrior(settings.flow)
+        self.traffic = TrafficFlowPrior(settings.traffic_flow_prior)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -118,7 +118,7 @@ class TrackerState:
     def reported_kinematics(self) -> Kinematics:
         """The estimates of all tracks, with velocities that allow for standing still."""
         now = self.kinematics()
-        return self.table.stationarity.reported(now) if self.settings.standing.prior > 0 else now
+        return self.table.stationarity.reported(now) if self.settings.stationarity.prior > 0 else now
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

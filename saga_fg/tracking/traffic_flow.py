@@ -24,7 +24,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.tracking.settings import FlowSettings
+from saga_fg.tracking.settings import TrafficFlowSettings
 from saga_fg.tracking.track_table import TrackTable
 
 
@@ -64,13 +64,13 @@ class SpeedPrior(NamedTuple):
 class TrafficFlowPrior:
     """The passages of the last `memory` seconds."""
 
-    settings: FlowSettings
+    settings: TrafficFlowSettings
     passages: Passages | None = None
 
     def update(self, passages: Passages) -> None:
         """Remember passages of the present; those of unknown heading or speed are left out."""
         settings = self.settings
-        known = np.isfinite(passages.heading) & (passages.variance < settings.known_speed**2)
+        known = np.isfinite(passages.heading) & (passages.variance < settings.max_speed_deviation**2)
         if settings.weight == 0 or len(known) == 0:
             return
         new = passages.select(known)

@@ -28,7 +28,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     t, d = matching.track, matching.detection
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
     R, with_velocity = measurements.R[d], measurements.with_velocity[d]
-    if state.settings.standing.prior > 0:
+    if state.settings.stationarity.prior > 0:
         position, P = state.joint.positions_before(table.id, table.label, delay)
         moving = state.kinematics()._replace(position=position, P=P).select(t)
         table.stationarity.update(t, z, R, moving, with_velocity)
@@ -43,7 +43,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         moves = (speed > MOVING) & (speed > 3 * now.speed_deviation)
         table.box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
         table.has_moved[t] |= moves[t]
-    if state.settings.flow.weight > 0:
+    if state.settings.traffic_flow_prior.weight > 0:
         passing, now = table.select(t), state.kinematics().select(t)
         state.traffic.update(Passages.of(passing, now.position + state.origin, now, state.time))
 

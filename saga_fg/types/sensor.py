@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -117,9 +117,8 @@ class Extrinsics:
 class Sensor(Settings):
     """A sensor's model."""
 
-    noise: Mapping[str, NoiseModel] = field(
-        default_factory=lambda: {DEFAULT: NoiseModel()},
-        metadata={"comment": "by class; the entry named default serves all others"},
+    noise: Mapping[str, NoiseModel] = settings_group(
+        lambda: {DEFAULT: NoiseModel()}, "by class; the entry named default serves all others"
     )
     use_velocity: bool = setting(True, "take in the velocity, or the range rate, where one was measured")
     max_speed: PositiveOrInf = setting(

@@ -106,7 +106,8 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path: Path) -> None:
 
 def test_the_ellipse_holds_ninety_percent() -> None:
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
-    half, (angle,) = ellipses(covariance[None])
+    size, (angle,) = ellipses(covariance[None])
+    half = size[:, :2] / 2
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     np.testing.assert_allclose(turn @ np.diag(half[0] ** 2) @ turn.T, HELD * covariance)
     points = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 20000) @ turn / half[0]

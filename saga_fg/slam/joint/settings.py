@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 from saga_fg.errors import InputError
@@ -48,9 +48,9 @@ class JointSettings(Settings):
     online_standing_share: Annotated[float, Range(1e-06, 1 - 1e-06)] = setting(
         0.1, "share of objects expected to stand, online, where queues that creep look parked for a while"
     )
-    moving_speed: Mapping[str, Positive] = field(
-        default_factory=lambda: {DEFAULT: 5.0, "pedestrian": 1.0},
-        metadata={"comment": "deviation of a velocity component of objects that move, by class, m/s"},
+    moving_speed: Mapping[str, Positive] = settings_group(
+        lambda: {DEFAULT: 5.0, "pedestrian": 1.0},
+        "deviation of a velocity component of objects that move, by class, m/s",
     )
     standing_drift: Positive = setting(0.05, "how far an object that stands may wander, m after one second")
     standing_speed: Positive = setting(0.1, "standard deviation of the velocity of an object that stands, m/s")

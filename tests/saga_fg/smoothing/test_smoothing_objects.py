@@ -15,8 +15,8 @@ from saga_fg.smoothing import (
     Lives,
     OfflineClass,
     SmoothedEdges,
-    StandingSettings,
     StateTable,
+    StationarySettings,
     claim_detections,
     evidence_scores,
     gather_evidence,
@@ -105,7 +105,7 @@ def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
     evidence, numbers = gathered(paths)
     lives = lives_of_evidence(numbers, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, numbers, lives, np.tile(25.0 * np.eye(2), (3, 1, 1)), CLASSES)
-    standing = standing_states(states, lives, evidence, numbers, StandingSettings(), CLASSES)
+    standing = standing_states(states, lives, evidence, numbers, StationarySettings(), CLASSES)
     assert sorted(standing.moment[standing.id == 0].tolist()) == list(range(20))
     assert set(standing.moment[standing.id == 1].tolist()) <= set(range(9))
     assert (standing.id == 1).sum() >= 5

@@ -15,8 +15,8 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.smoothing import (
     SmoothedEdges,
     Standing,
-    StandingSettings,
     StateTable,
+    StationarySettings,
     gather_evidence,
     lives_of_evidence,
     smooth_states,
@@ -89,7 +89,7 @@ def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
     rules = (Neighbours(min_speed=0.2, classes=("pedestrian",)),)
     edges = SmoothedEdges.of(rules, 0.0, lives, alone, np.full(n, np.nan), np.full(n, 0.5))
     moments = np.arange(len(evidence.times))
-    stands = Standing(StandingSettings(), moments, np.full(len(moments), 2))
+    stands = Standing(StationarySettings(), moments, np.full(len(moments), 2))
     weight = np.where(object_of == 1, 0.5, 1.0)
     return smooth_states(evidence, object_of, lives, V, CLASSES, edges, weight, stands, providers)
 

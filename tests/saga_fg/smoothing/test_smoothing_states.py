@@ -15,8 +15,8 @@ from saga_fg.smoothing import (
     Lives,
     OfflineClass,
     Standing,
-    StandingSettings,
     StateTable,
+    StationarySettings,
     batch_states,
     gather_evidence,
     lives_of_evidence,
@@ -122,7 +122,7 @@ def test_a_pinned_object_stays_where_it_is() -> None:
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     mine = np.zeros(20, dtype=np.int64)
     lives = lives_of_evidence(mine, evidence.boxes.label, evidence.moment)
-    stands = Standing(StandingSettings(), np.arange(20), mine)
+    stands = Standing(StationarySettings(), np.arange(20), mine)
     states = smooth_states(evidence, mine, lives, 25 * np.eye(2)[None], CLASSES, standing=stands)
     assert np.ptp(states.mean[:, :2], axis=0).max() < 0.1 * SIGMA
     assert np.allclose(states.mean[:, :2] + evidence.origin, path.mean(axis=0), atol=0.1 * SIGMA)

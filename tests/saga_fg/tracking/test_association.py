@@ -37,7 +37,7 @@ def measured(found, probability, noise=0.3):
         range_rate=np.full(n, np.nan),
         range_rate_variance=flat,
         covariance_scale=flat,
-        shared_error=flat,
+        position_bias=flat,
         viewpoint=None,
     )
 

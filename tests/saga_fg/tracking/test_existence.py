@@ -32,7 +32,7 @@ def test_a_miss_is_the_likelier_the_less_the_track_exists():
 
 def test_a_detection_as_probable_as_clutter_says_nothing():
     r = np.array([0.2, 0.7])
-    assert after_hit(r, np.full(2, SETTINGS.clutter_score), SETTINGS) == pytest.approx(r)
+    assert after_hit(r, np.full(2, SETTINGS.neutral_score), SETTINGS) == pytest.approx(r)
     assert (after_hit(r, np.full(2, 0.9), SETTINGS) > r).all()
     assert (after_hit(r, np.full(2, 0.05), SETTINGS) < r).all()
 
@@ -40,12 +40,12 @@ def test_a_detection_as_probable_as_clutter_says_nothing():
 def test_the_score_is_the_detections_unless_set_otherwise():
     assert score([0.4, 0.8], 1, 5) == pytest.approx([0.4, 0.8])
     assert score([0.4, 0.8], 1, 5, coasting=True) == pytest.approx([0.36, 0.72])
-    half = ExistenceSettings(coasting_score=0.5)
+    half = ExistenceSettings(coasting_score_factor=0.5)
     assert score([0.4, 0.8], 1, 5, coasting=True, settings=half) == pytest.approx([0.18, 0.36])
 
 
 def test_a_steady_track_scores_higher_than_a_new_or_a_flickering_one():
-    settings = ExistenceSettings(newness=1.0, steadiness_weight=0.5)
+    settings = ExistenceSettings(prior_opportunities=1.0, hit_ratio_weight=0.5)
     counts = ((9, 9), (1, 1), (4, 9))
     steady, new, flickering = (score(0.6, *count, settings=settings).item() for count in counts)
     assert steady == pytest.approx(0.6 * np.sqrt(0.9))

@@ -58,7 +58,7 @@ def test_the_world_may_be_turned_and_moved(turn, x, y):
 
 def existence(occlusion):
     """Of a car that is not seen any more once another stands before it, and whether a sensor is said to have looked."""
-    settings = TrackerSettings(edges=(), existence=ExistenceSettings(occlusion=occlusion, lifetime=np.inf))
+    settings = TrackerSettings(edges=(), existence=ExistenceSettings(occlusion_weight=occlusion, lifetime=np.inf))
     tracker = Tracker(settings)
     for k in range(15):
         cars = [(20.0, 0.0)] if k < 10 else [(10.0, 0.0)]

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import Sensor, Tracker, TrackerSettings
-from saga_fg.tracking import StandingSettings
+from saga_fg.tracking import StationaritySettings
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.stationarity import Stationarity
 
-ON = StandingSettings(prior=0.5)
-SETTINGS = TrackerSettings(edges=(), standing=ON)
-OFF = replace(SETTINGS, standing=StandingSettings())
+ON = StationaritySettings(prior=0.5)
+SETTINGS = TrackerSettings(edges=(), stationarity=ON)
+OFF = replace(SETTINGS, stationarity=StationaritySettings())
 TIMES = np.arange(60) * 0.1
 
 
@@ -57,7 +57,7 @@ def test_a_measured_velocity_is_evidence_of_its_own():
 
 @given(s=st.floats(0, 1), dt=st.floats(0.01, 5), share=st.floats(0.1, 0.9))
 def test_what_time_does_does_not_depend_on_how_often_one_looks(s, dt, share):
-    settings = StandingSettings(prior=0.5, depart=0.2, halt=0.3)
+    settings = StationaritySettings(prior=0.5, start_rate=0.2, stop_rate=0.3)
     at_once, in_two = (Stationarity.initiated(kinematics(), np.array([s])) for _ in range(2))
     at_once.predict(dt, kinematics(), settings)
     in_two.predict(share * dt, kinematics(), settings)

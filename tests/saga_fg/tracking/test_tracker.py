@@ -23,7 +23,7 @@ TENTHS = np.arange(0, 5, 0.1)
 
 def settings(edges=(), **values):
     """Independent objects of one kind of class settings."""
-    existence = {k: values.pop(k) for k in ("report", "confirm", "give_up", "lifetime") if k in values}
+    existence = {k: values.pop(k) for k in ("report_above", "confirm_above", "delete_below", "lifetime") if k in values}
     overall = {k: values.pop(k) for k in ("max_delay", "report_coasting", "max_out_of_view") if k in values}
     return TrackerSettings(
         {"default": ClassSettings(**values)}, edges=edges, existence=ExistenceSettings(**existence), **overall
@@ -175,13 +175,13 @@ def test_how_often_nobody_looks_does_not_matter_to_belief():
 
 def test_a_confirmed_track_outlives_misses():
     for score, alive in ((0.95, 1), (0.3, 0)):
-        tracker = Tracker(settings(max_coasting=2.0, report_coasting=2.0, confirm=0.9))
+        tracker = Tracker(settings(max_coasting=2.0, report_coasting=2.0, confirm_above=0.9))
         tracker.step(frame(0.0, [(0, 0)], score=score))
         assert len(run(tracker, [frame(t, []) for t in np.arange(0.1, 1.0, 0.1)])[-1]) == alive
 
 
 def test_only_believed_tracks_are_reported():
-    tracker = Tracker(settings(report=0.7))
+    tracker = Tracker(settings(report_above=0.7))
     assert len(tracker.step(frame(0.0, [(0, 0)], score=0.5))) == 0
     assert tracker.step(frame(0.1, [(0, 0)], score=0.5)).id.tolist() == [1]
 

@@ -143,11 +143,11 @@ def test_how_far_the_clock_may_jump_can_be_set():
         assert verdicts(tracker, [frame(60.0, [(0, 0)])]) == [expected]
     greedy = GreedyTracker(GreedySettings(clock=ClockSettings(max_jump=5.0)))
     assert verdicts(greedy, [frame(t, [(0, 0)]) for t in (0.0, 0.1, 6.0)]) == [*["accepted"] * 2, "unconfirmed"]
-    patient = Tracker(TrackerSettings(clock=ClockSettings(late_run=6)))
+    patient = Tracker(TrackerSettings(clock=ClockSettings(reset_after=6)))
     run(patient, [*at(0.0, np.arange(5) / 10), frame(9.0, [])])
     assert verdicts(patient, at(0.0, 0.5 + np.arange(6) / 10)) == [*["late"] * 5, "set_back"]
-    with pytest.raises(InputError, match="late_run: expected a finite number > 0"):
-        ClockSettings(late_run=0)
+    with pytest.raises(InputError, match="reset_after: expected a finite number > 0"):
+        ClockSettings(reset_after=0)
 
 
 def test_tracks_that_outlive_a_jump_are_predicted():

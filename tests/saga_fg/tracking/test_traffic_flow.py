@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from traffic_frames import frame
 
 from saga_fg import Tracker, TrackerSettings
-from saga_fg.tracking import FlowSettings
+from saga_fg.tracking import TrafficFlowSettings
 from saga_fg.tracking.traffic_flow import Passages, TrafficFlowPrior
 
-ON = FlowSettings(weight=5.0)
+ON = TrafficFlowSettings(weight=5.0)
 
 
 def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="car", standing=0.0):
@@ -114,7 +114,7 @@ def behind_a_leader(settings, newcomer=True):
 
 
 def test_a_car_that_appears_behind_another_starts_at_its_speed_with_less_doubt():
-    on = behind_a_leader(TrackerSettings(edges=(), flow=ON))
+    on = behind_a_leader(TrackerSettings(edges=(), traffic_flow_prior=ON))
     off = behind_a_leader(TrackerSettings(edges=()))
     assert off.boxes.velocity[1] == pytest.approx([0.0, 0.0])
     assert on.boxes.velocity[1] == pytest.approx([9.0, 0.0], abs=1.5)
@@ -123,13 +123,13 @@ def test_a_car_that_appears_behind_another_starts_at_its_speed_with_less_doubt()
 
 
 def test_reports_wait_until_the_velocity_is_known():
-    waiting = TrackerSettings(edges=(), report_speed_known=1.5)
+    waiting = TrackerSettings(edges=(), report_speed_deviation_below=1.5)
     assert behind_a_leader(waiting).id.tolist() == [1]
-    assert behind_a_leader(replace(waiting, report_speed_known=np.inf)).id.tolist() == [1, 2]
+    assert behind_a_leader(replace(waiting, report_speed_deviation_below=np.inf)).id.tolist() == [1, 2]
 
 
 def test_a_snapshot_remembers_the_traffic():
-    settings = TrackerSettings(edges=(), flow=ON)
+    settings = TrackerSettings(edges=(), traffic_flow_prior=ON)
     tracker, fresh = Tracker(settings), Tracker(settings)
     for k in range(20):
         tracker.step(frame(0.1 * k, [(1.2 * k, 0.0)]))
