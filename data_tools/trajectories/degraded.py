@@ -1,4 +1,4 @@
-"""Odometry made worse: what a poor device would have reported of a known path."""
+"""OdometryIncrements made worse: what a poor device would have reported of a known path."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.joint import Odometry, OdometryNoise
+from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
 
 
-def degraded_odometry(odometry: Odometry, noise: OdometryNoise, rng: np.random.Generator) -> Odometry:
+def degraded_odometry(
+    odometry: OdometryIncrements, noise: OdometryNoise, rng: np.random.Generator
+) -> OdometryIncrements:
     """`odometry` with errors drawn from the model of `noise`: independent ones; a scale, bias and course that wander.
 
     What the estimator is told is the model alone, never what was drawn.
@@ -28,7 +30,7 @@ def degraded_odometry(odometry: Odometry, noise: OdometryNoise, rng: np.random.G
     course[:, 2] = slow[:, 2]
     turned = (_rotations(course) @ a_T_b[:, :3, 3, None])[:, :, 0]
     a_T_b[:, :3, 3] = turned * (1 + slow[:, :1]) + drawn[:, 3:6]
-    return Odometry(odometry.timestamps, a_T_b)
+    return OdometryIncrements(odometry.timestamps, a_T_b)
 
 
 def _rotations(vector: FloatArray) -> FloatArray:

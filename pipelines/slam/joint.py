@@ -21,7 +21,7 @@ from saga_fg.slam.joint import (
     JointEstimate,
     JointSettings,
     Observations,
-    Odometry,
+    OdometryIncrements,
     OnlineEstimate,
     estimate_jointly,
     estimate_online,
@@ -93,7 +93,7 @@ def run_joint(
 
 def degraded_drive(
     scene: Scene, settings: JointSettings, sensor: str, seed: int
-) -> tuple[list[Frame], Trajectory, Odometry]:
+) -> tuple[list[Frame], Trajectory, OdometryIncrements]:
     """The keyframes of one sensor, their true path, and odometry degraded as `settings.odometry` says.
 
     Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
@@ -105,7 +105,7 @@ def degraded_drive(
     if len(poses) < len(frames):
         raise InputError(f"scene {scene.name}: expected a pose with every frame of {sensor}")
     truth = Trajectory(np.array([frame.timestamp for frame in frames]), np.stack(poses))
-    exact = Odometry.of(truth.timestamps, truth.world_T_ego)
+    exact = OdometryIncrements.of(truth.timestamps, truth.world_T_ego)
     return frames, truth, degraded_odometry(exact, settings.odometry, np.random.default_rng(seed))
 
 

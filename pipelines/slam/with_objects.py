@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from data_tools.lidar.scan_sequence import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
-from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.slam.joint import JointEstimate, Odometry, estimate_jointly, estimate_online
+from saga_fg.slam.joint import JointEstimate, OdometryIncrements, estimate_jointly, estimate_online
 from saga_fg.slam.joint.record import in_ego
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
@@ -66,7 +66,7 @@ def with_objects(
 
     seen = _frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
     motions = result.drive.motions(rows)
-    odometry = Odometry(
+    odometry = OdometryIncrements(
         scans.timestamps[rows],
         np.array([motion for motion, _ in motions]).reshape(-1, 4, 4),
         np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),

@@ -4,7 +4,7 @@ import numpy as np
 
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.slam.joint import Odometry
+from saga_fg.slam.joint import OdometryIncrements
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.sensor import NoiseModel
 
@@ -26,7 +26,7 @@ def drive(seed=0, n=50, dt=0.2, parked=8, moving=2):
         near = np.hypot(*boxes.position[:, :2].T) < 35
         detections = Detections(boxes, np.full(len(boxes), 0.9)).select(near)
         frames.append(Frame(time, "lidar", detections, np.eye(4), "ego"))
-    return frames, Odometry.of(t, poses), poses, cars
+    return frames, OdometryIncrements.of(t, poses), poses, cars
 
 
 def new_tracker():

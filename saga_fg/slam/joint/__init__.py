@@ -1,12 +1,11 @@
-"""The vehicle in the graph: its path and the objects around it, estimated together."""
+"""Joint estimation of the vehicle's path and the objects around it."""
 
 from saga_fg.slam.joint.batch import estimate_jointly
 from saga_fg.slam.joint.estimate import JointEstimate, ObjectStates
 from saga_fg.slam.joint.landmarks import Observations
 from saga_fg.slam.joint.lanes import lane_key
-from saga_fg.slam.joint.odometry import Odometry, OdometryNoise
-from saga_fg.slam.joint.online import OnlineEstimator, OnlineStep
-from saga_fg.slam.joint.online_estimate import OnlineEstimate, estimate_online
+from saga_fg.slam.joint.odometry import OdometryIncrements, OdometryNoise
+from saga_fg.slam.joint.online import OnlineEstimate, OnlineEstimator, OnlineStep, estimate_online
 from saga_fg.slam.joint.settings import JointSettings, LaneSettings
 
 __all__ = [
@@ -15,7 +14,7 @@ __all__ = [
     "LaneSettings",
     "ObjectStates",
     "Observations",
-    "Odometry",
+    "OdometryIncrements",
     "OdometryNoise",
     "OnlineEstimate",
     "OnlineEstimator",

@@ -1,7 +1,8 @@
-"""Landmarks along a path assumed so far: which observation is of which, where nobody knows.
+"""Association of landmarks of unknown identity, along a path and online.
 
-It is of the nearest landmark of its kind, by where that was last seen, within `reach`; else of a new one. A pose drifts
-little between two views of one thing, and the question is asked anew along the path found.
+Along a path assumed so far an observation belongs to the nearest landmark of its kind, by its last observation, within
+`reach`, else to a new one: a pose drifts little between two views of one thing, and association is repeated along the
+path found. Online the joint Gaussian of the new pose and the landmarks decides (`saga_fg.slam.mapping.associate`).
 """
 
 from __future__ import annotations
@@ -9,21 +10,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import gtsam
 import numpy as np
 
+from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import LandmarkObservations
-from saga_fg.types.landmark import LandmarkType, Observation
+from saga_fg.slam.mapping import EkfSlam, LandmarkObservations, MapperSettings, associate, landmark_key, pose_key
+from saga_fg.types.landmark import Landmark, LandmarkType, Observation
 
 Observations = Sequence[Sequence[Observation]]
 
 
 def nearest_landmarks(observations: Observations, path: FloatArray, reach: float) -> LandmarkObservations:
-    """Tell apart what is observed at n moments along a path (n, 4, 4); reach in m."""
+    """Associate the observations of n epochs along a path (n, 4, 4); reach in m."""
     start: dict[int, Any] = {}
     places: dict[LandmarkType, dict[int, FloatArray]] = {}
     seen: dict[int, list[tuple[int, Observation]]] = {}
-    for moment, (now, pose) in enumerate(zip(observations, path, strict=True)):
+    for epoch, (now, pose) in enumerate(zip(observations, path, strict=True)):
         for observation in now:
             state = observation.kind.initialise(pose, observation.value)
             where = observation.kind.coordinates(state)
@@ -35,5 +38,59 @@ def nearest_landmarks(observations: Observations, path: FloatArray, reach: float
                 number = len(start)
                 start[number] = state
             known[number] = place
-            seen.setdefault(moment, []).append((number, observation))
+            seen.setdefault(epoch, []).append((number, observation))
     return LandmarkObservations(seen, start)
+
+
+class WindowLandmarks:
+    """Landmarks of an online estimator: those observed in the window, and those that left it, in their last state."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self._settings = settings
+        self._last_seen: dict[int, int] = {}
+        self._kinds: dict[int, LandmarkType] = {}
+        self._count: dict[int, int] = {}
+        self._gone: dict[int, Landmark] = {}
+
+    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> LandmarkObservations:
+        """Associate observations from the epoch k; one without a match initiates a new landmark."""
+        numbers = sorted(self._kinds)
+        P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
+        states = {n: (self._kinds[n], self._state(n, solution.values)) for n in numbers}
+        pose = solution.values.atPose3(pose_key(k)).matrix()
+        pairs = associate(EkfSlam(pose, P, states), observations, self._settings.gate)
+        start: dict[int, object] = {}
+        seen: list[tuple[int, Observation]] = []
+        for row, observation in enumerate(observations):
+            if row in pairs:
+                number = pairs[row].landmark
+            else:
+                number = len(self._count) + 1
+                self._kinds[number] = observation.kind
+                start[number] = observation.kind.initialise(pose, observation.value)
+            self._count[number] = self._count.get(number, 0) + 1
+            self._last_seen[number] = k
+            seen.append((number, observation))
+        return LandmarkObservations({k: seen}, start)
+
+    def forget(self, first: int, solution: GraphSolution) -> list[int]:
+        """Let landmarks leave that were last observed before the epoch `first`; returns their keys."""
+        gone = [number for number in self._kinds if self._last_seen[number] < first]
+        for number in gone:
+            self._gone[number] = self._landmark(number, solution)
+            del self._kinds[number]
+        return [landmark_key(number) for number in gone]
+
+    def all(self, solution: GraphSolution | None) -> list[Landmark]:
+        """All so far: those in the window, and others in their last state."""
+        current = [] if solution is None else [self._landmark(number, solution) for number in self._kinds]
+        return sorted([*self._gone.values(), *current], key=lambda mark: mark.number)
+
+    def _landmark(self, number: int, solution: GraphSolution) -> Landmark:
+        covariance = solution.covariance([landmark_key(number)])
+        count = self._count[number]
+        state = self._state(number, solution.values)
+        return Landmark(number, self._kinds[number], state, covariance, count, count >= self._settings.confirm)
+
+    def _state(self, number: int, values: gtsam.Values) -> object:
+        return self._kinds[number].variable.read(values, landmark_key(number))

@@ -1,22 +1,25 @@
-"""Moving vehicles are drawn to the centre line of the lane of a map that they drive along.
+"""Attraction of moving vehicles to the centre line of the lane of a map that they drive along.
 
 In a level frame at the foot of a vehicle on the line, x along the lane, y to its left, the vehicle is off the line by
 
     y - c ~ N(0, spread^2 m / P),      m = max(1, 2 memory / dt)
 
-c is a landmark of its own, how far to its left the lane lies of where the map has it, c ~ N(0, deviation^2). Drivers
-who keep off the centre do so for a while: with an offset that is correlated over `memory`, moments dt apart say as
-much as one in m of independent ones would. P is the probability of driving along the lane, known from the estimate so
-far: of all lanes that run its way, beside which it is e_j off with the variance S = spread^2 + deviation^2 + n^T P_p n
-(P_p what the pose of the vehicle that sees it adds), with v sideways, and P(stands) as in
-`saga_fg.slam.joint.standing`,
+c is a landmark of its own, the offset of the lane to the left of its place in the map, c ~ N(0, deviation^2). A driver
+stays off the centre for a while: with an offset that is correlated over `memory`, m epochs dt apart carry the
+information of a single independent one. P is the probability of driving along the lane, known from the estimate so far:
+of all lanes in its direction, with the offset e_j from each and its variance S = spread^2 + deviation^2 + n^T P_p n
+(P_p: of the pose of the observing vehicle), the speed v across the lane, and P(stationary) as in
+`saga_fg.slam.joint.stationarity`,
 
     P(j) = q_j / (sum_i q_i + elsewhere / width),      q_j = N(e_j; 0, S)
-    P    = (1 - P(stands)) P(j) exp( -v^2 / (2 (drift^2 + sigma_v^2)) ),      sigma_v = speed times heading's deviation
+    P    = (1 - P(stationary)) P(j) exp( -v^2 / (2 (drift^2 + sigma_v^2)) ),   sigma_v = speed * deviation of heading
 
-Where the pose is less well known than to a lane's width no lane is likely, and nothing is said: the lanes then take
-hold from where it is known better, round by round. A robust loss lets go who changes lanes. The factor is
-`factors.lane_keeping_factors`.
+Where the pose is known less well than a lane is wide, no lane is likely, and there is no factor; assigned anew along
+the path found, round by round, the lanes take effect from where the pose is known better. A robust loss gives up
+vehicles that change lanes. The factor is `factors.lane_keeping_factors`.
+
+Online, a vehicle is assigned to its lane at its own epoch, and stays so while the epoch is in the window. A lane
+without vehicles in the window leaves with the last of them; met again, it starts from the map alone.
 """
 
 from __future__ import annotations
@@ -30,23 +33,23 @@ import numpy as np
 
 from factors import Linearisable, Robust, lane_keeping_factors, prior_factor
 from factors.rotations import cross_matrix
-from saga_fg.graph import MAP_NODE, key_of
+from saga_fg.graph import MAP_NODE, Additions, GraphView, NewVariable, key_of
 from saga_fg.model.interactions import POSITION
 from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.numerics.polyline import feet, on_it
-from saga_fg.slam.joint.estimate import ObjectStates
-from saga_fg.slam.joint.graph import Keyed, by_type, object_key
+from saga_fg.slam.joint.estimate import JointEstimate, ObjectStates
+from saga_fg.slam.joint.graph import Record, by_type, object_key
 from saga_fg.slam.joint.settings import LaneSettings
 from saga_fg.types.road_map import RoadMap
 
-_LIKELY = 0.9  # a vehicle that drives along a lane with less than this probability is not drawn to it
-_LEAVING = 3.0  # times the spread: farther from the centre line a vehicle is drawn less and less (Cauchy)
+_LIKELY = 0.9  # a vehicle that drives along a lane with less than this probability gets no factor
+_LEAVING = 3.0  # times the spread: scale of the Cauchy loss on the offset from the centre line
 
 
 def lane_key(number: int) -> int:
-    """Key of how far a lane lies to the left of where the map has it."""
+    """Key of the offset of a lane to the left of its place in the map."""
     return key_of(MAP_NODE, number, None)
 
 
@@ -61,14 +64,71 @@ class KnownLane:
 
 
 @dataclass(frozen=True, eq=False)
-class Keeping:
-    """A vehicle that drives along a lane at a moment: its id, the frame (4, 4) at its foot, and P as above."""
+class LaneAssignment:
+    """A vehicle that drives along a lane at an epoch: its id, the frame (4, 4) at its foot, and P as above."""
 
-    moment: int
+    epoch: int
     name: int
     lane: int
     world_T_foot: FloatArray
     probability: float
+
+
+class LaneKeeping:
+    """Provider of the lanes of the maps so far, and of the vehicles assigned to them."""
+
+    name = "lanes"
+
+    def __init__(self, settings: LaneSettings | None, maps: Iterable[RoadMap | None]) -> None:
+        self._settings = settings
+        self._maps: list[RoadMap] = []
+        self._lanes: list[KnownLane] = []
+        self._record: Record = ()
+        self._new: list[LaneAssignment] = []  # of the last call of `assign`, whose first epoch is `_first`
+        self._all: list[LaneAssignment] = []
+        self.add_maps(*maps)
+
+    @property
+    def rounds(self) -> int:
+        """Number of assignments to make; 0 without lanes."""
+        return 0 if self._settings is None or not self._lanes else self._settings.rounds
+
+    def add_maps(self, *maps: RoadMap | None) -> None:
+        """Add maps of frames, most of which bring the same one."""
+        for one in maps:
+            if one is not None and all(one is not known for known in self._maps):
+                self._maps.append(one)
+                self._lanes = known_lanes(self._maps)
+
+    def assign(self, record: Record, estimate: JointEstimate, stationary: Sequence[FloatArray]) -> bool:
+        """Assign the vehicles of the last epochs of a record to lanes; returns whether any is assigned.
+
+        estimate, stationary: of these epochs, and the probabilities (n,) that their objects are stationary
+        """
+        self._record, self._new, self._first = record, [], record[-len(estimate.objects)].epoch
+        if self.rounds and self._settings is not None:
+            for row in range(-len(estimate.objects), 0):
+                now, pose = record[row], (estimate.world_T_ego[row], estimate.pose_covariances[row])
+                self._new += assign_lanes(
+                    now.epoch, estimate.objects[row], now.seen.id, stationary[row], pose, self._lanes, self._settings
+                )
+        self._all += self._new
+        return bool(self._new)
+
+    def factors(self, view: GraphView) -> Additions:
+        """Lanes that are new to the graph, and the vehicles last assigned."""
+        if self._settings is None:
+            return Additions()
+        met = {one.lane for one in self._new}
+        new = [one for one in self._lanes if one.number in met and lane_key(one.number) not in view.variables]
+        lanes = [NewVariable(MAP_NODE, lane.number, np.zeros(1), static=True, label="lane") for lane in new]
+        return Additions(lanes, lane_priors(new), {self._first: lane_factors(self._record, self._new, self._settings)})
+
+    def forget(self, first: int) -> list[int]:
+        """Forget assignments before the epoch `first`; returns the keys of lanes that no vehicle is assigned to."""
+        before = {one.lane for one in self._all}
+        self._all = [one for one in self._all if one.epoch >= first]
+        return [lane_key(number) for number in before - {one.lane for one in self._all}]
 
 
 def known_lanes(maps: Iterable[RoadMap | None]) -> list[KnownLane]:
@@ -83,19 +143,19 @@ def known_lanes(maps: Iterable[RoadMap | None]) -> list[KnownLane]:
     return list(lanes.values())
 
 
-def keepings(
-    moment: int,
+def assign_lanes(
+    epoch: int,
     objects: ObjectStates,
     seen: IntArray,
-    standing: FloatArray,
+    stationary: FloatArray,
     pose: tuple[FloatArray, FloatArray],
     lanes: Sequence[KnownLane],
     settings: LaneSettings,
-) -> list[Keeping]:
-    """Which objects of a moment keep which lane.
+) -> list[LaneAssignment]:
+    """Assign the objects of an epoch to lanes.
 
-    seen (m,) ids; standing (n,) the probabilities that the objects stand; pose: (4, 4), and its covariance (6, 6) in
-    its own frame.
+    seen (m,) ids of detected ones; stationary (n,) probabilities of the objects; pose: (4, 4), and its covariance
+    (6, 6) in its own frame.
     """
     rows = np.flatnonzero(np.isin(objects.id, seen) & of_classes(np.array(objects.label), settings.classes))
     if not len(rows) or not lanes:
@@ -114,35 +174,35 @@ def keepings(
     beside = settings.elsewhere / np.array([lane.width for lane in lanes])[:, None]
     likely = q / (q.sum(axis=0) + beside)
     drift = settings.drift**2 + along**2 * P[2, 2]
-    p = likely * (1 - standing[rows]) * np.exp(-(across**2) / (2 * drift))
+    p = likely * (1 - stationary[rows]) * np.exp(-(across**2) / (2 * drift))
     found = []
     for column, j in enumerate(np.argmax(likely, axis=0).tolist()):
         if likely[j, column] >= _LIKELY:
             x, y = at[j].point[column].tolist()
             foot = yaw_transform(x, y, yaw=math.atan2(t[j, column, 1], t[j, column, 0]))
             name = int(objects.id[rows[column]])
-            found.append(Keeping(moment, name, lanes[j].number, foot, float(p[j, column])))
+            found.append(LaneAssignment(epoch, name, lanes[j].number, foot, float(p[j, column])))
     return found
 
 
-def lane_factors(record: Keyed, kept: Sequence[Keeping], settings: LaneSettings) -> list[Linearisable]:
-    """The factors of vehicles that keep a lane."""
-    times = {k: moment.time for k, moment in record}
+def lane_factors(record: Record, kept: Sequence[LaneAssignment], settings: LaneSettings) -> list[Linearisable]:
+    """The factors of assigned vehicles."""
+    times = {now.epoch: now.time for now in record}
     types: dict[tuple[int, int], NodeType] = {
-        (k, int(name)): node_type
-        for k, moment in record
-        for name, node_type in zip(moment.objects.id, moment.objects.types, strict=True)
+        (now.epoch, int(name)): node_type
+        for now in record
+        for name, node_type in zip(now.objects.id, now.objects.types, strict=True)
     }
     step = np.median(np.diff(sorted(times.values()))) if len(times) > 1 else settings.memory
     variance = settings.spread**2 * max(1.0, 2 * settings.memory / float(step))
-    present = [one for one in kept if (one.moment, one.name) in types and one.probability > 1e-6]
+    present = [one for one in kept if (one.epoch, one.name) in types and one.probability > 1e-6]
     factors: list[Linearisable] = []
-    for node_type, mine in by_type([types[one.moment, one.name] for one in present]):
+    for node_type, mine in by_type([types[one.epoch, one.name] for one in present]):
         some = [present[row] for row in mine.tolist()]
         x, y = node_type.index(POSITION).tolist()
         factors.append(
             lane_keeping_factors(
-                np.array([[object_key(one.moment, one.name), lane_key(one.lane)] for one in some], dtype=np.uint64),
+                np.array([[object_key(one.epoch, one.name), lane_key(one.lane)] for one in some], dtype=np.uint64),
                 variance / np.array([one.probability for one in some]),
                 np.stack([one.world_T_foot for one in some]),
                 1,
@@ -155,12 +215,12 @@ def lane_factors(record: Keyed, kept: Sequence[Keeping], settings: LaneSettings)
 
 
 def lane_priors(lanes: Iterable[KnownLane]) -> list[gtsam.JacobianFactor]:
-    """The knowledge of a map of where its lanes are."""
+    """Priors of the offsets of lanes."""
     return [prior_factor(lane_key(lane.number), np.zeros(1), np.array([[lane.deviation**2]])) for lane in lanes]
 
 
 def _shift(place: FloatArray, world_T_ego: FloatArray, P: FloatArray) -> FloatArray:
-    """(m, 2, 2) of how places (m, 2) move with the pose, at the pose's height: R (v - [z]x w)."""
+    """Covariances (m, 2, 2) of places (m, 2) that move with the pose, at the pose's height: R (v - [z]x w)."""
     R = world_T_ego[:3, :3]
     offset = np.column_stack([place - world_T_ego[:2, 3], np.zeros(len(place))])
     J = np.concatenate([-R @ cross_matrix(offset @ R), np.broadcast_to(R, (len(place), 3, 3))], axis=2)[:, :2]

@@ -1,4 +1,4 @@
-"""Odometry: what a vehicle believes it moved between moments, and how well it knows.
+"""OdometryIncrements: what a vehicle believes it moved between epochs, and how well it knows.
 
 Per interval of dt s and d m, an increment a_T_b has independent noise
 
@@ -55,7 +55,7 @@ class OdometryNoise(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Odometry:
+class OdometryIncrements:
     """timestamps (n,) s, strictly increasing; a_T_b (n - 1, 4, 4): each pose in the frame of the one before.
 
     covariances: (n - 1, 6, 6) of the increments where the device states them, as scan registration does: (rotation
@@ -87,7 +87,7 @@ class Odometry:
         return cls(np.asarray(timestamps, dtype=np.float64), inverse_transform(poses[:-1]) @ poses[1:])
 
     def __len__(self) -> int:
-        """The number of moments."""
+        """The number of epochs."""
         return len(self.timestamps)
 
     @property
@@ -108,5 +108,5 @@ class Odometry:
         return np.stack(poses)
 
     def select(self, rows: IntArray) -> Self:
-        """The odometry between some of the moments, by increasing rows."""
+        """The odometry between some of the epochs, by increasing rows."""
         return type(self).of(self.timestamps[rows], self.path()[rows])

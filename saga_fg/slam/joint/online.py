@@ -1,10 +1,10 @@
-"""Path, landmarks and objects as they come: the running graph of the last seconds, and a joint prior for all before.
+"""Path, landmarks and objects online: the running graph of the last seconds, with a joint prior for all before.
 
-Each frame adds a moment to the window. Which objects stand is judged over the window, which observation is of which
-landmark by the joint Gaussian of the new pose and the landmarks (`saga_fg.slam.mapping.associate`), which vehicle keeps
-which lane by the pose as known then (`saga_fg.slam.joint.lanes`), and iSAM2 solves the window with what is new. Moments
-older than `lag` leave, and landmarks last seen from them (`saga_fg.slam.joint.window`). With a lag longer than the
-recording it is the batch estimate, up to what is told apart online.
+Each frame adds an epoch to the window. The stationarity of objects follows from the window, landmarks are associated by
+the joint Gaussian of the new pose and the landmarks (`saga_fg.slam.mapping.associate`), vehicles are assigned to lanes
+by the present pose (`saga_fg.slam.joint.lanes`), and iSAM2 solves the window with the new factors. Epochs older than
+`lag` leave, and landmarks last observed from them (`saga_fg.slam.joint.window`). With a lag longer than the recording
+this is the batch estimate, but for associations made online.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform
+from saga_fg.slam.joint.batch import checked_landmarks
 from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
-from saga_fg.slam.joint.lane_keeping import LaneKeeping
-from saga_fg.slam.joint.record import EgoMoment, Registration
+from saga_fg.slam.joint.landmarks import Observations, WindowLandmarks
+from saga_fg.slam.joint.lanes import LaneKeeping
+from saga_fg.slam.joint.odometry import OdometryIncrements
+from saga_fg.slam.joint.record import EpochRecorder, RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
-from saga_fg.slam.joint.standing import SlowErrors, standing_probabilities
+from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.window import Window
-from saga_fg.slam.joint.window_landmarks import WindowLandmarks
 from saga_fg.slam.mapping import MapperSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
@@ -35,26 +37,26 @@ from saga_fg.types.landmark import Landmark, Observation
 
 @dataclass(frozen=True, eq=False)
 class OnlineStep:
-    """newest: the estimate of the moment that came; settled: of those that left the window with it, oldest first."""
+    """newest: the estimate of the new epoch; settled: of those that left the window with it, oldest first."""
 
     newest: JointEstimate
     settled: JointEstimate | None
 
 
 class OnlineEstimator:
-    """Takes one frame after the other.
+    """Estimate one frame after the other.
 
         estimator = OnlineEstimator(Tracker(...), lag=3.0)
         step = estimator.step(frame, a_T_b)
         step.newest.world_T_ego[-1], step.newest.objects[-1]
 
-    tracker    a fresh one, which registers detections
-    lag        s; the window begins at the last moment that is at least so old
-    settings   of the graph; mapper: `gate` of telling landmarks apart, `confirm` of the observations for a sure one
+    tracker    a new one, which associates detections
+    lag        s; the window begins at the last epoch that is at least so old
+    settings   of the graph; mapper: `gate` of the association of landmarks, `confirm` for observations of a certain one
     start      first pose (4, 4), by default the identity
-    providers  of factors of your own, asked when vehicle and objects of a frame are in
+    providers  of factors of your own, asked after vehicle and objects of a frame are added
 
-    Raises `InputError` for a lag that is none, and a first pose that is none.
+    Raises `InputError` for a negative lag, and a first pose that is not rigid.
     """
 
     def __init__(
@@ -69,12 +71,12 @@ class OnlineEstimator:
         if not (math.isfinite(lag) and lag >= 0):
             raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._lag, self._settings = lag, settings or JointSettings()
-        self._registration = Registration(tracker, self._settings.online_motion_noise)
+        self._recorder = EpochRecorder(tracker, self._settings.online_motion_noise)
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
         self._landmarks = WindowLandmarks(mapper or MapperSettings())
         self._lanes = LaneKeeping(self._settings.lanes, [tracker.settings.road_map])
-        self._standing: list[FloatArray] = []
+        self._stationary: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
         self._solution: GraphSolution | None = None
 
@@ -85,11 +87,11 @@ class OnlineEstimator:
         covariance: FloatArray | None = None,
         observations: Sequence[Observation] = (),
     ) -> OnlineStep:
-        """Take in the next frame, after the vehicle moved by a_T_b (4, 4) since the last one by its odometry.
+        """Add the next frame, after the vehicle moved by a_T_b (4, 4) since the last one by its odometry.
 
-        covariance: (6, 6) of that as in `Odometry`, if the device states one; observations: of landmarks, from the new
-        pose; of the first frame a_T_b is not asked for. Raises `InputError` for a motion that is missing or none, its
-        covariance likewise, for a frame that is not later than the last one, or in world coordinates without a pose.
+        a_T_b: not needed for the first frame; covariance: (6, 6) of it as in `OdometryIncrements`, if the device states
+        one; observations: of landmarks, from the new pose. Raises `InputError` for a motion that is missing or not
+        rigid, a bad covariance, a frame that is not later than the last one, or in world coordinates without a pose.
         """
         window = self._window
         if not window.record:
@@ -100,19 +102,20 @@ class OnlineEstimator:
             increment = checked_transform("a_T_b", a_T_b)
             covariance = None if covariance is None else checked_covariances("covariance", [covariance], 1, 6)[0]
             pose = window.predicted(frame.timestamp, increment)
-        moment = self._registration.add(frame, pose, increment, covariance)
-        self._lanes.learn(frame.road_map)
+        number = window.record[-1].epoch + 1 if window.record else 0
+        now = self._recorder.add(number, frame, pose, increment, covariance)
+        self._lanes.add_maps(frame.road_map)
         before = [] if not window.record else list(window.path)
-        self._standing = self._judged([*(one for _, one in window.record), moment], np.stack([*before, pose]))
-        solution = window.add(moment, pose, self._standing)
+        self._stationary = self._probabilities([*window.record, now], np.stack([*before, pose]))
+        solution = window.add(now, pose, self._stationary)
         more: list[FactorProvider] = []
         if observations:
-            more.append(self._landmarks.observe(window.record[-1][0], solution, observations))
-        if self._lanes.assign(window.record, read_estimate(window.record[-1:], solution), self._standing[-1:]):
+            more.append(self._landmarks.observe(number, solution, observations))
+        if self._lanes.assign(window.record, read_estimate(window.record[-1:], solution), self._stationary[-1:]):
             more.append(self._lanes)
         if more:
-            self._standing = self._judged([one for _, one in window.record], window.path)
-            solution = window.extend(self._standing, more)
+            self._stationary = self._probabilities(window.record, window.path)
+            solution = window.extend(self._stationary, more)
         self._solution = solution
         settled = self._slide(solution)
         newest = read_estimate(window.record[-1:], solution)
@@ -120,26 +123,79 @@ class OnlineEstimator:
         return OnlineStep(newest, settled)
 
     def window(self) -> JointEstimate:
-        """The estimate of all moments in the window. Raises `InputError` before the first frame."""
+        """The estimate of all epochs in the window. Raises `InputError` before the first frame."""
         if self._solution is None:
             raise InputError("expected a frame before the estimate is asked for")
         return read_estimate(self._window.record, self._solution)
 
     def landmarks(self) -> list[Landmark]:
-        """All landmarks so far: those in the window as they are, others as they were when they left it."""
+        """All landmarks so far: those in the window, and others in their last state."""
         return self._landmarks.all(self._solution)
 
-    def _judged(self, moments: list[EgoMoment], path: FloatArray) -> list[FloatArray]:
-        """For each moment the probabilities that its objects stand, along a path (n, 4, 4)."""
-        return standing_probabilities(moments, path, self._slow, self._settings, online=True)
+    def _probabilities(self, record: Sequence[RecordedEpoch], path: FloatArray) -> list[FloatArray]:
+        """For each epoch the probabilities that its objects are stationary, along a path (n, 4, 4)."""
+        return stationary_probabilities(record, path, self._slow, self._settings, online=True)
 
     def _slide(self, solution: GraphSolution) -> JointEstimate | None:
-        """Let moments leave that are older than the lag; returns their estimate."""
+        """Let epochs leave that are older than the lag; returns their estimate."""
         window = self._window
-        count = window.older_than(window.record[-1][1].time - self._lag)
+        count = window.older_than(window.record[-1].time - self._lag)
         if not count:
             return None
         settled = read_estimate(window.record[:count], solution)
-        first = window.record[count][0]
-        window.leave(count, [*self._landmarks.leave(first, solution), *self._lanes.leave(first)])
+        first = window.record[count].epoch
+        window.leave(count, [*self._landmarks.forget(first, solution), *self._lanes.forget(first)])
         return settled
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineEstimate:
+    """Poses (n, 4, 4) of n epochs, world_T_ego.
+
+    newest       estimated when the frame came, covariances (n, 6, 6) in its own frame: rotation vector (rad),
+                 translation (m)
+    settled      estimated when the epoch left the window, or at the end
+    landmarks    all that were observed
+    """
+
+    timestamps: FloatArray
+    newest: FloatArray
+    covariances: FloatArray
+    settled: FloatArray
+    landmarks: list[Landmark]
+
+
+def estimate_online(
+    frames: Sequence[Frame],
+    odometry: OdometryIncrements,
+    tracker: Tracker,
+    lag: float,
+    settings: JointSettings | None = None,
+    start: FloatArray | None = None,
+    landmarks: Observations | None = None,
+    mapper: MapperSettings | None = None,
+    providers: Sequence[FactorProvider] = (),
+) -> OnlineEstimate:
+    """Feed n frames to an `OnlineEstimator`; landmarks: observations at each epoch; other parameters as there.
+
+    Raises `InputError` where frames, odometry and landmarks do not fit together.
+    """
+    landmarks = checked_landmarks(frames, odometry, landmarks)
+    estimator = OnlineEstimator(tracker, lag, settings, mapper, start, providers)
+    newest, covariances, settled = [], [], []
+    for k, frame in enumerate(frames):
+        increment = odometry.a_T_b[k - 1] if k else None
+        covariance = odometry.covariances[k - 1] if k and odometry.covariances is not None else None
+        step = estimator.step(frame, increment, covariance, landmarks[k])
+        newest.append(step.newest.world_T_ego[-1])
+        covariances.append(step.newest.pose_covariances[-1])
+        if step.settled is not None:
+            settled.append(step.settled.world_T_ego)
+    settled.append(estimator.window().world_T_ego)
+    return OnlineEstimate(
+        odometry.timestamps,
+        np.stack(newest),
+        np.stack(covariances),
+        np.concatenate(settled),
+        estimator.landmarks(),
+    )

@@ -1,13 +1,13 @@
-"""Odometry made worse has the errors its model speaks of."""
+"""OdometryIncrements made worse has the errors its model speaks of."""
 
 import numpy as np
 import pytest
 
 from data_tools.trajectories import degraded_odometry
 from saga_fg.numerics.geometry import yaw_of, yaw_transform
-from saga_fg.slam.joint import Odometry, OdometryNoise
+from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
 
-STRAIGHT = Odometry.of(0.5 * np.arange(41.0), np.stack([yaw_transform(2.0 * k) for k in range(41)]))
+STRAIGHT = OdometryIncrements.of(0.5 * np.arange(41.0), np.stack([yaw_transform(2.0 * k) for k in range(41)]))
 
 
 def test_errors_have_the_deviations_of_the_model():
@@ -29,5 +29,5 @@ def test_errors_have_the_deviations_of_the_model():
 def test_the_same_seed_gives_the_same_errors():
     a, b = (degraded_odometry(STRAIGHT, OdometryNoise(), np.random.default_rng(3)) for _ in range(2))
     assert a.a_T_b.tolist() == b.a_T_b.tolist()
-    one = Odometry([0.0], np.empty((0, 4, 4)))
+    one = OdometryIncrements([0.0], np.empty((0, 4, 4)))
     assert len(degraded_odometry(one, OdometryNoise(), np.random.default_rng(0))) == 1

@@ -8,9 +8,9 @@ from scipy.stats import chi2
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.slam.joint import JointSettings, Odometry, OdometryNoise, estimate_jointly
-from saga_fg.slam.joint.record import register
-from saga_fg.slam.joint.standing import SlowErrors, standing_probabilities
+from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, estimate_jointly
+from saga_fg.slam.joint.record import record_epochs
+from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.types.landmark import Observation
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)
@@ -23,7 +23,7 @@ def worse(odometry, rng, scale=0.02, bias=-0.004):
         steps[k, :3, 3] = (1 + scale) * steps[k, :3, 3] + rng.normal(0, POOR.distance_noise * np.sqrt(6.0 * dt), 3)
         turn = yaw_transform(yaw=bias * dt + rng.normal(0, POOR.turn_noise * np.sqrt(dt)))
         steps[k, :3, :3] = turn[:3, :3] @ steps[k, :3, :3]
-    return Odometry(odometry.timestamps, steps)
+    return OdometryIncrements(odometry.timestamps, steps)
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +82,8 @@ def test_with_no_objects_the_odometry_remains():
 
 def test_what_stands_is_told_from_what_drives():
     frames, odometry, poses, cars = drive(parked=4, moving=2)
-    record = register(frames, poses, odometry, new_tracker())
-    p = standing_probabilities(record, poses, SlowErrors(1e-3, 1e-4, 1e-3), JointSettings())
+    record = record_epochs(frames, poses, odometry, new_tracker())
+    p = stationary_probabilities(record, poses, SlowErrors(1e-3, 1e-4, 1e-3), JointSettings())
     middle = len(record) // 2
     seen = record[middle].seen
     for name, z in zip(seen.id, seen.z, strict=True):
@@ -102,8 +102,8 @@ def test_who_walks_far_away_does_not_stand():
         boxes = Boxes.of(["pedestrian", "car"], [[20.0 + time, 45.0, 1.0], [20.0, -8.0, 1.0]])
         ahead = boxes.transformed(inverse_transform(pose))
         frames.append(Frame(time, "lidar", Detections(ahead, np.full(2, 0.9)), np.eye(4), "ego"))
-    record = register(frames, poses, Odometry.of(t, poses), new_tracker())
-    p = standing_probabilities(record, poses, SlowErrors.at_start(JointSettings(POOR)), JointSettings(POOR))
+    record = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker())
+    p = stationary_probabilities(record, poses, SlowErrors.at_start(JointSettings(POOR)), JointSettings(POOR))
     middle = record[len(record) // 2]
     says = dict(zip(middle.objects.label, p[len(record) // 2], strict=True))
     assert says["car"] > 0.9
@@ -119,9 +119,9 @@ def test_a_queue_that_creeps_does_not_pass_for_parked_online():
         ahead = Boxes.of(["car", "car"], [[45.0 + 1.2 * time, 0.0, 1.0], [8.0, 6.0, 1.0]])
         detections = Detections(ahead.transformed(inverse_transform(pose)), np.full(2, 0.9))
         frames.append(Frame(time, "lidar", detections, np.eye(4), "ego"))
-    record, settings = register(frames, poses, Odometry.of(t, poses), new_tracker()), JointSettings(POOR)
+    record, settings = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker()), JointSettings(POOR)
     slow = SlowErrors.at_start(settings)
-    batch, online = (standing_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
+    batch, online = (stationary_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
     creeps, parked = [int(np.argmin(abs(record[-1].seen.z[:, 1] - y))) for y in (0.0, 6.0)]
     assert batch[creeps] > 0.9
     assert online[creeps] < 0.5
@@ -132,15 +132,15 @@ def test_a_queue_that_creeps_does_not_pass_for_parked_online():
 
 def test_nothing_is_said_of_an_object_seen_once():
     frames, odometry, poses, _ = drive(n=1)
-    record = register(frames, poses, odometry, new_tracker())
+    record = record_epochs(frames, poses, odometry, new_tracker())
     assert all(
-        (p == 0).all() for p in standing_probabilities(record, poses, SlowErrors(0.01, 0.01, 0.01), JointSettings())
+        (p == 0).all() for p in stationary_probabilities(record, poses, SlowErrors(0.01, 0.01, 0.01), JointSettings())
     )
 
 
 def test_frames_and_odometry_must_fit():
     frames, odometry, _, _ = drive(n=5)
-    with pytest.raises(InputError, match="expected one at each of the 5 moments of the odometry, got 4"):
+    with pytest.raises(InputError, match="expected one at each of the 5 times of the odometry, got 4"):
         estimate_jointly(frames[:4], odometry, new_tracker)
     blind = [Frame(f.timestamp, f.sensor, f.detections) for f in frames]
     with pytest.raises(InputError, match="expected a pose, or detections in ego or sensor coordinates"):
@@ -158,7 +158,7 @@ def test_odometry_is_put_together_and_apart():
     assert P[2, 2] == pytest.approx(0.01**2 * 0.25)
     assert P[3, 3] == pytest.approx(0.03**2 * 4 + 0.01**2 * 0.25)
     with pytest.raises(InputError, match="strictly increasing"):
-        Odometry([0.0, 0.0], np.eye(4)[None])
+        OdometryIncrements([0.0, 0.0], np.eye(4)[None])
 
 
 def test_poles_correct_the_odometry_where_nothing_else_stands():
@@ -175,5 +175,5 @@ def test_poles_correct_the_odometry_where_nothing_else_stands():
     alone = np.linalg.norm((reported.path(poses[0]) - poses)[:, :2, 3], axis=1)
     joint = np.linalg.norm((estimate.world_T_ego - poses)[:, :2, 3], axis=1)
     assert joint.max() < min(0.2, alone.max() / 3)
-    with pytest.raises(InputError, match="landmarks: expected what is observed at 25 moments, got 24"):
+    with pytest.raises(InputError, match="landmarks: expected observations at 25 times, got 24"):
         estimate_jointly(frames, reported, new_tracker, landmarks=seen[1:])

@@ -14,14 +14,13 @@ from saga_fg.slam.joint import (
     JointSettings,
     LaneSettings,
     ObjectStates,
-    Odometry,
+    OdometryIncrements,
     OdometryNoise,
     estimate_jointly,
     estimate_online,
-    lane_keeping,
     lane_key,
 )
-from saga_fg.slam.joint.lanes import KnownLane, keepings, known_lanes
+from saga_fg.slam.joint.lanes import KnownLane, LaneKeeping, assign_lanes, known_lanes
 from saga_fg.types.road_map import Lane, RoadMap
 
 RADIUS = 200.0  # m of the bend
@@ -45,7 +44,7 @@ def road() -> RoadMap:
     return RoadMap(lanes=tuple(lanes), deviation=0.2)
 
 
-def traffic(seed: int = 0, n: int = 30, dt: float = 0.2) -> tuple[list[Frame], Odometry, FloatArray]:
+def traffic(seed: int = 0, n: int = 30, dt: float = 0.2) -> tuple[list[Frame], OdometryIncrements, FloatArray]:
     """Frames of a drive in the right lane among six cars that keep their lanes, odometry that turns, true poses."""
     rng = np.random.default_rng(seed)
     t = dt * np.arange(n)
@@ -59,9 +58,9 @@ def traffic(seed: int = 0, n: int = 30, dt: float = 0.2) -> tuple[list[Frame], O
         boxes = Boxes.of(["car"] * 6, world).transformed(inverse_transform(pose))
         detections = Detections(boxes, np.full(6, 0.9))
         frames.append(Frame(time, "lidar", detections, np.eye(4), "ego", road_map=None if k else road()))
-    exact = Odometry.of(t, poses)
+    exact = OdometryIncrements.of(t, poses)
     turned = exact.a_T_b @ yaw_transform(yaw=0.015 * dt)
-    return frames, Odometry(t, turned), poses
+    return frames, OdometryIncrements(t, turned), poses
 
 
 def off(path: FloatArray, poses: FloatArray) -> float:
@@ -116,7 +115,7 @@ def test_a_vehicle_keeps_the_lane_that_it_surely_drives_along() -> None:
     def found(sideways: float, seen: FloatArray | None = None) -> dict[int, tuple[int, float]]:
         P = np.diag([1e-8, 1e-8, 1e-8, 1e-8, sideways**2, 1e-8])
         which = np.arange(7) if seen is None else seen
-        kept = keepings(4, cars, which, stands, (np.eye(4), P), lanes, LaneSettings())
+        kept = assign_lanes(4, cars, which, stands, (np.eye(4), P), lanes, LaneSettings())
         return {one.name: (one.lane, one.probability) for one in kept}
 
     sure = found(0.05)
@@ -142,8 +141,8 @@ def test_a_map_that_every_frame_brings_is_read_once(monkeypatch: pytest.MonkeyPa
         read.append(len(maps))
         return known_lanes(maps)
 
-    monkeypatch.setattr(lane_keeping, "known_lanes", counted)
-    lanes, same = lane_keeping.LaneKeeping(LaneSettings(), []), road()
+    monkeypatch.setattr("saga_fg.slam.joint.lanes.known_lanes", counted)
+    lanes, same = LaneKeeping(LaneSettings(), []), road()
     for _ in range(3):
-        lanes.learn(same)
+        lanes.add_maps(same)
     assert read == [1]

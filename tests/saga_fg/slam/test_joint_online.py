@@ -101,7 +101,7 @@ def test_what_cannot_be_is_refused() -> None:
     estimator.step(frames[1])
     with pytest.raises(InputError, match="expected one after"):
         estimator.step(frames[0], np.eye(4))
-    with pytest.raises(InputError, match="expected what is observed at 3 moments, got 1"):
+    with pytest.raises(InputError, match="expected observations at 3 times, got 1"):
         estimate_online(frames, odometry, new_tracker(), 1.0, landmarks=[()])
 
 

@@ -1,0 +1,281 @@
+"""Labels beside the online tracks and the detections they were made of, against ground truth where there is some."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.datasets.label_table import LabelRows, read_label_table
+from data_tools.evaluation.placed_detections import placed_detections
+from data_tools.figures import FigureTable, cell
+from data_tools.metrics import SceneBoxes, coverages
+from data_tools.metrics.labels import (
+    CommonBoxes,
+    LabelledScene,
+    PrecisionRecall,
+    SelfConsistency,
+    common_boxes,
+    precision_recall,
+    scored_pairs,
+    self_consistency,
+)
+from pipelines.config import Method
+from pipelines.smoothing import SmoothConfig
+from pipelines.tracking import Progress, track_scene
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.smoothing import gather_evidence
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.sensor import sensor_model
+
+DISTANCES = (0.5, 1.0, 2.0)  # m
+PRECISIONS = (0.9, 0.8, 0.7)
+RANGES = ((0.0, 20.0), (20.0, 40.0), (40.0, np.inf))  # m
+SYSTEMS = ("detections", "online", "labels")
+SAME_TIME = 1e-4  # s
+
+
+@dataclass(frozen=True, eq=False)
+class LabelEvaluation:
+    """The figures of labels over some scenes.
+
+    curves       by distance (m) and system; empty without ground truth
+    same         by distance: the true boxes that all systems match
+    consistency  by system
+    """
+
+    scenes: tuple[str, ...]
+    curves: Mapping[float, Mapping[str, PrecisionRecall]]
+    same: Mapping[float, CommonBoxes]
+    consistency: Mapping[str, SelfConsistency]
+
+    def tables(self) -> list[FigureTable]:
+        """For people."""
+        tables = [] if not self.curves else [_recall_table(self.curves), *map(_group_table, self._groups())]
+        if self.same:
+            tables.append(_calibration_table(self.same[2.0]))
+        return [*tables, _consistency_table(self.consistency)]
+
+    def figures(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "scenes": self.scenes,
+            "precision_recall": {
+                str(distance): {
+                    name: {
+                        "whole": curve.whole,
+                        "best_f1": curve.best,
+                        "recall_at": {str(p): curve.recall_at(p) for p in PRECISIONS},
+                    }
+                    for name, curve in curves.items()
+                }
+                for distance, curves in self.curves.items()
+            },
+            "common_boxes": {
+                title: {group: _json_of(boxes) for group, boxes in groups.items()} for title, groups in self._groups()
+            },
+            "consistency": {name: asdict(value) for name, value in self.consistency.items()},
+        }
+
+    def _groups(self) -> list[tuple[str, dict[str, CommonBoxes]]]:
+        """Tables of the same boxes: by distance of the match, class, range, and whether they could be seen."""
+        if not self.same:
+            return []
+        visible = {d: same.select(same.visible) for d, same in self.same.items()}
+        wide = visible[2.0]
+        far = {f"{a:g} to {b:g} m": wide.select((wide.distance >= a) & (wide.distance < b)) for a, b in RANGES}
+        hidden = self.same[2.0].select(~self.same[2.0].visible)
+        return [
+            ("matched within", {f"{d:g} m": same for d, same in visible.items()}),
+            ("class", {str(c): wide.select(wide.label == c) for c in np.unique(wide.label)}),
+            ("range", far),
+            ("occlusion", {"visible": wide, "hidden": hidden}),
+        ]
+
+
+def evaluate_labels(
+    table: str | Path,
+    dataset: Dataset,
+    config: SmoothConfig,
+    method: Method = "saga",
+    progress: Progress | None = None,
+) -> LabelEvaluation:
+    """Judge a table of labels by the dataset it was made of; the online tracks are made anew, as `config` says.
+
+    The scenes judged are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
+    scenes and moments that the dataset does not have.
+    """
+    rows = read_label_table(table)
+    if len(rows.source) == 0:
+        raise InputError(f"{table}: expected labels, there are none")
+    scenes: list[str] = []
+    timestamps: list[FloatArray] = []
+    labelled: list[LabelledScene] = []
+    parts: dict[str, list[SceneBoxes]] = {name: [] for name in SYSTEMS}
+    seen: list[tuple[IntArray, Boxes, FloatArray]] = []
+    for name in np.unique(rows.tracks.scene).tolist():
+        scene = dataset.scene(name)
+        online = track_scene(scene, config.tracking.new_tracker(method), progress)
+        systems = {
+            "detections": _detections(scene, config),
+            "online": SceneBoxes.of_tracks(online.tracks),
+            "labels": _labels(scene, rows, table),
+        }
+        first = len(np.concatenate([np.empty(0), *timestamps]))
+        for system, found in systems.items():
+            parts[system].append(_moved(found, first, name))
+        seen.append(_noise(scene, config, first))
+        timestamps.append(scene.timestamps)
+        scenes.append(name)
+        if scene.ground_truth is not None:
+            labelled.append(_labelled(scene, systems))
+    times = np.concatenate([np.empty(0), *timestamps])
+    moment, boxes, R = zip(*seen, strict=True)
+    noise = np.concatenate(moment), Boxes.concatenate(boxes), np.concatenate(R)
+    consistency = {name: self_consistency(_joined(parts[name]), times, noise) for name in ("online", "labels")}
+    curves: dict[float, dict[str, PrecisionRecall]] = {}
+    same: dict[float, CommonBoxes] = {}
+    if len(labelled) == len(scenes):
+        for distance in DISTANCES:
+            curves[distance] = {
+                system: precision_recall(
+                    [scored_pairs(s.truth, s.visible, s.systems[system], distance) for s in labelled]
+                )
+                for system in SYSTEMS
+            }
+            same[distance] = CommonBoxes.pool(common_boxes(scene, distance) for scene in labelled)
+    return LabelEvaluation(tuple(scenes), curves, same, consistency)
+
+
+def _labels(scene: Scene, rows: LabelRows, table: str | Path) -> SceneBoxes:
+    """The rows of a scene at its moments."""
+    mine = np.flatnonzero(rows.tracks.scene == scene.name)
+    times = scene.timestamps
+    moment = np.clip(np.searchsorted(times, rows.tracks.timestamp[mine] - SAME_TIME), 0, len(times) - 1)
+    off = np.abs(times[moment] - rows.tracks.timestamp[mine]) > SAME_TIME
+    if off.any():
+        time = rows.tracks.timestamp[mine][np.argmax(off)]
+        raise InputError(f"{table}: scene {scene.name}: timestamp {time:.6f} s: expected one of the scene's moments")
+    order = np.argsort(moment, kind="stable")
+    mine = mine[order]
+    tracks = rows.tracks
+    boxes = tracks.boxes.select(mine)
+    return SceneBoxes(moment[order], tracks.id[mine], boxes, tracks.score[mine], tracks.position_covariance[mine])
+
+
+def _detections(scene: Scene, config: SmoothConfig) -> SceneBoxes:
+    """The detections taken at the scene's moments, each an object of its own, scores as probabilities."""
+    moment, boxes = placed_detections(scene)
+    moments = set(scene.timestamps.tolist())
+    scores = [
+        sensor_model(config.tracking.sensors, frame.sensor).probability(
+            frame.detections.score, frame.detections.boxes.label
+        )
+        for frame in scene.frames
+        if frame.timestamp in moments
+    ]
+    return SceneBoxes(moment, np.arange(len(boxes)).astype(np.str_), boxes, np.concatenate([np.empty(0), *scores]))
+
+
+def _noise(scene: Scene, config: SmoothConfig, first: int) -> tuple[IntArray, Boxes, FloatArray]:
+    """Moment, boxes and noise R (M, 2, 2) of the usable detections at the scene's moments, which count from `first`."""
+    evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, config.tracking.tracker.classes)
+    at = np.searchsorted(scene.timestamps, evidence.times[evidence.moment])
+    there = np.flatnonzero(np.isin(evidence.times[evidence.moment], scene.timestamps))
+    boxes = evidence.boxes.select(there)
+    world = replace(boxes, position=boxes.position + np.append(evidence.origin, 0.0))
+    return at[there] + first, world, evidence.R[there, :2, :2]
+
+
+def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
+    assert scene.ground_truth is not None
+    truth = SceneBoxes.of_annotations(scene.ground_truth)
+    visible = np.concatenate([np.empty(0, dtype=np.bool_), *(moment.visible for moment in scene.ground_truth)])
+    place = scene.world_T_ego[truth.frame][:, :2, 3]
+    distance = np.hypot(*(truth.boxes.position[:, :2] - place).T)
+    return LabelledScene(truth, visible, truth.boxes.velocity, distance, systems)
+
+
+def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
+    """The same with moments from `first` on and ids that name the scene."""
+    names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
+    return replace(table, frame=table.frame + first, id=names)
+
+
+def _joined(tables: Sequence[SceneBoxes]) -> SceneBoxes:
+    """The boxes of several scenes whose moments follow each other."""
+    return SceneBoxes(
+        np.concatenate([t.frame for t in tables]),
+        np.concatenate([t.id for t in tables]),
+        Boxes.concatenate([t.boxes for t in tables]),
+        np.concatenate([t.score for t in tables]),
+        np.concatenate([t.position_covariance for t in tables]),
+    )
+
+
+def _recall_table(curves: Mapping[float, Mapping[str, PrecisionRecall]]) -> FigureTable:
+    rows = []
+    for distance, by_system in curves.items():
+        level = by_system["online"].best[0]  # the precision at which the online tracks have their best F1
+        for name, curve in by_system.items():
+            at = (curve.recall_at(p) for p in (level, *PRECISIONS))
+            rows.append((f"{name}, {distance:g} m", *(cell(v) for v in (*curve.whole, *curve.best, *at))))
+    columns = ("within", "precision", "recall", "precision at best F1", "recall", "recall at online's precision")
+    title = "Precision and recall: of all boxes, at the best F1 over a score threshold, and recall at equal precision"
+    return FigureTable(title, (*columns, *(f"at {p:g}" for p in PRECISIONS)), tuple(rows))
+
+
+def _group_table(group: tuple[str, Mapping[str, CommonBoxes]]) -> FigureTable:
+    title, parts = group
+    columns = (
+        *(title, "boxes", "position: detections", "online", "labels", "labels / online", "labels / detections"),
+        *("heading: detections", "online", "labels", "size: detections", "online", "labels"),
+        *("velocity: online", "labels"),
+    )
+    rows = tuple((name, cell(len(same)), *_errors(same)) for name, same in parts.items())
+    return FigureTable(f"RMSE on the same boxes, by {title}: m, degrees, m/s", columns, rows)
+
+
+def _errors(same: CommonBoxes) -> tuple[str, ...]:
+    position = {name: same.sample(name, "position").rmse for name in SYSTEMS}
+    heading = (cell(float(np.degrees(same.sample(name, "heading").rmse)), 1) for name in SYSTEMS)
+    ratios = (position["labels"] / position[name] if len(same) else float("nan") for name in ("online", "detections"))
+    size = (cell(same.sample(name, "size").rmse) for name in SYSTEMS)
+    velocity = (cell(same.sample(name, "velocity").rmse) for name in ("online", "labels"))
+    return (*map(cell, position.values()), *map(cell, ratios), *heading, *size, *velocity)
+
+
+def _calibration_table(same: CommonBoxes) -> FigureTable:
+    rows = []
+    visible = same.select(same.visible)
+    for label in ("all", *np.unique(visible.label).tolist()):
+        part = visible if label == "all" else visible.select(visible.label == label)
+        for name in ("online", "labels"):
+            values = part.sample(name, "nees").values
+            covered = (cell(share) for share in coverages(values).values())
+            mean = cell(float(values.mean() / 2) if len(values) else float("nan"), 2)
+            rows.append((f"{label}, {name}", cell(len(values)), mean, *covered))
+    columns = ("class", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
+    return FigureTable("Calibration: share of position errors within the stated ellipses", columns, tuple(rows))
+
+
+def _consistency_table(consistency: Mapping[str, SelfConsistency]) -> FigureTable:
+    columns = (
+        *("system", "objects", "boxes", "frames each", "jerkiness, m/s^2", "turned", "resized, m", "gaps"),
+        "residual",
+    )
+    rows = tuple((name, *(cell(v) for v in asdict(value).values())) for name, value in consistency.items())
+    return FigureTable("Self-consistency, without ground truth", columns, rows)
+
+
+def _json_of(same: CommonBoxes) -> dict[str, Any]:
+    rmse = {
+        name: {q: same.sample(name, q).rmse for q in ("position", "heading", "size", "velocity")} for name in SYSTEMS
+    }
+    coverage = {name: coverages(same.sample(name, "nees").values) for name in ("online", "labels")}
+    return {"boxes": len(same), "rmse": rmse, "coverage": coverage}

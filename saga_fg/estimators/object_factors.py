@@ -1,0 +1,290 @@
+"""Objects in the running graph: their factors, the providers of these, and the graph of a recording.
+
+    prior        || x_i - m ||_P                             `Births`; one joint factor for a component at the start
+    interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}     `Interactions`, one n-ary factor a node and interval
+    detection    || z - H x_i ||_R                           `DetectionFactors`, one a measurement
+
+In the graph of a recording every node has a variable of its own at every epoch, but for one that nothing moves or
+disturbs, such as a pole: it keeps the variable of the epoch before, since a direction without noise has no factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import ClassVar
+
+import gtsam
+import numpy as np
+
+from factors import (
+    FactorError,
+    ResidualFactors,
+    detection_factors,
+    gaussian_factors,
+    interaction_factor,
+    interaction_factors,
+    joint_prior_factor,
+    prior_factors,
+)
+from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.epoch import Epoch
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
+from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.protocol import Measurements
+from saga_fg.graph.keys import node_key, node_kind
+from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import NewVariable
+from saga_fg.model.transition import Blocks, Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+
+_SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
+Factors = list[gtsam.JacobianFactor | ResidualFactors]
+
+
+@dataclass(frozen=True, eq=False)
+class EpochFactors:
+    """keys: of the variable of each node at an epoch; factors that come in with it, by what they are."""
+
+    keys: dict[int, int]
+    factors: dict[str, Factors]
+
+
+def prior_graph(x: BlockGaussian, time: float) -> SceneFactorGraph:
+    """The graph of what a filter knows at `time`, s: one joint prior for each component."""
+    return recording_graph(x, [Epoch(time)], [x.layout], [x.mean])
+
+
+def recording_graph(
+    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[Layout], means: Sequence[FloatArray]
+) -> SceneFactorGraph:
+    """The graph of `epochs` after `prior`; layouts and smoothed means of each epoch's joint state.
+
+    Raises `InputError` where a covariance has become singular, so that no factor can be made of it.
+    """
+    try:
+        recorded = recording_factors(prior, epochs, layouts, means)
+    except FactorError as error:
+        raise InputError(f"graph: {error}") from error
+    graph = SceneFactorGraph()
+    for epoch, layout, mean, one in zip(epochs, layouts, means, recorded, strict=True):
+        graph.advance(max(epoch.time, float(np.nextafter(graph.time, np.inf))))  # two may be at the same time
+        new = [
+            NewVariable(*node_kind(node), mean[layout.offsets[row] : layout.offsets[row + 1]])
+            for row, node in enumerate(layout.nodes.tolist())
+            if one.keys[node] not in graph.variables
+        ]
+        graph.add_variables("recording", new)
+        for name, factors in one.factors.items():
+            graph.add_factors(name, factors)
+    return graph
+
+
+def recording_factors(
+    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[Layout], means: Sequence[FloatArray]
+) -> list[EpochFactors]:
+    """The factors epoch by epoch, nonlinear ones and noise at the means. Raises `FactorError`, as the graph."""
+    result: list[EpochFactors] = []
+    keys: dict[int, int] = {}  # of nodes that have a variable already
+    moved: Factors = []
+    for k, (epoch, layout) in enumerate(zip(epochs, layouts, strict=True)):
+        keys = {node: keys.get(node) or node_key(node, k) for node in layout.nodes.tolist()}
+        factors: dict[str, Factors] = {
+            "interactions": moved,
+            "prior": _prior_factors(prior, keys) if k == 0 and len(prior.layout) else [],
+            "births": [
+                factor
+                for birth in epoch.births
+                for factor in prior_factors([keys[n] for n in birth.nodes.tolist()], birth.means, birth.covariances)
+            ],
+            "detections": [factor for one in epoch.measurements for factor in measurement_factors(keys, one)],
+        }
+        result.append(EpochFactors(keys, factors))
+        if epoch.interval is not None:
+            leaving = layout.rows(epoch.leaving)
+            stay = layout.without(leaving) if len(leaving) else layout
+            at = means[k][layout.places(layout.rows(stay.nodes))]
+            resting = stay.nodes[epoch.interval.linearised(stay, at).still].tolist()
+            now, keys = keys, {node: keys[node] for node in resting}
+            then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
+            native, nonlinear = interval_factors(epoch.interval, stay, at, now, then)
+            moved = [*native, *nonlinear]
+    return result
+
+
+def _prior_factors(x: BlockGaussian, keys: dict[int, int]) -> Factors:
+    """One joint factor a component."""
+    factors: Factors = []
+    for label in range(x.partition.count):
+        rows = np.flatnonzero(x.partition.label == label)
+        means = [x.mean[x.layout.places(rows[k : k + 1])] for k in range(len(rows))]
+        names = [keys[node] for node in x.layout.nodes[rows].tolist()]
+        factors.append(joint_prior_factor(names, means, x.joint(rows)))
+    return factors
+
+
+def measurement_factors(keys: Mapping[int, int], recorded: RecordedMeasurements) -> Factors:
+    """Return the factors of measurements, native where they are linear; keys: of the variables by id.
+
+    Measurements of weight 0 have none.
+    """
+    measured = recorded.measured
+    weights = np.ones(len(measured)) if recorded.weights is None else recorded.weights
+    kept = np.flatnonzero(weights > 0)
+    names = np.array([keys[node] for node in measured.nodes[kept].tolist()], dtype=np.uint64)
+    z, R = measured.z[kept], measured.R[kept] / weights[kept, None, None]
+    if not isinstance(measured, Measurements):
+        return [detection_factors(names, measured.model, z, R, recorded.loss)]
+    H = measured.H[kept]
+    if recorded.loss is None:
+        informative = H.any(axis=(1, 2))
+        return list(gaussian_factors(names[informative, None], [H[informative]], z[informative], R[informative]))
+    residual, jacobian = partial(_linear_residual, H, z), partial(_linear_jacobian, H)
+    dims = (H.shape[2],)
+    return [ResidualFactors(names[:, None], dims, residual, R, jacobian, recorded.loss, name="robust detections")]
+
+
+def _linear_residual(H: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
+    return np.asarray((H @ x[:, :, None])[:, :, 0] - z)
+
+
+def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
+    return [H]
+
+
+def interval_factors(
+    interval: IntervalDynamics | ZeroInterval,
+    layout: Layout,
+    mean: FloatArray,
+    keys: dict[int, int],
+    next_keys: dict[int, int],
+) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactors]]:
+    """Factors of an interval, native ones and those of nodes that move nonlinearly."""
+    dynamics = interval.linearised(layout, mean)
+    now = np.array([keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
+    then = np.array([next_keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
+    noise: dict[int, FloatArray] = {}
+    regular = np.zeros(len(layout), dtype=bool)  # native factors need noise in all directions
+    for blocks in dynamics.Q:
+        noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
+        regular[blocks.target] = _is_regular(blocks.values)
+    same = now == then  # of who rests
+    kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
+    for blocks in dynamics.F:
+        kinds[np.unique(blocks.target)] += 1
+    nonlinear: list[ResidualFactors] = []
+    moves_nonlinearly = same.copy()
+    for group, rows in interval.nonlinear_rows(layout) if isinstance(interval, IntervalDynamics) else ():
+        moves_nonlinearly[rows[:, 0]] = True
+        nonlinear.append(group.factors(then[rows[:, 0]], now[rows]))
+    together = regular & (kinds == 1) & ~moves_nonlinearly
+    native: list[gtsam.JacobianFactor] = []
+    for blocks in dynamics.F:
+        mine = np.flatnonzero(together[blocks.target])
+        mine = mine[np.argsort(blocks.target[mine], kind="stable")]
+        rows, first = np.unique(blocks.target[mine], return_index=True)
+        if len(rows):
+            b = dynamics.b[layout.spans(rows)]
+            Q = np.stack([noise[row] for row in rows.tolist()])
+            names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
+            native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
+    for row in np.flatnonzero(~together & ~moves_nonlinearly).tolist():
+        d, node = int(layout.dims[row]), int(layout.nodes[row])
+        Q = noise.get(row, np.zeros((d, d)))
+        sources = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
+        b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
+        if not _is_regular(Q):
+            raise FactorError(f"node {node}: expected noise in all directions of its state")
+        native.append(interaction_factor(int(then[row]), [key for key, _ in sources], [F for _, F in sources], b, Q))
+    return native, nonlinear
+
+
+def _is_regular(Q: FloatArray) -> BoolArray:
+    """(...,) true where covariances (..., d, d), in units of their axes, have variance in all directions."""
+    deviation = np.sqrt(np.diagonal(Q, axis1=-2, axis2=-1))
+    scale = np.where(deviation > 0, deviation, 1.0)
+    return np.asarray(np.linalg.eigvalsh(Q / scale[..., :, None] / scale[..., None, :])[..., 0] > _SINGULAR)
+
+
+def _of_row(blocks: Blocks, row: int) -> list[tuple[int, FloatArray]]:
+    """Source rows and blocks of one node."""
+    mine = np.flatnonzero(blocks.target == row)
+    return list(zip(blocks.source[mine].tolist(), blocks.values[mine], strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Births:
+    """New objects, independent of all others: ids (k,), means (k, d), covariances (k, d, d); labels by id."""
+
+    nodes: IntArray
+    means: FloatArray
+    covariances: FloatArray
+    labels: Mapping[int, str] = field(default_factory=dict)
+    name: str = "births"
+    internal: ClassVar[bool] = True
+
+    def factors(self, view: GraphView) -> Additions:
+        ids = np.asarray(self.nodes).tolist()
+        if not ids:
+            return Additions()
+        new = [
+            NewVariable(*node_kind(i), mean, label=self.labels.get(i, ""))
+            for i, mean in zip(ids, self.means, strict=True)
+        ]
+        return Additions(new, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
+
+
+@dataclass(frozen=True, eq=False)
+class Interactions:
+    """Objects move by a transition over those that stay.
+
+    earlier    by id, the keys of their variables, by default those of the epoch before
+    carried_over   ids of those whose variables stay as they are
+    """
+
+    transition: Transition
+    earlier: Mapping[int, int] | None = None
+    carried_over: Collection[int] = ()
+    name: str = "interactions"
+    internal: ClassVar[bool] = True
+
+    def factors(self, view: GraphView) -> Additions:
+        transition = self.transition
+        nodes = transition.nodes.tolist()
+        if not nodes:
+            return Additions()
+        earlier = self.earlier or {node: node_key(node, view.epoch - 1) for node in nodes}
+        now = {node: node_key(node, view.epoch) for node in nodes}
+        layout = Layout(nodes, transition.graph.dims)
+        mean = np.concatenate([view.state(earlier[node]) for node in nodes])
+        interval = IntervalDynamics(transition)
+        dynamics = interval.linearised(layout, mean)
+        moved = dynamics.moved(mean) + dynamics.b
+        states = np.split(moved, transition.offsets[1:-1])
+        new = [
+            NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
+            for n, x in zip(nodes, states, strict=True)
+            if n not in self.carried_over
+        ]
+        native, nonlinear = interval_factors(interval, layout, mean, dict(earlier), now)
+        still = {now[node] for node in self.carried_over}
+        return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionFactors:
+    """Measurements of objects; keys: of their variables by id, by default those of this epoch."""
+
+    measurements: Measurements | Observations
+    keys: Mapping[int, int] | None = None
+    name: str = "detections"
+    internal: ClassVar[bool] = True
+
+    def factors(self, view: GraphView) -> Additions:
+        m = self.measurements
+        now = self.keys or {node: node_key(node, view.epoch) for node in m.nodes.tolist()}
+        return Additions(factors=measurement_factors(now, RecordedMeasurements(m)))

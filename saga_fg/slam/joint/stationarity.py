@@ -1,0 +1,155 @@
+"""Stationarity of objects: the probability that each one is at rest, from its detections along a path.
+
+Around each detection of an object, within a window, D is the mean place of the later half of the detections less that
+of the earlier half, in the world along the path assumed so far, and T the time between the two. A stationary object
+has D ~ N(0, S): noise of the detections and of the odometry over the T seconds and s metres in between,
+
+    S = R (1/n_1 + 1/n_2) + shift + (scale^2 + course^2) s^2 + range^2 (turn + (bias T)^2)
+
+where shift and turn are the summed variances of the increments in between, in translation and in heading; scale, bias
+and course are the odometry's deviations as known so far. A moving object has D ~ N(0, S + (u T)^2), with the usual
+speed u of its class (`moving_speed`). By Bayes, with a share q of stationary objects, one half in a whole recording,
+
+    P(stationary | D) = q N(D; 0, S) / (q N(D; 0, S) + (1 - q) N(D; 0, S + (u T)^2))
+
+Where T is short, S and S + (u T)^2 are nearly equal, and P is about one half; so it is for slow classes far away.
+
+Online the window ends now, T is short, and creeping queues look parked: q is `online_standing_share`, and the last term
+of S, errors of the heading, counts across the line of sight only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import transform_points
+from saga_fg.slam.joint.record import RecordedEpoch, motion_covariances
+from saga_fg.slam.joint.settings import JointSettings
+from saga_fg.types.by_class import class_numbers
+
+
+@dataclass(frozen=True)
+class SlowErrors:
+    """Standard deviations of the odometry's scale, its bias of the yaw rate (rad/s) and its course (rad), as known."""
+
+    scale: float
+    bias: float
+    course: float
+
+    @classmethod
+    def at_start(cls, settings: JointSettings) -> SlowErrors:
+        """The deviations of the settings, before any measurement."""
+        return cls(settings.odometry.scale, settings.odometry.bias, settings.odometry.course)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlacedDetections(Columns):
+    """All detections, by object and time: object, row of the record, time (N,), place (N, 2), variance, range, u (N,).
+
+    sight (N, 2): the place less the vehicle's, m
+    drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first epoch on
+    """
+
+    object: IntArray
+    row: IntArray
+    time: FloatArray
+    place: FloatArray
+    sight: FloatArray
+    variance: FloatArray
+    range: FloatArray
+    speed: FloatArray
+    drift: FloatArray
+
+
+def stationary_probabilities(
+    record: Sequence[RecordedEpoch], path: FloatArray, slow: SlowErrors, settings: JointSettings, online: bool = False
+) -> list[FloatArray]:
+    """For each epoch the probabilities (n,) that its objects are stationary; path (K, 4, 4) assumed so far.
+
+    0 where there are too few detections. Between two detections it is the smaller one of theirs.
+    """
+    seen = _placed(record, path, settings)
+    p = _probabilities(seen, slow, settings, online)
+    result = [np.zeros(len(now.objects.id)) for now in record]
+    if not len(p):
+        return result
+    first = np.flatnonzero(np.append(True, seen.object[1:] != seen.object[:-1]))
+    for start, end in zip(first, np.append(first[1:], len(p)), strict=True):
+        name, rows, mine = seen.object[start], seen.row[start:end], p[start:end]
+        for k in range(int(rows[0]), int(rows[-1]) + 1):
+            after = int(np.searchsorted(rows, k))
+            value = mine[after] if rows[after] == k else min(mine[after - 1], mine[after])
+            row = int(np.searchsorted(record[k].objects.id, name))
+            if row < len(record[k].objects.id) and record[k].objects.id[row] == name:
+                result[k][row] = value
+    return result
+
+
+def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSettings, online: bool) -> FloatArray:
+    """P(stationary) (N,) of the object of each detection, around it."""
+    n = len(seen.object)
+    if n == 0:
+        return np.empty(0)
+    far = 4 * (seen.time.max() - seen.time.min() + settings.standing_window)  # puts objects apart on one axis
+    axis = seen.time - seen.time.min() + far * np.unique(seen.object, return_inverse=True)[1]
+    low = np.searchsorted(axis, axis - settings.standing_window / 2, "left")
+    high = np.searchsorted(axis, axis + settings.standing_window / 2, "right")
+    start = np.searchsorted(seen.object, seen.object, "left")
+    end = np.searchsorted(seen.object, seen.object, "right")
+    # at the ends of its lifespan the window is shifted into it
+    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.standing_window, "left"), low)
+    low = np.maximum(low, start)
+    high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.standing_window, "right"), high)
+    high = np.minimum(high, end)
+    middle = (low + high) // 2
+    n1, n2 = middle - low, high - middle
+
+    def half(values: FloatArray, a: IntArray, b: IntArray) -> FloatArray:
+        total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+        count = np.maximum(b - a, 1).reshape(-1, *(1,) * (values.ndim - 1))
+        return np.asarray((total[b] - total[a]) / count)
+
+    columns = np.column_stack([seen.place, seen.time - seen.time.min(), seen.drift])
+    between = half(columns, middle, high) - half(columns, low, middle)
+    D, (T, s, shift, turn) = between[:, :2], between[:, 2:].T
+    S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
+    S = S + shift + (slow.scale**2 + slow.course**2) * s**2
+    turned = half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
+    sight = half(seen.sight, low, high)
+    along = (D * sight).sum(axis=1) ** 2 / np.maximum((sight**2).sum(axis=1), 1e-9)
+    d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across
+    S = np.stack([S if online else S + turned, S + turned])
+    M = S + (seen.speed * T) ** 2
+    q = settings.online_standing_share if online else 0.5
+    odds = np.log(q / (1 - q)) + (np.log(M / S) - d2 * (1 / S - 1 / M)).sum(axis=0) / 2  # log
+    p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
+    return np.where(n1 > 0, p, 0.0)
+
+
+def _placed(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:
+    row = np.repeat(np.arange(len(record)), [len(now.seen.id) for now in record]).astype(np.int64)
+    place = [transform_points(pose, now.seen.z)[:, :2] for now, pose in zip(record, path, strict=True)]
+    sight = [one - pose[:2, 3] for one, pose in zip(place, path, strict=True)]
+    label = [np.array(now.objects.label)[np.isin(now.objects.id, now.seen.id)] for now in record]
+    P = motion_covariances(record, settings)
+    drift = np.zeros((len(record), 3))
+    drift[:, 0] = np.cumsum([np.linalg.norm(now.a_T_b[:3, 3]) for now in record])
+    drift[1:, 1] = np.cumsum((P[:, 3, 3] + P[:, 4, 4]) / 2)
+    drift[1:, 2] = np.cumsum(P[:, 2, 2])
+    placed = _PlacedDetections(
+        np.concatenate([now.seen.id for now in record]),
+        row,
+        np.array([now.time for now in record])[row],
+        np.concatenate(place),
+        np.concatenate(sight),
+        np.concatenate([np.trace(now.seen.R, axis1=1, axis2=2) / 2 for now in record]),
+        np.concatenate([np.hypot(now.seen.z[:, 0], now.seen.z[:, 1]) for now in record]),
+        class_numbers(settings.moving_speed, float, np.concatenate(label)),
+        drift[row],
+    )
+    return placed.select(np.lexsort((placed.row, placed.object)))
