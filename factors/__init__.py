@@ -29,12 +29,15 @@ from factors.nonlinear_interaction import NonlinearInteraction
 from factors.odometry import ERROR_DIM, odometry_factors
 from factors.on_plane import on_plane_factor
 from factors.plane import OrientedPlane, plane, plane_factor
-from factors.point import point_factors
 from factors.polar import Bearing, Radar, Range, RangeBearing, RangeRate
 from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
-from factors.relative_detection import relative_detection_factors
-from factors.relative_polar import relative_range_bearing_factors
+from factors.relative import (
+    point_factors,
+    relative_detection_factors,
+    relative_factors,
+    relative_range_bearing_factors,
+)
 from factors.robust import Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
@@ -108,6 +111,7 @@ __all__ = [
     "prior_factors",
     "range_factor",
     "relative_detection_factors",
+    "relative_factors",
     "relative_range_bearing_factors",
     "solve",
 ]

@@ -1,4 +1,4 @@
-"""What is known of a pose from outside: its place from a satellite receiver, its tilt from an accelerometer.
+"""Absolute measurements of a pose: its place from a satellite receiver, its tilt from an accelerometer.
 
     position   r = t + R a - z                                       z in the local frame, a the antenna's place, m
     attitude   r = angle between R u_pose and u_world, two turns     GTSAM's `AttitudeFactorPose3`

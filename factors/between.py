@@ -70,6 +70,6 @@ def gaussian_noise(name: str, covariance: ArrayLike, dim: int) -> gtsam.noiseMod
 def noise_model(
     name: str, covariance: ArrayLike, dim: int, robust: RobustLoss | None = None
 ) -> gtsam.noiseModel.Gaussian | gtsam.noiseModel.Robust:
-    """The same under a robust loss, if one is given."""
+    """GTSAM's noise model of a covariance, under a robust loss if one is given."""
     gaussian = gaussian_noise(name, covariance, dim)
     return gaussian if robust is None else robust.model(gaussian)

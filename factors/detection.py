@@ -1,4 +1,4 @@
-"""What a sensor says of one node: a detection.
+"""Detections: measurements of single nodes.
 
     z = h(x) + v,    v ~ N(0, R)            phi  =  rho( || z - h(x) ||_R )
 

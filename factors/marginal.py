@@ -36,15 +36,15 @@ def marginal_factors(
     Factors without eliminated keys are passed on as they are (shared, not copied). Raises `FactorError` for a key that
     the graph lacks, and `SingularSystemError` when the graph does not determine the eliminated variables.
     """
-    gone = checked_keys("eliminate", eliminate)
-    _present(graph, gone)
-    if not gone:
+    leaving = checked_keys("eliminate", eliminate)
+    _present(graph, leaving)
+    if not leaving:
         return graph
     try:  # in the order COLAMD finds best
         if _checked(elimination) == "qr":
-            tree, remaining = graph.eliminatePartialMultifrontal(list(gone), gtsam.EliminateQR)
+            tree, remaining = graph.eliminatePartialMultifrontal(list(leaving), gtsam.EliminateQR)
         else:
-            tree, remaining = graph.eliminatePartialMultifrontal(list(gone))
+            tree, remaining = graph.eliminatePartialMultifrontal(list(leaving))
     except RuntimeError as error:
         raise singular_system(graph, error) from error
     if not np.isfinite(tree.gradientAtZero().norm()):  # GTSAM passes NaN on without a word

@@ -24,7 +24,7 @@ class MeasurementModel(Protocol):
 
     @property
     def name(self) -> str:
-        """What is measured, for messages."""
+        """Name of the measured quantity, for messages."""
 
     @property
     def state_dim(self) -> int:
@@ -40,7 +40,7 @@ class MeasurementModel(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether h(x) = H x, up to whole turns of the angles."""
+        """True where h(x) = H x, up to whole turns of the angles."""
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return h (..., m) at states (..., d)."""

@@ -31,7 +31,7 @@ from factors.variables import Variable, read_states
 
 
 class Linearisable(Protocol):
-    """What `factors.solver.solve` asks of a factor, or of many in one, that GTSAM does not evaluate itself."""
+    """A factor, or many in one, that GTSAM does not evaluate itself, as `factors.solver.solve` needs it."""
 
     @property
     def keys(self) -> tuple[int, ...]: ...

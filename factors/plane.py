@@ -12,6 +12,7 @@ Wraps GTSAM's `OrientedPlane3Factor` (Trevor, Rogers and Christensen, "Planar su
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -20,26 +21,19 @@ from numpy.typing import ArrayLike
 from factors.between import gaussian_noise
 from factors.errors import FactorError
 from factors.validation import FloatArray, checked, checked_keys
+from factors.variables import Manifold
 
 _UNIT = 1e-6  # what the length of a normal may be off 1
 
 
 @dataclass(frozen=True)
-class OrientedPlane:
+class OrientedPlane(Manifold):
     """A `gtsam.OrientedPlane3`; delta = (two turns of the normal, rad; distance, m); as numbers (4,): n, d."""
 
-    @property
-    def dim(self) -> int:
-        return 3
+    dim: ClassVar[int] = 3
 
     def read(self, values: gtsam.Values, key: int) -> gtsam.OrientedPlane3:
         return values.atOrientedPlane3(key)
-
-    def retract(self, state: gtsam.OrientedPlane3, delta: FloatArray) -> gtsam.OrientedPlane3:
-        return state.retract(delta)
-
-    def local(self, state: gtsam.OrientedPlane3, other: gtsam.OrientedPlane3) -> FloatArray:
-        return state.localCoordinates(other)
 
     def size(self, state: gtsam.OrientedPlane3) -> FloatArray:
         return np.array([1.0, 1.0, abs(state.distance())])

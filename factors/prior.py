@@ -1,4 +1,4 @@
-"""What is known of a variable, or of several together, before anything is measured.
+"""Priors of a variable, or of several together.
 
     phi(x) = || x - m ||_P^2
 

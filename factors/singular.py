@@ -1,4 +1,4 @@
-"""Which variables a singular linear system leaves undetermined.
+"""Variables that a singular linear system leaves undetermined.
 
 GTSAM names the one variable at which elimination broke down, which depends on the ordering and is often an innocent
 neighbour. The undetermined directions are the null space of the information matrix Lambda = A^T A. Scaled to a unit

@@ -1,4 +1,4 @@
-"""What a factor of ours must know of a variable: how to read it from `gtsam.Values`, its dimension, how to move it.
+"""Types of variables: how to read one from `gtsam.Values`, its dimension, how to move it.
 
 A variable x lives on a manifold; x + delta means retract(x, delta), delta in R^dim. For vectors that is the sum, for
 poses GTSAM's own retraction, so that Jacobians are taken in the coordinates in which GTSAM's solvers step.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import gtsam
 import numpy as np
@@ -69,22 +69,24 @@ class Vector:
         return state
 
 
+class Manifold:
+    """Steps of a variable of GTSAM's own, by GTSAM's retraction."""
+
+    def retract(self, state: Any, delta: FloatArray) -> Any:
+        return state.retract(delta)
+
+    def local(self, state: Any, other: Any) -> FloatArray:
+        return np.asarray(state.localCoordinates(other))
+
+
 @dataclass(frozen=True)
-class PlanarPose:
+class PlanarPose(Manifold):
     """A `gtsam.Pose2`; delta = (x, y, heading) in the pose's own frame; as numbers (3, 3)."""
 
-    @property
-    def dim(self) -> int:
-        return 3
+    dim: ClassVar[int] = 3
 
     def read(self, values: gtsam.Values, key: int) -> gtsam.Pose2:
         return values.atPose2(key)
-
-    def retract(self, state: gtsam.Pose2, delta: FloatArray) -> gtsam.Pose2:
-        return state.retract(delta)
-
-    def local(self, state: gtsam.Pose2, other: gtsam.Pose2) -> FloatArray:
-        return state.localCoordinates(other)
 
     def size(self, state: gtsam.Pose2) -> FloatArray:
         return np.ones(3)
@@ -94,21 +96,13 @@ class PlanarPose:
 
 
 @dataclass(frozen=True)
-class SpatialPose:
+class SpatialPose(Manifold):
     """A `gtsam.Pose3`; delta = (rotation vector, translation) in the pose's own frame; as numbers (4, 4)."""
 
-    @property
-    def dim(self) -> int:
-        return 6
+    dim: ClassVar[int] = 6
 
     def read(self, values: gtsam.Values, key: int) -> gtsam.Pose3:
         return values.atPose3(key)
-
-    def retract(self, state: gtsam.Pose3, delta: FloatArray) -> gtsam.Pose3:
-        return state.retract(delta)
-
-    def local(self, state: gtsam.Pose3, other: gtsam.Pose3) -> FloatArray:
-        return state.localCoordinates(other)
 
     def size(self, state: gtsam.Pose3) -> FloatArray:
         return np.ones(6)
@@ -118,21 +112,13 @@ class SpatialPose:
 
 
 @dataclass(frozen=True)
-class ImuBias:
+class ImuBias(Manifold):
     """A `gtsam.imuBias.ConstantBias`; delta = (of accelerometers, m/s^2, of gyroscopes, rad/s), as numbers the same."""
 
-    @property
-    def dim(self) -> int:
-        return 6
+    dim: ClassVar[int] = 6
 
     def read(self, values: gtsam.Values, key: int) -> gtsam.imuBias.ConstantBias:
         return values.atConstantBias(key)
-
-    def retract(self, state: gtsam.imuBias.ConstantBias, delta: FloatArray) -> gtsam.imuBias.ConstantBias:
-        return state.retract(delta)
-
-    def local(self, state: gtsam.imuBias.ConstantBias, other: gtsam.imuBias.ConstantBias) -> FloatArray:
-        return state.localCoordinates(other)
 
     def size(self, state: gtsam.imuBias.ConstantBias) -> FloatArray:
         return np.abs(state.vector())

@@ -36,10 +36,10 @@ def explain(
       saga-fg explain results --scene 0011 --track 4 --json events.json
       saga-fg explain tracks.json --scene scene-0103 --graph --time 3.4 --output graph.png
     """
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import atomic_file, check_writable
     from data_tools.files.located import located
     from pipelines.explaining import graph_picture, journal_of, read_graphs, read_track, story
-    from pipelines.figures import write_figures
     from saga_fg.errors import InputError
 
     journal = journal_of(result)

@@ -13,9 +13,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
+from data_tools.datasets.parts import Part
 from data_tools.files.atomic_files import remove_leftovers
 from pipelines.scale_out.folder import OutputFolder
-from pipelines.scale_out.job import Job, Outcome, SceneInput, SceneTask, sha256
+from pipelines.scale_out.job import Job, Outcome, SceneTask, sha256
 from pipelines.scale_out.manifest import Manifest, Record
 from saga_fg.errors import InputError
 
@@ -46,7 +47,7 @@ class Report:
 
 
 def run_scenes(
-    inputs: Iterable[SceneInput],
+    inputs: Iterable[Part],
     total: int,
     task: SceneTask,
     output: Path,
@@ -87,9 +88,7 @@ def run_scenes(
     return report
 
 
-def _jobs(
-    inputs: Iterable[SceneInput], task: SceneTask, manifest: Manifest, configuration: str, here: str
-) -> Iterator[Job]:
+def _jobs(inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configuration: str, here: str) -> Iterator[Job]:
     names: set[str] = set()
     for scene in inputs:
         if scene.name in names:

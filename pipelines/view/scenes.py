@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
+from data_tools.lidar.scan_sequence import ScanSequence
 from data_tools.metrics import SceneBoxes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections
-from pipelines.scan_sequence import ScanSequence
 from pipelines.view.drawing import (
     VEHICLE,
     Arrows,

@@ -6,13 +6,13 @@ from saga_fg.estimators.bounded import BoundedKalmanFilter
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
-from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.estimators.kalman import JointKalmanFilter
 from saga_fg.estimators.measurements import Observations
+from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
 from saga_fg.estimators.protocol import Estimator, Measurements
 from saga_fg.estimators.recorded_smoother import SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings

@@ -109,7 +109,7 @@ class MarginalCovariances:
 
     @staticmethod
     def of(whole: SmoothedCovariance) -> MarginalCovariances:
-        """Those of all nodes."""
+        """Marginals of all nodes."""
         layout = whole.partition.layout
         own, place = {}, np.empty(len(layout), dtype=np.int64)
         for d in np.unique(layout.dims).tolist():
@@ -212,8 +212,8 @@ def _moved(blocks: BlockDiagonal, old: Partition, new: Partition) -> BlockDiagon
     return regrouped(blocks, old, new, np.array([row.get(node, -1) for node in new.layout.nodes.tolist()], dtype=int))
 
 
-def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition, told: float) -> BlockDiagonal:
-    """N before a correction, from N after it; told: 1 to count what the correction tells, 0 not to."""
+def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition, counted: float) -> BlockDiagonal:
+    """N before a correction, from N after it; counted: 1 to count its information, 0 not to."""
     fine = x.partition
     node = np.searchsorted(fine.layout.offsets, gain.places[:, 0], side="right") - 1
     number, rows = int(fine.group[node[0]]), fine.row[node]
@@ -223,7 +223,7 @@ def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition
         N_active = N[number][rows]
         W_N = gain.W @ N_active
         inner = W_N @ np.swapaxes(gain.W, 1, 2)
-        half = B_T @ ((told * np.eye(B.shape[1]) + inner) @ B / 2 - W_N)
+        half = B_T @ ((counted * np.eye(B.shape[1]) + inner) @ B / 2 - W_N)
         changed = N[number].copy()
         changed[rows] = N_active + half + np.swapaxes(half, 1, 2)
         return (*N[:number], changed, *N[number + 1 :])
@@ -234,7 +234,7 @@ def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition
     A[number] = A[number].copy()
     A[number][rows] -= np.swapaxes(gain.W, 1, 2) @ B
     C = list(zeros(fine))
-    C[number][rows] = told * (B_T @ B)
+    C[number][rows] = counted * (B_T @ B)
     every = np.arange(len(fine.layout))
     A_joined, C_joined = regrouped(tuple(A), fine, partition, every), regrouped(tuple(C), fine, partition, every)
     products = (np.swapaxes(a, 1, 2) @ n @ a + c for a, n, c in zip(A_joined, N, C_joined, strict=True))

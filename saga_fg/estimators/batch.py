@@ -181,7 +181,7 @@ class BatchSmoother(RecordedSmoother):
         self._graduated = True
 
     def _distances(self, loss: GraduatedNonConvexity) -> FloatArray:
-        """Of all residuals under this loss, standard deviations."""
+        """Distances of all residuals under this loss, standard deviations."""
         epochs, layouts = self._recording.epochs, self._recording.layouts
         parts = [
             recorded.distances(layout, mean)

@@ -58,7 +58,7 @@ class BatchSolver:
     def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
         """Begin the epoch at `time`, s, and ask the providers, by default those of the solver.
 
-        frame: what they are told of the epoch
+        frame: the input of the epoch
         """
         asked = self.providers if providers is None else providers
         unchanged, begun = (self._graph, self._solution, self._lent), predictors(asked)
@@ -99,7 +99,7 @@ class BatchSolver:
         return self._graph
 
     def state(self, key: int) -> object:
-        """Where a variable is: a vector, or a pose."""
+        """Value of a variable: a vector, or a pose."""
         return self.graph().state(key)
 
     def covariance(self, key: int) -> FloatArray:

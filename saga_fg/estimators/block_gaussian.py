@@ -26,7 +26,7 @@ class BlockGaussian:
 
     @staticmethod
     def empty() -> BlockGaussian:
-        """Of no node."""
+        """Gaussian of no node."""
         return BlockGaussian(Partition.apart(Layout()), np.empty(0), ())
 
     @property
@@ -34,7 +34,7 @@ class BlockGaussian:
         return self.partition.layout
 
     def over(self, partition: Partition) -> BlockGaussian:
-        """The same over a partition of the same nodes; what it leaves uncorrelated loses its correlation."""
+        """Change the partition; nodes that it separates lose their correlation."""
         if partition is self.partition:
             return self
         rows = np.arange(len(self.layout))
@@ -62,8 +62,8 @@ class BlockGaussian:
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
         if old.count - partition.count == len(rows):  # nodes without partners go, all others stay as they are
-            gone = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
-            left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, gone, strict=True))
+            leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
+            left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, leaving, strict=True))
             blocks = tuple(P for P in left if len(P))
         else:
             blocks = regrouped(self.blocks, old, partition, kept)

@@ -114,9 +114,9 @@ class BlockVariables:
         keys = self.keys[self.partition.label[rows]].tolist()
         return [native_factor([key], [d], matrix.T) for key, matrix in zip(keys, augmented, strict=True)]
 
-    def detections(self, seen: WhitenedMeasurements) -> list[gtsam.JacobianFactor]:
+    def detections(self, white: WhitenedMeasurements) -> list[gtsam.JacobianFactor]:
         """One factor a variable for the measurements of its nodes."""
-        rows, z, H = seen.rows, seen.z, seen.H
+        rows, z, H = white.rows, white.z, white.H
         partition, (_, k, d) = self.partition, H.shape
         span = partition.layout.offsets[rows][:, None] + np.arange(d)
         A = H * self.scale[span][:, None, :]

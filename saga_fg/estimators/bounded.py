@@ -37,9 +37,9 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind

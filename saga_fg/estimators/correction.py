@@ -10,7 +10,7 @@ H P = R K^T, so that the measured rows are as exact as in Joseph's form.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ _BATCHED_BELOW = 10  # size from which a triangular system is worth a call of it
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """What a correction did to c components of equal size s with up to a measured values each (rows of zeros fill up).
+    """A correction of c components of equal size s with up to a measured values each (rows of zeros fill up).
 
     places (c, s) of the components; H (c, a, s); L (c, a, a) lower triangular, L L^T = S; W (c, a, s) = L^-1 H P;
     whitened (c, a) = L^-1 (z - H m)
@@ -43,34 +43,16 @@ class Gain:
 def correct(
     x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[BlockGaussian, tuple[Gain, ...], float]:
-    """The posterior, the gains, and the log-likelihood of the innovation.
+    """Return the posterior, the gains, and the log-likelihood of the innovation.
 
     rows (m,) of the measured nodes, may repeat; z (m, k); H (m, k, d); R (m, k, k) positive definite. Raises
     `InputError` where a covariance has grown so large that R no longer counts among its digits.
     """
-    partition, mean, blocks = x.partition, x.mean.copy(), list(x.blocks)
-    gains = []
+    posterior, gains = _posterior(x, _stacks(x, x.mean, rows, z, H, R))
     log_likelihood = -0.5 * z.size * math.log(2 * math.pi)
-    for number, members, at in partition.members(rows, H.shape[2]):
-        component = partition.row[rows[members]]
-        active = np.flatnonzero(np.bincount(component, minlength=len(partition.groups[number])))
-        every = len(active) == len(partition.groups[number])
-        if not every:
-            component = np.searchsorted(active, component)
-        P = blocks[number] if every else blocks[number][active]
-        places = partition.groups[number] if every else partition.groups[number][active]
-        stacked = _stacked(P, mean, places, component, at, z[members], H[members], R[members])
-        gain, P = _corrected(P, places, stacked)
-        gains.append(gain)
-        mean[places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
-        if not every:
-            blocks[number] = blocks[number].copy()
-            blocks[number][active] = P
-        else:
-            blocks[number] = P
-        log_det = 2 * np.log(np.diagonal(gain.L, axis1=1, axis2=2)).sum()
-        log_likelihood -= 0.5 * float(np.vdot(gain.whitened, gain.whitened) + log_det)
-    return replace(x, mean=mean, blocks=tuple(blocks)), tuple(gains), log_likelihood
+    for gain in gains:
+        log_likelihood -= _half_mahalanobis(gain.L, gain.whitened)
+    return posterior, gains, log_likelihood
 
 
 class WhitenedFactor(NamedTuple):
@@ -82,31 +64,12 @@ class WhitenedFactor(NamedTuple):
 
 
 def correct_whitened(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> BlockGaussian:
-    """The posterior given factors on any nodes, whose components become one; noise of variance 1."""
+    """Return the posterior given factors on any nodes, whose components become one; noise of variance 1."""
     if not factors:
         return x
     ties = [np.array([[factor.rows[0], row] for row in factor.rows[1:]]).reshape(-1, 2) for factor in factors]
     x = x.over(x.partition.joined(*np.concatenate(ties).astype(np.int64).T))
-    partition, mean, blocks = x.partition, x.mean.copy(), list(x.blocks)
-    first = np.array([factor.rows[0] for factor in factors])
-    for number in np.unique(partition.group[first]).tolist():
-        mine = np.flatnonzero(partition.group[first] == number)
-        active, component = np.unique(partition.row[first[mine]], return_inverse=True)
-        lengths = np.array([len(factors[k].innovation) for k in mine.tolist()])
-        most = int(np.bincount(component, weights=lengths).max())
-        P, places, used = blocks[number][active], partition.groups[number][active], [0] * len(active)
-        H, innovation = np.zeros((len(active), most, P.shape[1])), np.zeros((len(active), most, 1))
-        for k, c in zip(mine.tolist(), component.tolist(), strict=True):
-            factor, at = factors[k], slice(used[c], used[c] + len(factors[k].innovation))
-            within = [np.arange(x.layout.dims[row]) + partition.offset[row] for row in factor.rows]
-            H[c][at, np.concatenate(within)] = factor.H
-            innovation[c, at, 0], used[c] = factor.innovation, at.stop
-        R = np.broadcast_to(np.eye(most), (len(active), most, most))
-        gain, P = _corrected(P, places, _Stacked(H @ P, H, R, innovation))
-        mean[places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
-        blocks[number] = blocks[number].copy()
-        blocks[number][active] = P
-    return replace(x, mean=mean, blocks=tuple(blocks))
+    return _posterior(x, _factor_stacks(x, factors))[0]
 
 
 def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> float:
@@ -114,9 +77,7 @@ def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: Fl
     likelihood = -0.5 * z.size * math.log(2 * math.pi)
     for stacked in _stacks(x, x.mean, rows, z, H, R):
         L = _innovation_root(stacked)
-        whitened = solve_lower(L, stacked.innovation)
-        log_det = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum()
-        likelihood -= 0.5 * float(np.vdot(whitened, whitened) + log_det)
+        likelihood -= _half_mahalanobis(L, solve_lower(L, stacked.innovation))
     return likelihood
 
 
@@ -125,8 +86,8 @@ def posterior_likelihood(
 ) -> float:
     """Log-likelihood of the innovation from the posterior `x` and the mean before it, (D,).
 
-    z and H are whitened, R = 1, and log_det what that took. With v = z - H m the inverse of the innovation's covariance
-    is then T = 1 - H P H^T.
+    z and H are whitened, R = 1, with log_det the sum of the logarithms of the determinants of R before. With
+    v = z - H m the inverse of the innovation's covariance is then T = 1 - H P H^T.
     """
     likelihood = -0.5 * (z.size * math.log(2 * math.pi) + log_det)
     R = np.broadcast_to(np.eye(H.shape[1]), (len(rows), H.shape[1], H.shape[1]))
@@ -139,58 +100,93 @@ def posterior_likelihood(
 class _Stacked(NamedTuple):
     """Measurements of c components of equal size s, a values each (rows of zeros fill up).
 
-    H_P, H (c, a, s); R (c, a, a); innovation (c, a, 1)
+    number: of their group; active: their rows in it; places (c, s); P (c, s, s); H_P, H (c, a, s); R (c, a, a);
+    innovation (c, a, 1)
     """
 
+    number: int
+    active: IntArray | slice
+    places: IntArray
+    P: FloatArray
     H_P: FloatArray
     H: FloatArray
     R: FloatArray
     innovation: FloatArray
 
 
+def _posterior(x: BlockGaussian, stacks: Iterable[_Stacked]) -> tuple[BlockGaussian, tuple[Gain, ...]]:
+    """Correct components, each of which is in one stack at most."""
+    mean, blocks, gains = x.mean.copy(), list(x.blocks), []
+    for stacked in stacks:
+        gain, P = _corrected(stacked)
+        gains.append(gain)
+        mean[gain.places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
+        if isinstance(stacked.active, slice):  # all of the group
+            blocks[stacked.number] = P
+        else:
+            blocks[stacked.number] = blocks[stacked.number].copy()
+            blocks[stacked.number][stacked.active] = P
+    return replace(x, mean=mean, blocks=tuple(blocks)), tuple(gains)
+
+
+def _half_mahalanobis(L: FloatArray, whitened: FloatArray) -> float:
+    """-log of the Gaussian density of innovations with covariance L L^T, but for its constant."""
+    return 0.5 * float(np.vdot(whitened, whitened) + 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
+
+
 def _stacks(
     x: BlockGaussian, mean: FloatArray, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
 ) -> Iterator[_Stacked]:
-    """For each group of components; innovations from the joint state `mean`."""
-    for number, members, at in x.partition.members(rows, H.shape[2]):
-        active, component = np.unique(x.partition.row[rows[members]], return_inverse=True)
-        P, places = x.blocks[number][active], x.partition.groups[number][active]
-        yield _stacked(P, mean, places, component, at, z[members], H[members], R[members])
+    """Stack the measurements of each group of components; innovations from the joint state `mean`."""
+    partition, (k, d) = x.partition, H.shape[1:]
+    for number, members, at in partition.members(rows, d):
+        component, places = partition.row[rows[members]], partition.groups[number]
+        measured = np.flatnonzero(np.bincount(component, minlength=len(places)))
+        active: IntArray | slice = slice(None)
+        if len(measured) < len(places):
+            component, active = np.searchsorted(measured, component), measured
+        P, places = x.blocks[number][active], places[active]
+        c, s = places.shape
+        slot = rank(component)  # of a measurement among those of its component
+        most = int(slot.max()) + 1
+        H_P, H_all, innovation = np.zeros((c, most, k, s)), np.zeros((c, most, k, s)), np.zeros((c, most, k))
+        R_all = np.zeros((c, most, k, most, k))
+        H_P[component, slot] = H[members] @ P[component[:, None], at]
+        if s % d == 0 and not (at[:, 0] % d).any():  # states of equal size: node by node
+            H_all.reshape(c, most, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H[members]
+        else:
+            H_all[component[:, None, None], slot[:, None, None], np.arange(k)[:, None], at[:, None, :]] = H[members]
+        R_all[component, slot, :, slot, :] = R[members]
+        expected = H[members] @ mean[places[component[:, None], at]][:, :, None]
+        innovation[component, slot] = z[members] - expected[:, :, 0]
+        if len(component) < c * most:
+            empty = np.ones((c, most), dtype=bool)
+            empty[component, slot] = False
+            i, j = np.nonzero(empty)
+            R_all[i, j, :, j, :] = np.eye(k)
+        a = most * k
+        stacked = H_P.reshape(c, a, s), H_all.reshape(c, a, s), R_all.reshape(c, a, a), innovation.reshape(c, a, 1)
+        yield _Stacked(number, active, places, P, *stacked)
 
 
-def _stacked(
-    P: FloatArray,
-    mean: FloatArray,
-    places: IntArray,
-    component: IntArray,
-    at: IntArray,
-    z: FloatArray,
-    H: FloatArray,
-    R: FloatArray,
-) -> _Stacked:
-    """Of c components P (c, s, s) at `places` of the joint state.
-
-    component (m,): the one that a measurement is of; at (m, d): the entries of its state that H sees.
-    """
-    (c, s, _), (k, d) = P.shape, H.shape[1:]
-    slot = rank(component)  # of a measurement among those of its component
-    most = int(slot.max()) + 1
-    H_P, H_all, innovation = np.zeros((c, most, k, s)), np.zeros((c, most, k, s)), np.zeros((c, most, k))
-    R_all = np.zeros((c, most, k, most, k))
-    H_P[component, slot] = H @ P[component[:, None], at]
-    if s % d == 0 and not (at[:, 0] % d).any():  # states of equal size: node by node
-        H_all.reshape(c, most, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H
-    else:
-        H_all[component[:, None, None], slot[:, None, None], np.arange(k)[:, None], at[:, None, :]] = H
-    R_all[component, slot, :, slot, :] = R
-    innovation[component, slot] = z - (H @ mean[places[component[:, None], at]][:, :, None])[:, :, 0]
-    if len(component) < c * most:
-        empty = np.ones((c, most), dtype=bool)
-        empty[component, slot] = False
-        i, j = np.nonzero(empty)
-        R_all[i, j, :, j, :] = np.eye(k)
-    a = most * k
-    return _Stacked(H_P.reshape(c, a, s), H_all.reshape(c, a, s), R_all.reshape(c, a, a), innovation.reshape(c, a, 1))
+def _factor_stacks(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> Iterator[_Stacked]:
+    """Stack factors of which each is on one component."""
+    partition = x.partition
+    first = np.array([factor.rows[0] for factor in factors])
+    for number in np.unique(partition.group[first]).tolist():
+        mine = np.flatnonzero(partition.group[first] == number)
+        active, component = np.unique(partition.row[first[mine]], return_inverse=True)
+        lengths = np.array([len(factors[k].innovation) for k in mine.tolist()])
+        most = int(np.bincount(component, weights=lengths).max())
+        P, places, used = x.blocks[number][active], partition.groups[number][active], [0] * len(active)
+        H, innovation = np.zeros((len(active), most, P.shape[1])), np.zeros((len(active), most, 1))
+        for k, c in zip(mine.tolist(), component.tolist(), strict=True):
+            factor, at = factors[k], slice(used[c], used[c] + len(factors[k].innovation))
+            within = [np.arange(x.layout.dims[row]) + partition.offset[row] for row in factor.rows]
+            H[c][at, np.concatenate(within)] = factor.H
+            innovation[c, at, 0], used[c] = factor.innovation, at.stop
+        R = np.broadcast_to(np.eye(most), (len(active), most, most))
+        yield _Stacked(number, active, places, P, H @ P, H, R, innovation)
 
 
 def _innovation_root(stacked: _Stacked) -> FloatArray:
@@ -204,11 +200,11 @@ def _innovation_root(stacked: _Stacked) -> FloatArray:
         ) from None
 
 
-def _corrected(P: FloatArray, places: IntArray, stacked: _Stacked) -> tuple[Gain, FloatArray]:
-    """Gain and posterior covariance of c components P (c, s, s) at `places` of the joint state."""
-    L = _innovation_root(stacked)
+def _corrected(stacked: _Stacked) -> tuple[Gain, FloatArray]:
+    """Gain and posterior covariance (c, s, s)."""
+    P, L = stacked.P, _innovation_root(stacked)
     solved = solve_lower(L, np.concatenate([stacked.H_P, stacked.innovation], axis=2))
-    gain = Gain(places, stacked.H, L, solved[:, :, :-1], solved[:, :, -1])
+    gain = Gain(stacked.places, stacked.H, L, solved[:, :, :-1], solved[:, :, -1])
     posterior = np.swapaxes(gain.W, 1, 2) @ gain.W
     np.subtract(P, posterior, out=posterior)
     after, before = (np.diagonal(array, axis1=1, axis2=2) for array in (posterior, P))
@@ -222,7 +218,7 @@ def _corrected(P: FloatArray, places: IntArray, stacked: _Stacked) -> tuple[Gain
 
 
 def solve_lower(L: FloatArray, B: FloatArray, transposed: bool = False) -> FloatArray:
-    """X of L X = B, or of L^T X = B, for a stack of lower triangular L (c, a, a) and B (c, a, b)."""
+    """Solve L X = B, or L^T X = B, for a stack of lower triangular L (c, a, a) and B (c, a, b)."""
     if L.shape[1] < _BATCHED_BELOW:
         return np.asarray(np.linalg.solve(np.swapaxes(L, 1, 2) if transposed else L, B), dtype=np.float64)
     solved = np.array(B, order="C")

@@ -36,7 +36,7 @@ class Dynamics:
 
     @staticmethod
     def of(transition: Transition, layout: Layout) -> Dynamics:
-        """Those of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
+        """Dynamics of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
         require_kind("transition", transition, Transition)
         rows = layout.rows(transition.nodes)
         if len(rows) != len(layout):
@@ -102,15 +102,15 @@ class Dynamics:
     def still(self) -> BoolArray:
         """(n,) which nodes stay exactly where they are, x' = x without noise, whatever the others do."""
         n = len(self.layout)
-        same, told = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        same, driven = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for F in self.F:
             own = F.target == F.source
             same[F.target[own & (F.values == np.eye(*F.values.shape[1:])).all(axis=(1, 2))]] = True
-            told[F.target[~own & F.values.any(axis=(1, 2))]] = True
+            driven[F.target[~own & F.values.any(axis=(1, 2))]] = True
         for Q in self.Q:
-            told[Q.target[Q.values.any(axis=(1, 2))]] = True
-        told[np.repeat(np.arange(n), self.layout.dims)[self.b != 0]] = True
-        return same & ~told
+            driven[Q.target[Q.values.any(axis=(1, 2))]] = True
+        driven[np.repeat(np.arange(n), self.layout.dims)[self.b != 0]] = True
+        return same & ~driven
 
     def joined(self, partition: Partition) -> Partition:
         """The components that a prediction leaves of those of `partition`."""
@@ -214,7 +214,7 @@ def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
 
 @dataclass(frozen=True, eq=False)
 class PredictionSummary:
-    """Where a prediction will lie and how large it will be, known before it is made.
+    """Mean, scale and noise of a prediction, without its covariance.
 
     components  what will be correlated
     mean        (D,), exact

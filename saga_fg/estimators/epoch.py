@@ -37,12 +37,12 @@ class Epoch:
     time: float
     births: tuple[Birth, ...] = ()
     measurements: tuple[RecordedMeasurements, ...] = ()
-    gone: tuple[int, ...] = ()
+    leaving: tuple[int, ...] = ()
     interval: IntervalDynamics | ZeroInterval | None = None
 
     @property
     def linear(self) -> bool:
-        """True where linearising it again elsewhere gives the same."""
+        """True where linearising it again elsewhere changes nothing."""
         return (self.interval is None or self.interval.linear) and all(
             recorded.linear for recorded in self.measurements
         )
@@ -91,15 +91,15 @@ class FilterStep:
             self, filtered=x, gains=(*self.gains, *gains), log_likelihood=self.log_likelihood + log_likelihood
         )
 
-    def staying(self, gone: Sequence[int]) -> BlockGaussian:
+    def staying(self, leaving: Sequence[int]) -> BlockGaussian:
         """The posterior of the nodes that stay."""
-        return self.filtered.without(self.layout.rows(gone))
+        return self.filtered.without(self.layout.rows(leaving))
 
     def to_next(
-        self, gone: Sequence[int], interval: IntervalDynamics | ZeroInterval, mean: FloatArray | None = None
+        self, leaving: Sequence[int], interval: IntervalDynamics | ZeroInterval, mean: FloatArray | None = None
     ) -> tuple[FilterStep, BlockGaussian]:
         """Set the dynamics to the next epoch, linearised at the joint state `mean`; returns also the prior there."""
-        x = self.staying(gone)
+        x = self.staying(leaving)
         at = x.mean
         if mean is not None:
             at = mean if len(mean) == len(at) else mean[self.layout.places(self.layout.rows(x.layout.nodes))]
@@ -114,8 +114,8 @@ def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequen
         mean = np.concatenate([mean, *(birth.means.ravel() for birth in epoch.births)])
         means.append(mean)
         if epoch.interval is not None:
-            gone = layout.rows(epoch.gone)
-            stay = layout.without(gone) if len(gone) else layout
+            leaving = layout.rows(epoch.leaving)
+            stay = layout.without(leaving) if len(leaving) else layout
             before = mean[layout.places(layout.rows(stay.nodes))]
             dynamics = epoch.interval.linearised(stay, before)
             mean = dynamics.moved(before) + dynamics.b
@@ -138,6 +138,6 @@ def filter_epochs(prior: BlockGaussian, epochs: list[Epoch], means: list[FloatAr
         for recorded in epoch.measurements:
             step = step.updated(recorded, mean)
         if epoch.interval is not None:
-            step, prior = step.to_next(epoch.gone, epoch.interval, mean)
+            step, prior = step.to_next(epoch.leaving, epoch.interval, mean)
         steps.append(step)
     return steps

@@ -153,7 +153,7 @@ def _factor(rows: ActiveRows) -> ResidualFactors | ResidualFactor | None:
 
 
 def _with(rows: ActiveRows, loss: GraduatedNonConvexity | None) -> ActiveRows:
-    """The same factors under another loss."""
+    """Replace the loss of factors."""
     if isinstance(rows.group, StackedGroup):
         return replace(rows, group=replace(rows.group, factors=replace(rows.group.factors, robust=loss)))
     assert isinstance(rows.group, SingleGroup)
@@ -162,7 +162,7 @@ def _with(rows: ActiveRows, loss: GraduatedNonConvexity | None) -> ActiveRows:
 
 
 def _distances(rows: ActiveRows, values: gtsam.Values) -> FloatArray:
-    """Of the residuals (n,), standard deviations: without a loss the cost is s^2 / 2."""
+    """Distances (n,) of the residuals, standard deviations: without a loss the cost is s^2 / 2."""
     plain = _with(rows, None)
     if isinstance(plain.group, StackedGroup):
         return np.sqrt(2 * plain.group.factors.errors(values, rows.chosen))

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, predictors
@@ -78,7 +78,7 @@ class GraphFilter(LatestMarginals):
         return self._smoother.time
 
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
-        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
         self._smoother.origin, self._smoother.frame = origin, frame
         graph = self._smoother.graph()
         if graph.epoch == 0 and not graph.variables:
@@ -115,7 +115,7 @@ class GraphFilter(LatestMarginals):
         smoother = self._changed()
         keys = {node: node_key(node, smoother.graph().epoch) for node in added.tolist()}
         back = [key for key in keys.values() if key in smoother.graph().variables]
-        if back:  # gone and back at the same epoch: iSAM2 has to forget them first
+        if back:  # removed and added at the same epoch: iSAM2 has to forget them first
             smoother.marginalise(back)
             smoother.extend([])
         smoother.extend([Births(added, mean, covariance, labels or {})])
@@ -157,7 +157,7 @@ class GraphFilter(LatestMarginals):
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
-        """Nodes that disappear have no state at the next epoch; what they told of their neighbours stays."""
+        """Nodes that disappear have no state at the next epoch; their information on their neighbours stays."""
         self._layout = self._layout.without(self._layout.rows(nodes))
         self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
         self._posterior = None
@@ -192,7 +192,7 @@ class GraphFilter(LatestMarginals):
     def _in_moments(
         self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
     ) -> Callable[[SceneFactorGraph], None]:
-        """What is to be done to the graph to move the components of the `chosen` nodes (n,) by covariances."""
+        """Return the change of the graph that predicts the components of the `chosen` nodes (n,) by covariances."""
         every = self._smoother.graph().variables
         auxiliary = {key: key for key, one in every.items() if one.epoch is None or key in self._auxiliary}
         x = self._joint(auxiliary)
@@ -218,7 +218,7 @@ class GraphFilter(LatestMarginals):
 
 
 def _with_noise(transition: Transition, rows: BoolArray) -> Transition:
-    """The same with noise of variance 1 for some nodes (n,), so that there are factors of it, which are not used."""
+    """Give some nodes (n,) noise of variance 1, so that their factors, which are not used, can be made."""
     Q = [
         replace(group, values=np.where(rows[group.target][:, None, None], np.eye(group.values.shape[1]), group.values))
         for group in transition.Q

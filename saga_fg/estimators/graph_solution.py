@@ -53,7 +53,7 @@ class GraphSolution:
 
     @property
     def step(self) -> gtsam.VectorValues:
-        """What is left to go from where the factors are linearised. Raises `SingularSystemError`."""
+        """Step from the linearisation point to the minimum. Raises `SingularSystemError`."""
         step = self._eliminated[0].optimize()
         if not np.isfinite(step.norm()):
             raise singular_system(self._linear)

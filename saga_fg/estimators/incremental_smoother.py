@@ -8,7 +8,7 @@ anew, families in NumPy all at once, and exchanged: the old ones out, the new on
 settle, as after a poor start, Levenberg-Marquardt solves the whole graph, and iSAM2 begins anew from there.
 
 Epochs older than `lag` are marginalised: their factors go out, the prior that they leave on their neighbours comes in,
-and iSAM2 drops the variables that nothing speaks of. Between the two they need not be leaves of the Bayes tree, which
+and iSAM2 drops the variables without factors. Between the two they need not be leaves of the Bayes tree, which
 GTSAM's `marginalizeLeaves` asks for, and the prior is a factor of the graph like any other.
 """
 
@@ -73,7 +73,7 @@ class IncrementalSmoother:
     def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
         """Begin the epoch at `time`, s, ask the providers, by default those of the smoother, and solve.
 
-        frame: what they are told of the epoch
+        frame: the input of the epoch
         """
         unchanged, times, asked = self._graph, self._times, self.providers if providers is None else providers
         self.frame = frame
@@ -94,7 +94,7 @@ class IncrementalSmoother:
         carried_over: Iterable[int] = (),
         change: Callable[[SceneFactorGraph], None] | None = None,
     ) -> None:
-        """The same, but keep all that is older than the lag.
+        """Begin an epoch as `step`, but keep all that is older than the lag.
 
         carried_over: variables that are those of the new epoch, too; change: of the graph, after the first provider
         """
@@ -130,7 +130,7 @@ class IncrementalSmoother:
         self._graph = graph
 
     def state(self, key: int) -> object:
-        """Where a variable is: a vector, or a pose."""
+        """Value of a variable: a vector, or a pose."""
         return self._graph.state(key)
 
     def covariance(self, key: int) -> FloatArray:
@@ -171,7 +171,7 @@ class IncrementalSmoother:
         return self._graph.copy()
 
     def restore(self, graph: SceneFactorGraph) -> None:
-        """Continue from a snapshot; iSAM2 is built anew."""
+        """Continue from a snapshot; iSAM2 is built restarted."""
         if not isinstance(graph, SceneFactorGraph):
             raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
         self._graph, self._engine = graph.copy(), None

@@ -47,7 +47,7 @@ class IntervalDynamics:
 
     @property
     def linear(self) -> bool:
-        """Whether linearising it again elsewhere gives the same."""
+        """True where linearising it again elsewhere changes nothing."""
         return not self.nonlinear
 
     @cached_property
@@ -56,7 +56,7 @@ class IntervalDynamics:
         return nonlinear_dynamics(self.transition)
 
     def nonlinear_rows(self, layout: Layout) -> list[tuple[NonlinearDynamics, IntArray]]:
-        """The same with their rows (n, 1 + k) of `layout`."""
+        """Nonlinear dynamics with their rows (n, 1 + k) of `layout`."""
         place = layout.rows(self.transition.nodes)
         return [(group, place[group.rows]) for group in self.nonlinear]
 

@@ -8,7 +8,7 @@ of a frame do not grow. Means and covariances are read from the Bayes tree. The 
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of
 variance P costs Cholesky elimination log10(P/Q) digits, QR half as many. So small components are eliminated by QR,
 large ones by Cholesky while that leaves enough digits, and an interval that would leave fewer (Q singular, or many
-million times smaller than P) is predicted by covariances, P <- F P F^T + Q, after which iSAM2 begins anew.
+million times smaller than P) is predicted by covariances, P <- F P F^T + Q, after which iSAM2 begins restarted.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
-from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
+from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -99,7 +99,7 @@ class IncrementalFilter(LatestMarginals):
         added = live.nodes[len(state.live) :]
         if len(added) == 0:
             return
-        if np.isin(added, state.newest.gone).any():  # gone and back at the same time
+        if np.isin(added, state.newest.leaving).any():  # removed and added at the same time
             state = _moved(state, ZeroInterval())
         state, x = _solved(state)
         x = x.extended(x.layout.extended(added, mean.shape[1]), mean, covariance)
@@ -125,14 +125,14 @@ class IncrementalFilter(LatestMarginals):
         if state.x is None:
             assert state.tree is not None
             prior_mean = state.tree.variables.origin
-            seen = recorded.linearised(state.tree.components.layout, prior_mean)
-            white = whitened(seen)
+            linear = recorded.linearised(state.tree.components.layout, prior_mean)
+            white = whitened(linear)
             self._state, x = _solved(replace(state, tree=state.tree.with_measurements(white), epochs=epochs))
             return posterior_likelihood(x, prior_mean, *white)
-        seen = recorded.linearised(state.x.layout, state.x.mean)
-        likelihood = innovation_likelihood(state.x, *seen)
+        linear = recorded.linearised(state.x.layout, state.x.mean)
+        likelihood = innovation_likelihood(state.x, *linear)
         tree = _begun(state.x, _largest(state.x.partition) <= _SMALL) if state.tree is None else state.tree
-        tree = None if tree is None else tree.with_measurements(whitened(seen))
+        tree = None if tree is None else tree.with_measurements(whitened(linear))
         self._state, _ = _solved(replace(state, tree=tree, x=None, epochs=epochs))
         return likelihood
 
@@ -141,9 +141,9 @@ class IncrementalFilter(LatestMarginals):
         rows = state.live.rows(nodes)
         if len(set(rows.tolist())) < len(rows):
             raise InputError("nodes: expected each node once")
-        gone = (*state.newest.gone, *state.live.nodes[rows].tolist())
+        leaving = (*state.newest.leaving, *state.live.nodes[rows].tolist())
         self._state = replace(
-            state, live=state.live.without(rows), epochs=state.with_newest(replace(state.newest, gone=gone))
+            state, live=state.live.without(rows), epochs=state.with_newest(replace(state.newest, leaving=leaving))
         )
 
     def posterior(self) -> BlockGaussian:
@@ -162,8 +162,8 @@ class IncrementalFilter(LatestMarginals):
     def snapshot(self) -> IncrementalState:
         """The whole state as a value. The filter itself restarts from it, so that both go on to the same bits."""
         self._state, x = _solved(self._state)
-        gone = x.layout.rows(self._state.newest.gone)
-        state = IncrementalState(x.without(gone), self.time)
+        leaving = x.layout.rows(self._state.newest.leaving)
+        state = IncrementalState(x.without(leaving), self.time)
         self.restore(state)
         return state
 
@@ -202,7 +202,7 @@ def _begun(x: BlockGaussian, small: bool) -> BayesTree | None:
 def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
     """Move over an interval: by interaction factors, or by covariances for components whose digits these would lose."""
     state, x = _solved(state)
-    stay = x.without(x.layout.rows(state.newest.gone))
+    stay = x.without(x.layout.rows(state.newest.leaving))
     dynamics = interval.linearised(stay.layout, stay.mean)
     apart = dynamics.separated(stay)
     prediction = PredictionSummary.of(apart, dynamics)
@@ -222,7 +222,7 @@ def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
         if tree is None:
             predicted = predict(apart, dynamics)
     then, now = state.newest.time, state.newest.time + interval.dt
-    epochs = (Epoch(then, gone=state.newest.gone, interval=interval), Epoch(now))
+    epochs = (Epoch(then, leaving=state.newest.leaving, interval=interval), Epoch(now))
     return _State(apart.layout, tree, predicted if tree is None else None, x, epochs)
 
 

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RelinearisationSettings(Settings):
-    """When factors are linearised anew."""
+    """When factors are linearised restarted."""
 
     threshold: Positive = setting(
         0.001, "linearise factors anew when a variable has moved by this many of its standard deviations"
@@ -74,12 +74,12 @@ class Engine:
         except GraphError as error:  # where it got to a factor may not be defined
             log.info("at %.3f s: %s", graph.time, error)
         graph.moved_to(start)
-        anew = Engine(graph.elimination)
-        anew.converged = graph.solve(SolverSettings(tolerance=settings.threshold / 10)).converged
-        if not anew.converged:
+        restarted = Engine(graph.elimination)
+        restarted.converged = graph.solve(SolverSettings(tolerance=settings.threshold / 10)).converged
+        if not restarted.converged:
             log.warning("at %.3f s the graph has not settled: its factors may contradict each other", graph.time)
-        anew._synchronised(graph)
-        return anew
+        restarted._synchronised(graph)
+        return restarted
 
     def root(self, key: int, rough: bool = False) -> FloatArray:
         """R (d, d) of a variable's marginal, P = R^-1 R^-T, on increments from the base; rough: to half the digits."""
@@ -111,7 +111,7 @@ class Engine:
 
     def _synchronised(self, graph: SceneFactorGraph) -> bool:
         """Tell iSAM2 what has changed in the graph, and move it to the solution; whether any factor is nonlinear."""
-        gone = [key for key in self.points.keys if key not in graph.variables]
+        leaving = [key for key in self.points.keys if key not in graph.variables]
         new = {key: one.dim for key, one in graph.variables.items() if key not in self.points}
         removed = self._remove_factors(graph)
         rows: list[tuple[int, IntArray]] = []
@@ -126,7 +126,7 @@ class Engine:
                 nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
         if alone := graph.without_factors():
             raise graph.undetermined(SingularSystemError("", tuple(alone)))
-        self.points.remove(gone)
+        self.points.remove(leaving)
         self.points.add(new)
         self._update(graph, linear, rows, removed, new)
         self._update_sigmas(graph, nonlinear)
@@ -210,8 +210,8 @@ class Engine:
         parameters.constrainedKeys = last
         try:
             # without a linearisation point: increments are those that iSAM2 counts, from the base
-            told = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
-            result = self.isam.update(told, values, parameters)
+            added = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
+            result = self.isam.update(added, values, parameters)
             estimate, length = self.isam.calculateEstimate(), self.isam.getDelta().norm()
         except RuntimeError as error:
             raise self._undetermined(graph, error) from error

@@ -39,10 +39,10 @@ def joint_gaussian(
     Nodes with their states, other variables with increments from their base; linear: all factors of the graph.
     """
     factors = [linear.at(k) for k in range(linear.size())]
-    spoken = [factor.keys() for factor in factors]
-    label = components(spoken)
+    involved = [factor.keys() for factor in factors]
+    label = components(involved)
     parts = {label[key]: gtsam.GaussianFactorGraph() for key in keys}
-    for factor, its in zip(factors, spoken, strict=True):
+    for factor, its in zip(factors, involved, strict=True):
         if (part := parts.get(label[its[0]])) is not None:
             part.push_back(factor)
     number, own = np.unique([label[key] for key in keys], return_inverse=True)
@@ -115,7 +115,7 @@ def replace_by_prior(
         rows = np.flatnonzero(x.partition.label == number)
         keys = [now[ids[row]] for row in rows.tolist()]
         old = {label.get(earlier[ids[row]]) for row in rows.tolist()}
-        gone = [key for key, part in label.items() if part in old and key not in keys]
+        leaving = [key for key, part in label.items() if part in old and key not in keys]
         mean = np.split(x.mean[x.layout.places(rows)], np.cumsum(x.layout.dims[rows])[:-1])
         base = graph.base
         increments = [m if key in ids else m - base.atVector(key) for key, m in zip(keys, mean, strict=True)]
@@ -123,4 +123,4 @@ def replace_by_prior(
             prior = joint_prior_factor(keys, increments, x.joint(rows))
         except FactorError as error:
             raise InputError(f"transition: {graph.with_names(str(error), keys)}") from error
-        graph.replace_by_prior(gone, prior)
+        graph.replace_by_prior(leaving, prior)

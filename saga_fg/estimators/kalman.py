@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
-from saga_fg.estimators.factor_graph import prior_graph
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -78,7 +78,7 @@ class JointKalmanFilter(LatestMarginals):
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
 
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
-        """What providers are told from now on; origin (2,): of the states' positions in the world, m."""
+        """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
         self._frame, self._origin = frame, origin
 
     def ask_providers(self) -> None:
@@ -118,8 +118,8 @@ class JointKalmanFilter(LatestMarginals):
     def marginalise(self, nodes: ArrayLike) -> None:
         self._state = self._state.without(self._state.layout.rows(nodes))
         if self.providers:
-            gone = set(np.asarray(nodes).tolist())
-            labels = {node: label for node, label in self._auxiliary.labels.items() if node not in gone}
+            leaving = set(np.asarray(nodes).tolist())
+            labels = {node: label for node, label in self._auxiliary.labels.items() if node not in leaving}
             self._auxiliary = replace(self._auxiliary, labels=labels)
 
     def posterior(self) -> BlockGaussian:

@@ -49,7 +49,7 @@ Linear = tuple[list[int], FloatArray]  # keys and [A | b]
 
 @dataclass(frozen=True, eq=False)
 class AuxiliaryVariables:
-    """What a filter holds of the running graph beside its joint state.
+    """The part of the running graph that a filter keeps beside its joint state.
 
     graph    variables without factors: those beside the nodes, and the nodes as they were when last asked
     labels   of nodes, by id
@@ -59,13 +59,13 @@ class AuxiliaryVariables:
     labels: Mapping[int, str] = field(default_factory=dict)
 
     def rows(self, layout: Layout) -> IntArray:
-        """Of the variables beside the nodes, in the joint state."""
+        """Rows of the auxiliary variables in the joint state."""
         known = self.graph.variables
         every = enumerate(layout.nodes.tolist()) if known else ()
         return np.array([row for row, node in every if node in known], dtype=np.int64)
 
     def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
-        """Those of a transition over the nodes; the variables beside them stay as they are."""
+        """Dynamics of a transition over the nodes; the auxiliary variables stay as they are."""
         interval, others = IntervalDynamics(transition), self.rows(x.layout)
         if len(others) == 0:
             return interval.linearised(x.layout, x.mean)
@@ -123,15 +123,15 @@ def asked(
         bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
         x, factors = _born(graph, x, ids, new, factors)
         ids |= {key: key for key in new}
-    increment, others, told = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout)), []
+    increment, others, measured = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout)), []
     increment[others] = x.mean[others]
     for keys, A in factors:
         rows = x.layout.rows([ids[key] for key in keys])
-        told.append(WhitenedFactor(rows, A[:, :-1], A[:, -1] - A[:, :-1] @ increment[x.layout.places(rows)]))
-    x = correct_whitened(x, told)
-    gone = [key for key, one in bare.variables.items() if last and one.epoch not in (None, bare.epoch)]
-    bare.marginalise(gone)
-    x = x.without(x.layout.rows([key for key in gone if key in ids]))
+        measured.append(WhitenedFactor(rows, A[:, :-1], A[:, -1] - A[:, :-1] @ increment[x.layout.places(rows)]))
+    x = correct_whitened(x, measured)
+    leaving = [key for key, one in bare.variables.items() if last and one.epoch not in (None, bare.epoch)]
+    bare.marginalise(leaving)
+    x = x.without(x.layout.rows([key for key in leaving if key in ids]))
     _move(bare, x, ids)
     return x, AuxiliaryVariables(bare, auxiliary.labels)
 
@@ -185,12 +185,12 @@ def _born(
     triangle = np.zeros((width, width + 1))
     upper = np.linalg.qr(A, mode="r")[:width]
     triangle[: len(upper)] = upper
-    R, told = triangle[:size, :size], triangle[size:, size:]
+    R, rest = triangle[:size, :size], triangle[size:, size:]
     lost = np.abs(np.diagonal(R)) <= _UNDETERMINED * np.linalg.norm(A[:, :size], axis=0)
     if lost.any():
         raise graph.undetermined(SingularSystemError("", tuple(key for key in new if lost[span[key]].any())))
     if others:
-        left.append((others, told))
+        left.append((others, rest))
     solved = np.linalg.solve(R, np.column_stack([triangle[:size, size:], np.eye(size)]))
     T, c, root = np.split(solved, [width - size, width - size + 1], axis=1)
     layout, rows = x.layout.extended([_TOGETHER], size), np.arange(len(x.layout))

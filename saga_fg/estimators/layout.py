@@ -1,4 +1,4 @@
-"""Where each node's state sits in a joint state vector."""
+"""Layout of a joint state vector: the place of each node's state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""What was measured of some nodes at one time, in the form that an estimator can linearise, and linearise again.
+r"""Measurements of some nodes at one time, in a form that an estimator can linearise, and linearise again.
 
     z = h(x_node) + v,   v ~ N(0, R)        h(x) = H x for `Measurements`, any measurement model for `Observations`
 
@@ -58,7 +58,7 @@ class LinearisedMeasurements(NamedTuple):
 
 
 class WhitenedMeasurements(NamedTuple):
-    """The same in units of its noise, R = 1; log_det: the sum of the logarithms of the determinants of R."""
+    """Measurements in units of their noise, R = 1; log_det: the sum of the logarithms of the determinants of R."""
 
     rows: IntArray
     z: FloatArray
@@ -66,12 +66,12 @@ class WhitenedMeasurements(NamedTuple):
     log_det: float
 
 
-def whitened(seen: LinearisedMeasurements) -> WhitenedMeasurements:
+def whitened(linear: LinearisedMeasurements) -> WhitenedMeasurements:
     """W z and W H, W R W^T = 1."""
-    L = np.linalg.cholesky(seen.R)
-    white = np.linalg.solve(L, np.concatenate([seen.H, seen.z[:, :, None]], axis=2))
+    L = np.linalg.cholesky(linear.R)
+    white = np.linalg.solve(L, np.concatenate([linear.H, linear.z[:, :, None]], axis=2))
     log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-    return WhitenedMeasurements(seen.rows, white[:, :, -1], white[:, :, :-1], log_det)
+    return WhitenedMeasurements(linear.rows, white[:, :, -1], white[:, :, :-1], log_det)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class RecordedMeasurements:
 
     @property
     def linear(self) -> bool:
-        """Whether linearising it again elsewhere gives the same."""
+        """True where linearising it again elsewhere changes nothing."""
         return isinstance(self.measured, Measurements) and self.loss is None
 
     @property
@@ -139,7 +139,7 @@ class RecordedMeasurements:
         return np.ones(len(self.measured)) if self.loss is None else self.loss.weight(self.distances(layout, mean))
 
     def with_weights(self, weights: FloatArray) -> RecordedMeasurements:
-        """The same with fixed weights."""
+        """Fix the weights."""
         return replace(self, weights=weights)
 
     def _residual(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Components of the joint state: sets of nodes that are correlated among themselves and with nobody else.
+"""Components of the joint state: sets of nodes that are correlated among themselves and with no others.
 
     P = blockdiag( P_1, ..., P_C )       one dense block a component
 
@@ -160,7 +160,7 @@ class Partition:
         return Partition(layout, np.concatenate([self.label, self.count + np.arange(len(layout) - len(self.layout))]))
 
     def restricted(self, layout: Layout, rows: IntArray) -> Partition:
-        """Of the nodes at `rows` alone, which are those of `layout`."""
+        """Partition of the nodes at `rows` alone, which are those of `layout`."""
         return Partition(layout, _without_gaps(self.label[rows]))
 
 

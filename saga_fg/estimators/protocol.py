@@ -1,7 +1,7 @@
 """The role of an estimator: hold the joint state of all nodes, move it by a transition, correct it by measurements.
 
     predict   x <- F x + b + q,  q ~ N(0, Q)          the graph's dynamics over an interval
-    update    z = H x_node + v,  v ~ N(0, R)           what a sensor says of some nodes
+    update    z = H x_node + v,  v ~ N(0, R)           measurements of some nodes
 
 Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md for the figures).
 """
@@ -92,7 +92,7 @@ class Estimator(Protocol):
         ...
 
     def marginalise(self, nodes: ArrayLike) -> None:
-        """Nodes that disappear: integrated out, so that what they told of their neighbours stays."""
+        """Nodes that disappear: integrated out, so that their information on their neighbours stays."""
         ...
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
@@ -152,6 +152,6 @@ class LatestMarginals:
 
 
 def live_rows(x: BlockGaussian, live: Layout, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
-    """A Gaussian that may have nodes which have gone since, and which of its rows are `nodes`."""
+    """A Gaussian that may have nodes that have left since, and which of its rows are `nodes`."""
     rows = live.rows(nodes)
     return x, rows if len(live) == len(x.layout) else x.layout.rows(live.nodes[rows])

@@ -25,10 +25,10 @@ from saga_fg.estimators.backward import (
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
-from saga_fg.estimators.factor_graph import recording_graph
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
+from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
@@ -104,12 +104,12 @@ class Recording:
 
     @property
     def time(self) -> float:
-        """Of the newest epoch, s."""
+        """Time of the newest epoch, s."""
         return self._epochs[-1].time
 
     @property
     def prior(self) -> BlockGaussian:
-        """What was known before the first epoch, of the nodes that were there already."""
+        """Gaussian before the first epoch, of the nodes of before."""
         return self._prior
 
     @property
@@ -118,12 +118,12 @@ class Recording:
 
     @property
     def linear(self) -> bool:
-        """Whether nothing is nonlinear or robust."""
+        """True where nothing is nonlinear or robust."""
         return not self._nonlinear
 
     @property
     def layouts(self) -> Sequence[Layout]:
-        """Of each epoch: all its nodes, those that go afterwards too."""
+        """Layout of each epoch's nodes, with those that leave afterwards."""
         return self._layouts
 
     @property
@@ -136,8 +136,8 @@ class Recording:
     def layout(self) -> Layout:
         """The nodes that are there now."""
         if self._layout is None:
-            gone = self._layouts[-1].rows(self._epochs[-1].gone)
-            self._layout = self._layouts[-1].without(gone) if len(gone) else self._layouts[-1]
+            leaving = self._layouts[-1].rows(self._epochs[-1].leaving)
+            self._layout = self._layouts[-1].without(leaving) if len(leaving) else self._layouts[-1]
         return self._layout
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
@@ -145,7 +145,7 @@ class Recording:
         added = self.layout.extended(nodes, mean.shape[1]).nodes[len(self.layout) :]
         if len(added) == 0:
             return
-        if np.isin(added, self._epochs[-1].gone).any():  # gone and back at the same time: another epoch
+        if np.isin(added, self._epochs[-1].leaving).any():  # removed and added at the same time: another epoch
             self._begin_epoch(ZeroInterval())
         birth, epoch = Birth(added, mean, covariance), self._epochs[-1]
         if len(self._steps) == len(self._epochs):
@@ -194,18 +194,18 @@ class Recording:
         if len(set(rows.tolist())) < len(rows):
             raise InputError("nodes: expected each node once")
         epoch = self._epochs[-1]
-        self._epochs[-1] = replace(epoch, gone=(*epoch.gone, *self.layout.nodes[rows].tolist()))
+        self._epochs[-1] = replace(epoch, leaving=(*epoch.leaving, *self.layout.nodes[rows].tolist()))
         self._layout = None
 
     def drop_before(self, time: float) -> None:
-        """Drop the epochs before the last one that is not after `time`; what they told becomes the prior."""
+        """Drop the epochs before the last one that is not after `time`; their posterior becomes the prior."""
         k = 0
         while k + 1 < len(self._epochs) and self._epochs[k + 1].time <= time + _SAME_TIME:
             k += 1
         self.drop(k)
 
     def drop(self, k: int) -> None:
-        """Drop the first k epochs; what they told becomes the prior."""
+        """Drop the first k epochs; their posterior becomes the prior."""
         if k == 0:
             return
         self.solve()
@@ -222,7 +222,7 @@ class Recording:
         return self._steps[-1].filtered
 
     def means(self) -> list[FloatArray]:
-        """Smoothed joint mean of every epoch, over all its nodes (those that go afterwards, too)."""
+        """Smoothed joint mean of every epoch, over all its nodes (with those that leave afterwards)."""
         self.solve()
         if self._means is None:
             self._means = smoothed_means(self._steps)
@@ -289,7 +289,7 @@ class Recording:
             self.solve()
         if not (self._lazy and interval.linear):
             known = _completed(self._steps, self._prior, self._epochs)
-            step, prior = known[-1].to_next(epoch.gone, interval)
+            step, prior = known[-1].to_next(epoch.leaving, interval)
             steps = [*known[:-1], step, initial_step(prior)]
         self._epochs = [*self._epochs[:-1], replace(epoch, interval=interval), Epoch(epoch.time + interval.dt)]
         self._layouts, self._steps = [*self._layouts, layout], steps
@@ -314,10 +314,10 @@ class Recording:
         interval = epochs[k].interval
         assert isinstance(interval, IntervalDynamics)  # a zero interval has no inside
         start, rest = interval.split(time - epochs[k].time)
-        gone = layouts[k].rows(epochs[k].gone)
+        leaving = layouts[k].rows(epochs[k].leaving)
         epochs[k] = replace(epochs[k], interval=start)
         epochs.insert(k + 1, Epoch(time, interval=rest))
-        layouts.insert(k + 1, layouts[k].without(gone) if len(gone) else layouts[k])
+        layouts.insert(k + 1, layouts[k].without(leaving) if len(leaving) else layouts[k])
         return k + 1, epochs, layouts
 
     def _changed(self) -> None:
@@ -334,5 +334,5 @@ def _completed(steps: list[FilterStep], prior: BlockGaussian, epochs: list[Epoch
     if k > 0:
         interval = epochs[k - 1].interval
         assert interval is not None
-        done[-1], prior = done[-1].to_next(epochs[k - 1].gone, interval)
+        done[-1], prior = done[-1].to_next(epochs[k - 1].leaving, interval)
     return done + filter_epochs(prior, epochs[k:])

@@ -29,10 +29,10 @@ from factors import Linearisable, linearised, nonlinear_graph
 from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.factor_graph import recording_factors
 from saga_fg.estimators.graph_solution import NoSolution, tree_covariances
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.object_factors import recording_factors
 from saga_fg.estimators.recording import Recording
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -79,7 +79,7 @@ class SparseSolution:
         return SparseSolution(solved, keys, dims, tree)
 
     def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
-        """Of all single states, by epoch."""
+        """Marginals of all nodes, by epoch."""
         if self.known is None:
             self.known = marginal_covariances(tree_covariances(self.tree, self.dims), self.keys, layouts)
         return self.known
@@ -121,7 +121,7 @@ def solved_tree(
 
 
 def _mixed(values: gtsam.Values, step: gtsam.VectorValues, accelerated: AndersonAcceleration) -> gtsam.Values:
-    """Where to linearise next."""
+    """Next linearisation point."""
     keys = list(values.keys())
     sizes = [len(values.atVector(key)) for key in keys]
     x = np.concatenate([values.atVector(key) for key in keys])
@@ -135,7 +135,7 @@ def _mixed(values: gtsam.Values, step: gtsam.VectorValues, accelerated: Anderson
 def marginal_covariances(
     blocks: Mapping[int, FloatArray], keys: Sequence[Mapping[int, int]], layouts: Sequence[Layout]
 ) -> list[MarginalCovariances]:
-    """The same by epoch; keys of each epoch's nodes."""
+    """Marginals by epoch, from blocks by key; keys: of each epoch's nodes."""
     epochs = []
     for own, layout in zip(keys, layouts, strict=True):
         by_size, place = {}, np.empty(len(layout), dtype=np.int64)
@@ -163,12 +163,12 @@ def cheapest_order(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> Order:
 
 
 def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> float:
-    """Of filter and smoother over components joined through all epochs."""
+    """Seconds of filter and smoother over components joined through all epochs."""
     nodes = np.unique(np.concatenate([layout.nodes for layout in layouts]))
     a, b = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     for epoch in epochs:
         if isinstance(epoch.interval, IntervalDynamics):
-            for target, source in _heard(epoch.interval):
+            for target, source in _acting_pairs(epoch.interval):
                 a.append(np.searchsorted(nodes, target))
                 b.append(np.searchsorted(nodes, source))
     i, j = np.concatenate(a), np.concatenate(b)
@@ -181,7 +181,7 @@ def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> floa
     return _SWEEP_CALLS * len(epochs) + work / _SWEEP_SPEED
 
 
-def _heard(interval: IntervalDynamics) -> list[tuple[IntArray, IntArray]]:
+def _acting_pairs(interval: IntervalDynamics) -> list[tuple[IntArray, IntArray]]:
     """Ids of nodes and of those they listen to."""
     nodes = interval.transition.nodes
     pairs = [(nodes[blocks.target], nodes[blocks.source]) for blocks in interval.transition.F]
@@ -191,7 +191,7 @@ def _heard(interval: IntervalDynamics) -> list[tuple[IntArray, IntArray]]:
 
 
 def sparse_ordering(factors: Sequence[Sequence[int]], order: Order) -> gtsam.Ordering:
-    """An ordering of all variables that factors, given by their keys, speak of."""
+    """An ordering of all variables that factors, given by their keys, are on."""
     if order == "colamd":
         return gtsam.Ordering.ColamdSymbolicFactorGraph(_symbolic(factors))
     tied = [keys for keys in factors if len(keys) > 1]
@@ -214,20 +214,20 @@ def _symbolic(factors: Sequence[Sequence[int]]) -> gtsam.SymbolicFactorGraph:
 
 
 def _structure(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> tuple[list[list[int]], IntArray]:
-    """Which states each interaction is about; keys count through the nodes of all epochs, whose sizes come with it."""
+    """Keys of the states of each interaction, counted through the nodes of all epochs; and their sizes."""
     first = np.concatenate([[0], np.cumsum([len(layout) for layout in layouts])]).tolist()
     factors: list[list[int]] = [[key] for key in range(first[1])]  # what was known before
     for k, epoch in enumerate(epochs[:-1]):
         here, there = layouts[k], layouts[k + 1]
-        gone = set(epoch.gone)
-        listens = {node: [first[k] + row] for row, node in enumerate(here.nodes.tolist()) if node not in gone}
+        leaving = set(epoch.leaving)
+        listens = {node: [first[k] + row] for row, node in enumerate(here.nodes.tolist()) if node not in leaving}
         if isinstance(epoch.interval, IntervalDynamics):
-            for targets, sources in _heard(epoch.interval):
+            for targets, sources in _acting_pairs(epoch.interval):
                 for target, source in zip(targets.tolist(), (first[k] + here.rows(sources)).tolist(), strict=True):
                     listens[target].append(source)
         rows = first[k + 1] + there.rows(list(listens))
-        for row, heard in zip(rows.tolist(), listens.values(), strict=True):
-            factors.append([row, *dict.fromkeys(heard)])
+        for row, acting in zip(rows.tolist(), listens.values(), strict=True):
+            factors.append([row, *dict.fromkeys(acting)])
     return factors, np.concatenate([layout.dims for layout in layouts])
 
 

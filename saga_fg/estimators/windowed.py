@@ -6,8 +6,8 @@ expected to move an epoch any more: with s the standard deviations of `saga_fg.e
 
     5 s <= tolerance        for every component of this epoch and of all before it.
 
-Such epochs are final. They are those of the batch smoother to the tolerance, without anybody guessing how long the
-memory of a graph is: an object in view settles in a second or two, a hidden one when it is seen again, or has gone.
+Such epochs are final. They are those of the batch smoother to the tolerance, whatever the
+memory of a graph is: an object in view settles in a second or two, a hidden one when it is seen again, or has left.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SURE = 5.0  # standard deviations
 
 @dataclass(frozen=True)
 class WindowSettings(Settings):
-    """How a window slides."""
+    """Settings of the sliding window."""
 
     step: Positive = setting(5.0, "s from one look at what has become final to the next")
     tolerance: Positive = setting(
@@ -78,7 +78,7 @@ class WindowedSmoother(RecordedSmoother):
         return epochs
 
     def _settled(self) -> int:
-        """How many epochs of the window are final."""
+        """Number of epochs of the window that are final."""
         settings, times = self._settings, np.array([epoch.time for epoch in self._recording.epochs])
         known = max(1, int(np.searchsorted(times, self.time - settings.late + 1e-9)))  # before it, all is measured
         influence = np.array([s.max(initial=0.0) for s in future_influence(self._recording.steps[:known])][::-1])

@@ -1,4 +1,4 @@
-"""What a running graph takes for a factor, checked before GTSAM's C++ sees it.
+"""Checks of the factors that a running graph takes, before GTSAM's C++ sees them.
 
 | given | becomes |
 |---|---|
@@ -122,7 +122,7 @@ def _check_variables(provider: str, group: FactorGroup, variables: Mapping[int, 
 
 
 def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) -> str:
-    """What does not fit together, "" if everything does."""
+    """Describe what does not fit together; "" if everything does."""
     types = [variable.type for variable in variables]
     total = sum(variable.dim for variable in variables)
     if isinstance(group, LinearGroup):
@@ -157,7 +157,7 @@ def _types(expected: Sequence[Any], got: Sequence[Any]) -> str:
 
 
 def _lengths(factor: gtsam.NonlinearFactor) -> int | None:
-    """How long the vectors of a factor must be that GTSAM does not check itself."""
+    """Length of the vectors of a factor that GTSAM does not check itself."""
     if isinstance(factor, gtsam.PriorFactorVector):
         return len(factor.prior())
     if isinstance(factor, gtsam.BetweenFactorVector):

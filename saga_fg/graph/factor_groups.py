@@ -79,7 +79,7 @@ class LinearGroup:
 
 @dataclass(frozen=True, eq=False)
 class PriorGroup:
-    """What is left of marginalised variables: linear factors on increments from the base."""
+    """Priors left by marginalised variables: linear factors on increments from the base."""
 
     factors: tuple[gtsam.JacobianFactor, ...]
     rows: Rows
@@ -90,7 +90,7 @@ class PriorGroup:
         return [self.factors[row] for row in chosen.tolist()]
 
     def here(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
-        """The same on increments from the point."""
+        """Factors on increments from the linearisation point."""
         result = []
         for row in chosen.tolist():
             keys, augmented = self.rows[row], np.array(self.factors[row].augmentedJacobian(), order="F")

@@ -1,4 +1,4 @@
-"""Where factors are linearised: the value of every variable, and its increment from the base.
+"""Linearisation points of factors: the value of every variable, and its increment from the base.
 
 A factor linearised at x says || J delta' + r || of the increment delta' from x. Counted from the base, with delta_0 the
 increment of x and D the derivative of `saga_fg.graph.variables`,

@@ -36,7 +36,7 @@ Factors = Sequence[Factor] | gtsam.NonlinearFactorGraph
 
 @dataclass(frozen=True, eq=False)
 class Additions:
-    """What a provider adds to the graph.
+    """Additions of a provider to the graph.
 
     variables   new ones, of this epoch or for all time
     factors     on variables of the graph, new ones among them
@@ -55,7 +55,7 @@ class FactorProvider(Protocol):
     def name(self) -> str: ...
 
     def factors(self, view: GraphView) -> Additions:
-        """What to add at this epoch."""
+        """Return the additions of this epoch."""
 
 
 class GraphView:
@@ -63,7 +63,7 @@ class GraphView:
 
     covariance(key): marginal (d, d), as known before this frame; origin (2,): that positions of objects are counted
     from, in the world, m (a tracker's is near its first frame, so that no digits are lost), places of the vehicle and
-    of landmarks as well; frame: what the epoch brings, None where nobody has text
+    of landmarks as well; frame: what the epoch brings, None where none was given
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class GraphView:
         return self._graph.carried_over.get(key, key)
 
     def state(self, key: int) -> Any:
-        """Where a variable is."""
+        """Value of a variable."""
         return self._graph.state(key)
 
     def covariance(self, key: int) -> FloatArray:
@@ -136,7 +136,7 @@ def _unknown(key: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Predictor:
-    """What a provider adds when an epoch begins, as a provider."""
+    """The `predict` of a provider, as a provider."""
 
     provider: Any
 
@@ -150,7 +150,7 @@ class _Predictor:
 
 
 def predictors(providers: Iterable[FactorProvider]) -> list[FactorProvider]:
-    """Those of some providers that add something when an epoch begins, to be asked for that."""
+    """Select the providers with a `predict`, which is called when an epoch begins."""
     return [_Predictor(provider) for provider in providers if callable(getattr(provider, "predict", None))]
 
 

@@ -3,7 +3,7 @@
     minimise over x   sum_i rho_i( || r_i(x) ||_{R_i} )
 
 Objects, the vehicle and landmarks are variables of one graph, interactions, measurements and priors its factors. What
-leaves is marginalised with all factors that speak of it, linearised where everything is then,
+leaves is marginalised with all factors on it, linearised where everything is then,
 
     phi(x_b) = max over x_a of prod phi(x_a, x_b)      a: what leaves, b: its neighbours that stay
 
@@ -83,7 +83,7 @@ class SceneFactorGraph:
         return gtsam.Values(self._base)
 
     def state(self, key: int) -> Any:
-        """Where a variable is: a vector, a pose, or what its type reads."""
+        """Value of a variable: a vector, a pose, or as its type reads it."""
         return self.variable(key).type.read(self._values, key)
 
     def variable(self, key: int) -> GraphVariable:
@@ -160,22 +160,22 @@ class SceneFactorGraph:
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Integrate variables out: they go, what they knew of the others stays."""
-        gone = {key: self.variable(key) for key in keys}
-        if not gone:
+        leaving = {key: self.variable(key) for key in keys}
+        if not leaving:
             return
-        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._rows_on(gone)
+        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._rows_on(leaving)
         for number, mine in rows.items():
             for factor in self.linearised(self._groups[number], np.array(mine), point):
                 touched.push_back(factor)
-        spoken = set(touched.keyVector())
-        factors = self._eliminated(touched, sorted(gone.keys() & spoken))
-        self._replace(rows, factors, gone)
+        involved = set(touched.keyVector())
+        factors = self._eliminated(touched, sorted(leaving.keys() & involved))
+        self._replace(rows, factors, leaving)
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))
 
-    def replace_by_prior(self, gone: Collection[int], prior: gtsam.JacobianFactor) -> None:
-        """Put a prior, on increments from the base, in the place of all factors on its variables and those `gone`."""
-        self._replace(self._rows_on({*gone, *prior.keys()}), [prior], gone)
+    def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
+        """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
+        self._replace(self._rows_on({*leaving, *prior.keys()}), [prior], leaving)
         self._choose(prior.cols() - 1)
 
     def _rows_on(self, keys: Collection[int]) -> dict[int, list[int]]:
@@ -190,9 +190,9 @@ class SceneFactorGraph:
         return result
 
     def _replace(
-        self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], gone: Iterable[int]
+        self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
     ) -> None:
-        """Take rows of groups out and put priors in, then take out the variables that nothing speaks of any more."""
+        """Take rows of groups out and put priors in, then take out the variables without any factor left."""
         for number, mine in rows.items():
             self._fresh.pop(number, None)
             active = self._groups[number].active.copy()
@@ -204,7 +204,7 @@ class SceneFactorGraph:
         if factors:
             prior = PriorGroup(tuple(factors), tuple(tuple(factor.keys()) for factor in factors))
             self._hold(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
-        for key in gone:
+        for key in leaving:
             del self._variables[key], self._touching[key], self._factor_counts[key]
             self._values.erase(key)
             self._base.erase(key)
@@ -228,7 +228,7 @@ class SceneFactorGraph:
         return [key for key, one in self._variables.items() if one.time is not None and one.time < time]
 
     def point(self) -> LinearisationPoint:
-        """Where everything is, to linearise factors at."""
+        """The present values as a linearisation point."""
         return LinearisationPoint(self._variables, self._base, self._values)
 
     def linearised(self, held: HeldGroup, rows: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
@@ -244,7 +244,7 @@ class SceneFactorGraph:
         self._fresh.clear()
 
     def linear(self, number: int, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
-        """What is there of a group, as linear factors on increments from the base."""
+        """Active factors of a group, linear, on increments from the base."""
         if number in self._fresh:
             return self._fresh[number]
         held = self._groups[number]
@@ -301,7 +301,7 @@ class SceneFactorGraph:
                 values.erase(key)
 
     def undetermined(self, error: Exception) -> GraphError:
-        """What a solver text, in the words of this graph."""
+        """The error of a solver, with the names of this graph's variables."""
         if not isinstance(error, SingularSystemError) or not error.keys:
             return GraphError(self.with_names(str(error), self._variables))
         names = [str(self._variables[key]) if key in self._variables else described(key) for key in error.keys[:8]]
@@ -322,7 +322,7 @@ class SceneFactorGraph:
         return text
 
     def _kinds_on(self, key: int) -> str:
-        """Which factors there are on a variable, in words."""
+        """Describe the factors on a variable."""
         counts: dict[str, int] = {}
         for number in self._touching[key]:
             held = self._groups[number]
@@ -353,7 +353,7 @@ class SceneFactorGraph:
                 self._factor_counts[key] += step
 
     def _eliminated(self, touched: gtsam.GaussianFactorGraph, keys: list[int]) -> list[gtsam.JacobianFactor]:
-        """What factors say of the variables that stay."""
+        """Factors that are left on the other variables."""
         if self.elimination == "cholesky":
             with contextlib.suppress(FactorError, RuntimeError):  # it has half the digits that QR has
                 return _jacobians(marginal_factors(touched, keys, "cholesky"))

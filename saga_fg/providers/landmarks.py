@@ -1,4 +1,4 @@
-"""What stands and is known by name: landmarks seen from the vehicle, each a variable for all time."""
+"""Landmarks with known identities, seen from the vehicle; each is a variable for all time."""
 
 from __future__ import annotations
 

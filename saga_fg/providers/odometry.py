@@ -56,17 +56,17 @@ class Odometry(Settings):
         return Additions()
 
     def _motion(self, view: GraphView, planar: bool) -> tuple[Pose, FloatArray]:
-        """Of this epoch, with the covariance of its tangent."""
+        """Motion of this epoch, with the covariance of its tangent."""
         ego = None if view.frame is None else view.frame.ego
         if ego is None or ego.odometry is None:
             standing: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
             return standing, self._covariance(self.unknown_speed * view.dt, self.unknown_turn * view.dt, planar)
-        said = ego.odometry
-        motion = _motion_of(said, planar)
-        covariance = said.covariance
+        reported = ego.odometry
+        motion = _motion_of(reported, planar)
+        covariance = reported.covariance
         if covariance is None:
-            covariance = self._covariance(self.place_drift, self.heading_drift, planar) * said.dt
-        share = view.dt / said.dt
+            covariance = self._covariance(self.place_drift, self.heading_drift, planar) * reported.dt
+        share = view.dt / reported.dt
         if abs(share - 1) <= _SAME:
             return motion, covariance
         still: Any = type(motion)()
@@ -77,9 +77,9 @@ class Odometry(Settings):
         return np.diag(np.square(sigmas))
 
 
-def _motion_of(said: OdometryIncrement, planar: bool) -> Pose:
+def _motion_of(reported: OdometryIncrement, planar: bool) -> Pose:
     wanted = 3 if planar else 4
-    if len(said.before_T_now) != wanted:
-        n = len(said.before_T_now)
+    if len(reported.before_T_now) != wanted:
+        n = len(reported.before_T_now)
         raise InputError(f"odometry: expected a {wanted} x {wanted} transform, as poses are, got {n} x {n}")
-    return pose("odometry", said.before_T_now)
+    return pose("odometry", reported.before_T_now)

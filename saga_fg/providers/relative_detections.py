@@ -1,4 +1,4 @@
-"""Objects seen from the vehicle: factors between its pose and their states (`factors.relative_detection`)."""
+"""Objects seen from the vehicle: factors between its pose and their states (`factors.relative`)."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from saga_fg.estimators import IncrementalSmoother
-from saga_fg.estimators.graph_providers import Births, DetectionFactors, Interactions
+from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
 from saga_fg.graph import OBJECT, key_of
 
 

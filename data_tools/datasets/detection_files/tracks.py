@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_file
+from data_tools.files.input_files import open_bytes
 from data_tools.files.located import located
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle
@@ -53,6 +55,16 @@ def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[A
                 known = {name: value for name, value in zip(columns, row, strict=True) if value is not None}
                 file.write(json.dumps(known, allow_nan=False) + "\n")
         file.detach()
+
+
+def merge_tables(path: Path, parts: Iterable[Path]) -> None:
+    """Write the rows of several CSV tables with the same columns into one. Raises `InputError` where that fails."""
+    with atomic_file(path) as file:
+        for number, part in enumerate(parts):
+            with open_bytes(part) as table:
+                header = table.readline()
+                file.write(b"" if number else header)
+                shutil.copyfileobj(table, file)
 
 
 def track_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:

@@ -12,15 +12,21 @@ https://github.com/crowdbotp/OpenTraj.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from data_tools.datasets.annotated import AnnotatedSource
+from data_tools.datasets.source import option
 from data_tools.files.located import located, unknown
+from data_tools.files.remote_files import local_tree
 from data_tools.files.text_tables import read_table
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.dataset import Annotations, Dataset, Scene
 
 FRAME_RATES = {"eth": 15.0, "hotel": 25.0}  # of the videos, 1/s
 _COLUMNS = ("frame", "person", "x", "z", "y", "vx", "vz", "vy")
@@ -69,3 +75,17 @@ class EthUcy:
                 truth.append(Annotations(person[rows].astype(np.str_), boxes.select(rows), np.ones(len(rows), bool)))
         poses = np.tile(np.eye(4), (len(frames), 1, 1))
         return Scene(name, frames / FRAME_RATES[name], poses, tuple(map(str, frames.tolist())), [], truth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EthUcySource(AnnotatedSource):
+    """ETH walking pedestrians: annotated positions on the ground plane, every 0.4 s."""
+
+    name = "eth_ucy"
+    example = "--dataroot data/eth_ucy --scenes hotel"
+    dataroot: str = option("Folder that holds eth/ and hotel/, or its URL.")
+
+    @contextmanager
+    def annotated(self) -> Iterator[Dataset]:
+        with local_tree(self.dataroot, ["*/obsmat.txt"]) as root:
+            yield EthUcy(root)

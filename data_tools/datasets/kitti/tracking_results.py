@@ -1,4 +1,4 @@
-"""Tracking results in KITTI's text format: a file `NNNN.txt` for each sequence, one box a line,
+"""Tracking results and labels in KITTI's text format: a file `NNNN.txt` for each sequence, one box a line,
 
     frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y score
 
@@ -28,6 +28,7 @@ from data_tools.kitti_objects import world_boxes_to_camera
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
 
@@ -60,6 +61,22 @@ def write_kitti_results(
                 yield scene, moments
 
         write_tracks(folder / TRACK_TABLE, written())
+
+
+def write_kitti_labels(
+    directory: str | Path, dataset: KittiTracking, scenes: Iterable[tuple[Scene, Sequence[Labels]]]
+) -> None:
+    """Write labels as text of ground truth, without scores, to directory/NNNN.txt; the files appear when all is done.
+
+    Boxes that do not show in the image are left out. Raises `InputError` for a directory that is not writable, a size
+    or heading that is unknown, a class KITTI does not have.
+    """
+    with atomic_directory(directory) as folder:
+        for scene, moments in scenes:
+            tracks = [moment.tracks for moment in moments]
+            with located(f"{directory}: sequence {scene.name}"):
+                text = kitti_result_text(scene, tracks, dataset.calibration(scene.name), with_score=False)
+            (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
 
 
 def kitti_result_text(

@@ -47,7 +47,7 @@ class NuScenes:
         scenes: Collection[str] | None = None,
         ground_truth: bool = False,
     ) -> None:
-        self._dataroot, self._version = dataroot, version
+        self.dataroot, self.version = dataroot, version
         self.folder = folder = table_folder(dataroot, version)
         tables = read_scenes(folder, scenes)
         self.records: dict[str, SceneRecord] = tables.records
@@ -80,12 +80,12 @@ class NuScenes:
 
     def split(self, name: str) -> tuple[str, ...]:
         """The scenes of a split that the tables hold (see `split_scenes`)."""
-        return split_scenes(self._dataroot, self._version, name)
+        return split_scenes(self.dataroot, self.version, name)
 
     def scene(self, name: str) -> Scene:
         """One of the chosen scenes; raises `InputError` for another name."""
         if name not in self.records:
-            raise InputError(f"{self._dataroot}: {unknown('scene', name, self.scenes)}")
+            raise InputError(f"{self.dataroot}: {unknown('scene', name, self.scenes)}")
         self._check_seen(name)
         record = self.records[name]
         frames = [
@@ -94,7 +94,7 @@ class NuScenes:
             for frame in self._frames(token, time, pose)
         ]
         truth: Sequence[Annotations] | None = None if self._annotations is None else self._annotations[name]
-        with located(str(self._dataroot)):
+        with located(str(self.dataroot)):
             return Scene(name, record.timestamps, record.world_T_ego, record.tokens, frames, truth)
 
     def _frames(self, token: str, time: float, world_T_ego: FloatArray) -> list[Frame]:

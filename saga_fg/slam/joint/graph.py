@@ -3,7 +3,7 @@
     prior        first pose; first errors; velocity of a new object
     odometry     poses and errors of two epochs            (`factors.odometry`)
     interaction  an object's next state and the states of all that act on it, from the scene graph
-    detection    a pose and an object's state              (`factors.relative_detection`), robust
+    detection    a pose and an object's state              (`factors.relative`), robust
     stationary   p' - p ~ N(0, standing_drift^2 dt / P),  v' ~ N(0, standing_speed^2 / P), robust
 
 The last one is the hybrid part of the model: with the probability P an object is stationary and a landmark, else it
@@ -31,9 +31,9 @@ from factors import (
     relative_detection_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators.factor_graph import interval_factors
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.object_factors import interval_factors
 from saga_fg.graph import EGO_ERROR, OBJECT, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.node import NodeType

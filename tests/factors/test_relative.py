@@ -1,10 +1,19 @@
-"""Range and bearing of objects from a planar pose."""
+"""Measurement models of places in the frame of a pose."""
 
 import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, PlanarPose, Vector, relative_range_bearing_factors
+from factors import (
+    Bearing,
+    FactorError,
+    PlanarPose,
+    Range,
+    Vector,
+    position,
+    relative_factors,
+    relative_range_bearing_factors,
+)
 from factors.differences import central_differences
 
 
@@ -38,5 +47,18 @@ def test_what_has_no_direction_is_refused():
     values = gtsam.Values()
     values.insert(0, gtsam.Pose2(1, 1, 0))
     values.insert(1, np.array([1.0, 1.0, 0.0, 0.0]))
-    with pytest.raises(FactorError, match="at the vehicle itself"):
+    with pytest.raises(FactorError, match="at the sensor itself"):
         relative_range_bearing_factors([[0, 1]], [[1.0, 0.1]], np.eye(2), 4).error(values)
+
+
+def test_any_model_is_seen_from_a_pose():
+    """Range and bearing alone cost what they cost together."""
+    values, R = gtsam.Values(), np.diag([0.3, 0.02]) ** 2
+    values.insert(0, gtsam.Pose2(1.0, 2.0, 0.5))
+    values.insert(1, np.array([4.0, 3.0, 0.0, 0.0]))
+    both = relative_range_bearing_factors([[0, 1]], [[3.0, 0.1]], R, 4).error(values)
+    range_ = relative_factors([[0, 1]], Range(2), [[3.0]], R[:1, :1], 4).error(values)
+    bearing = relative_factors([[0, 1]], Bearing(2), [[0.1]], R[1:, 1:], 4).error(values)
+    assert both == pytest.approx(range_ + bearing)
+    with pytest.raises(FactorError, match="in the plane or in space"):
+        relative_factors([[0, 1]], position(4), [[1.0, 2.0]], np.eye(2), 4)

@@ -1,18 +1,19 @@
-"""The factors of a recording, and the running graph that they make: the equivalent problem, for anybody's solver.
+"""Objects in the running graph: their factors, the providers of these, and the graph of a recording.
 
-    prior        one joint factor for each component of what was known before; one factor for each node that appears
-    interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}, one n-ary factor a node and interval
-    detection    one factor a measurement
+    prior        || x_i - m ||_P                             `Births`; one joint factor for a component at the start
+    interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}     `Interactions`, one n-ary factor a node and interval
+    detection    || z - H x_i ||_R                           `DetectionFactors`, one a measurement
 
-Every node has a variable of its own at every epoch, but for one that nothing moves or disturbs, such as a pole: it
-keeps the variable of the epoch before, since a direction without noise has no factor.
+In the graph of a recording every node has a variable of its own at every epoch, but for one that nothing moves or
+disturbs, such as a pole: it keeps the variable of the epoch before, since a direction without noise has no factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -32,13 +33,14 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import Layout
-from saga_fg.estimators.measurements import RecordedMeasurements
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
+from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import NewVariable
-from saga_fg.model.transition import Blocks
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.model.transition import Blocks, Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
 Factors = list[gtsam.JacobianFactor | ResidualFactors]
@@ -91,7 +93,6 @@ def recording_factors(
     moved: Factors = []
     for k, (epoch, layout) in enumerate(zip(epochs, layouts, strict=True)):
         keys = {node: keys.get(node) or node_key(node, k) for node in layout.nodes.tolist()}
-        seen = [_detections(keys, recorded, layout, means[k]) for recorded in epoch.measurements]
         factors: dict[str, Factors] = {
             "interactions": moved,
             "prior": _prior_factors(prior, keys) if k == 0 and len(prior.layout) else [],
@@ -100,12 +101,12 @@ def recording_factors(
                 for birth in epoch.births
                 for factor in prior_factors([keys[n] for n in birth.nodes.tolist()], birth.means, birth.covariances)
             ],
-            "detections": [factor for one in seen for factor in one],
+            "detections": [factor for one in epoch.measurements for factor in measurement_factors(keys, one)],
         }
         result.append(EpochFactors(keys, factors))
         if epoch.interval is not None:
-            gone = layout.rows(epoch.gone)
-            stay = layout.without(gone) if len(gone) else layout
+            leaving = layout.rows(epoch.leaving)
+            stay = layout.without(leaving) if len(leaving) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
             resting = stay.nodes[epoch.interval.linearised(stay, at).still].tolist()
             now, keys = keys, {node: keys[node] for node in resting}
@@ -126,22 +127,25 @@ def _prior_factors(x: BlockGaussian, keys: dict[int, int]) -> Factors:
     return factors
 
 
-def _detections(keys: dict[int, int], recorded: RecordedMeasurements, layout: Layout, mean: FloatArray) -> Factors:
-    """Native factors where measurements are linear; a weight of zero leaves nothing to say."""
+def measurement_factors(keys: Mapping[int, int], recorded: RecordedMeasurements) -> Factors:
+    """Return the factors of measurements, native where they are linear; keys: of the variables by id.
+
+    Measurements of weight 0 have none.
+    """
     measured = recorded.measured
-    names = np.array([[keys[node]] for node in measured.nodes.tolist()], dtype=np.uint64).reshape(-1, 1)
-    if recorded.loss is None and isinstance(measured, Measurements):
-        _, z, H, R = recorded.linearised(layout, mean)
-        heard = np.flatnonzero(H.any(axis=(1, 2)))
-        return list(gaussian_factors(names[heard], [H[heard]], z[heard], R[heard]))
-    weights = np.ones(len(names)) if recorded.weights is None else recorded.weights
-    heard = np.flatnonzero(weights > 0)
-    names, z, R = names[heard], measured.z[heard], measured.R[heard] / weights[heard, None, None]
+    weights = np.ones(len(measured)) if recorded.weights is None else recorded.weights
+    kept = np.flatnonzero(weights > 0)
+    names = np.array([keys[node] for node in measured.nodes[kept].tolist()], dtype=np.uint64)
+    z, R = measured.z[kept], measured.R[kept] / weights[kept, None, None]
     if not isinstance(measured, Measurements):
-        return [detection_factors(names[:, 0], measured.model, z, R, recorded.loss)]
-    H = measured.H[heard]
+        return [detection_factors(names, measured.model, z, R, recorded.loss)]
+    H = measured.H[kept]
+    if recorded.loss is None:
+        informative = H.any(axis=(1, 2))
+        return list(gaussian_factors(names[informative, None], [H[informative]], z[informative], R[informative]))
     residual, jacobian = partial(_linear_residual, H, z), partial(_linear_jacobian, H)
-    return [ResidualFactors(names, (H.shape[2],), residual, R, jacobian, recorded.loss, name="robust detections")]
+    dims = (H.shape[2],)
+    return [ResidualFactors(names[:, None], dims, residual, R, jacobian, recorded.loss, name="robust detections")]
 
 
 def _linear_residual(H: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
@@ -191,16 +195,16 @@ def interval_factors(
     for row in np.flatnonzero(~together & ~moves_nonlinearly).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
-        heard = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
+        sources = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
         if not _is_regular(Q):
             raise FactorError(f"node {node}: expected noise in all directions of its state")
-        native.append(interaction_factor(int(then[row]), [key for key, _ in heard], [F for _, F in heard], b, Q))
+        native.append(interaction_factor(int(then[row]), [key for key, _ in sources], [F for _, F in sources], b, Q))
     return native, nonlinear
 
 
 def _is_regular(Q: FloatArray) -> BoolArray:
-    """Which of the covariances (..., d, d) have variance in all directions, in units in which those of axes are 1."""
+    """(...,) true where covariances (..., d, d), in units of their axes, have variance in all directions."""
     deviation = np.sqrt(np.diagonal(Q, axis1=-2, axis2=-1))
     scale = np.where(deviation > 0, deviation, 1.0)
     return np.asarray(np.linalg.eigvalsh(Q / scale[..., :, None] / scale[..., None, :])[..., 0] > _SINGULAR)
@@ -210,3 +214,77 @@ def _of_row(blocks: Blocks, row: int) -> list[tuple[int, FloatArray]]:
     """Source rows and blocks of one node."""
     mine = np.flatnonzero(blocks.target == row)
     return list(zip(blocks.source[mine].tolist(), blocks.values[mine], strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Births:
+    """New objects, independent of all others: ids (k,), means (k, d), covariances (k, d, d); labels by id."""
+
+    nodes: IntArray
+    means: FloatArray
+    covariances: FloatArray
+    labels: Mapping[int, str] = field(default_factory=dict)
+    name: str = "births"
+    internal: ClassVar[bool] = True
+
+    def factors(self, view: GraphView) -> Additions:
+        ids = np.asarray(self.nodes).tolist()
+        if not ids:
+            return Additions()
+        new = [
+            NewVariable(*node_kind(i), mean, label=self.labels.get(i, ""))
+            for i, mean in zip(ids, self.means, strict=True)
+        ]
+        return Additions(new, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
+
+
+@dataclass(frozen=True, eq=False)
+class Interactions:
+    """Objects move by a transition over those that stay.
+
+    earlier    by id, the keys of their variables, by default those of the epoch before
+    carried_over   ids of those whose variables stay as they are
+    """
+
+    transition: Transition
+    earlier: Mapping[int, int] | None = None
+    carried_over: Collection[int] = ()
+    name: str = "interactions"
+    internal: ClassVar[bool] = True
+
+    def factors(self, view: GraphView) -> Additions:
+        transition = self.transition
+        nodes = transition.nodes.tolist()
+        if not nodes:
+            return Additions()
+        earlier = self.earlier or {node: node_key(node, view.epoch - 1) for node in nodes}
+        now = {node: node_key(node, view.epoch) for node in nodes}
+        layout = Layout(nodes, transition.graph.dims)
+        mean = np.concatenate([view.state(earlier[node]) for node in nodes])
+        interval = IntervalDynamics(transition)
+        dynamics = interval.linearised(layout, mean)
+        moved = dynamics.moved(mean) + dynamics.b
+        states = np.split(moved, transition.offsets[1:-1])
+        new = [
+            NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
+            for n, x in zip(nodes, states, strict=True)
+            if n not in self.carried_over
+        ]
+        native, nonlinear = interval_factors(interval, layout, mean, dict(earlier), now)
+        still = {now[node] for node in self.carried_over}
+        return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionFactors:
+    """Measurements of objects; keys: of their variables by id, by default those of this epoch."""
+
+    measurements: Measurements | Observations
+    keys: Mapping[int, int] | None = None
+    name: str = "detections"
+    internal: ClassVar[bool] = True
+
+    def factors(self, view: GraphView) -> Additions:
+        m = self.measurements
+        now = self.keys or {node: node_key(node, view.epoch) for node in m.nodes.tolist()}
+        return Additions(factors=measurement_factors(now, RecordedMeasurements(m)))
