@@ -156,4 +156,4 @@ def _solved(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
             LinearisationPoint(dict(graph.variables), values, values), linearised(native, ours, values), found.converged
         )
     except FactorError as error:
-        raise solver_error(graph, error) from error
+        raise solver_error(graph.variables, graph.groups, error) from error

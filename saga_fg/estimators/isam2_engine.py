@@ -126,7 +126,7 @@ class Engine:
             if not held.factors.linear:
                 nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
         if alone := graph.without_factors():
-            raise solver_error(graph, SingularSystemError("", tuple(alone)))
+            raise solver_error(graph.variables, graph.groups, SingularSystemError("", tuple(alone)))
         self.points.remove(leaving)
         self.points.add(new)
         self._update(graph, linear, rows, removed, new)
@@ -230,7 +230,7 @@ class Engine:
         for number in graph.groups:
             for factor in graph.linear(number, point):
                 linear.push_back(factor)
-        return solver_error(graph, singular_system(linear, error))
+        return solver_error(graph.variables, graph.groups, singular_system(linear, error))
 
 
 class Displacements:

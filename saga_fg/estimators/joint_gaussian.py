@@ -55,7 +55,7 @@ def joint_gaussian(
         try:
             P = _covariance(parts[name], mine, "cholesky" if wide else "qr")
         except FactorError as error:
-            raise solver_error(graph, error) from error
+            raise solver_error(graph.variables, graph.groups, error) from error
         blocks[partition.group[rows[0]]][partition.row[rows[0]]] = P
     base = graph.base
     mean = [
@@ -123,5 +123,5 @@ def replace_by_prior(
         try:
             prior = joint_prior_factor(keys, increments, x.joint(rows))
         except FactorError as error:
-            raise InputError(f"transition: {with_names(graph, str(error), keys)}") from error
+            raise InputError(f"transition: {with_names(graph.variables, str(error), keys)}") from error
         graph.replace_by_prior(leaving, prior)

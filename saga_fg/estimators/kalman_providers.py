@@ -189,7 +189,9 @@ def _born(
     R, rest = triangle[:size, :size], triangle[size:, size:]
     lost = np.abs(np.diagonal(R)) <= _UNDETERMINED * np.linalg.norm(A[:, :size], axis=0)
     if lost.any():
-        raise solver_error(graph, SingularSystemError("", tuple(key for key in new if lost[span[key]].any())))
+        raise solver_error(
+            graph.variables, graph.groups, SingularSystemError("", tuple(key for key in new if lost[span[key]].any()))
+        )
     if others:
         left.append((others, rest))
     solved = np.linalg.solve(R, np.column_stack([triangle[:size, size:], np.eye(size)]))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
 
 from factors import FactorError, SingularSystemError
 from factors.validation import format_key
@@ -12,19 +11,19 @@ from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_groups import HeldGroup
 from saga_fg.graph.keys import described
 from saga_fg.numerics.arrays import IntArray
+from saga_fg.variables import GraphVariable
 
-if TYPE_CHECKING:
-    from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+Variables = Mapping[int, GraphVariable]
 
 
-def solver_error(graph: SceneFactorGraph, error: Exception) -> GraphError:
+def solver_error(variables: Variables, groups: Mapping[int, HeldGroup], error: Exception) -> GraphError:
     """Return a solver's error in the names of the graph: an `UndeterminedError` where the system is singular."""
     if not isinstance(error, SingularSystemError) or not error.keys:
-        return GraphError(with_names(graph, str(error), graph.variables))
-    names = [str(graph.variables[key]) if key in graph.variables else described(key) for key in error.keys[:8]]
+        return GraphError(with_names(variables, str(error), variables))
+    names = [str(variables[key]) if key in variables else described(key) for key in error.keys[:8]]
     more = f" and {len(error.keys) - 8} more" if len(error.keys) > 8 else ""
     first = error.keys[0]
-    its = f" (factors on {names[0]}: {_factors_on(graph, first)})" if first in graph.variables else ""
+    its = f" (factors on {names[0]}: {_factors_on(groups.values(), first)})" if first in variables else ""
     return UndeterminedError(
         f"{', '.join(names)}{more}: not determined by the factors{its}; "
         "expected a prior, or measurements of all components",
@@ -32,29 +31,28 @@ def solver_error(graph: SceneFactorGraph, error: Exception) -> GraphError:
     )
 
 
-def factor_error(graph: SceneFactorGraph, held: HeldGroup, rows: IntArray, error: Exception) -> GraphError:
+def factor_error(variables: Variables, held: HeldGroup, rows: IntArray, error: Exception) -> GraphError:
     """Return the error of factors, with their provider, kind and variables."""
     keys = dict.fromkeys(key for row in rows.tolist() for key in held.factors.rows[row])
-    named = [str(graph.variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
+    named = [str(variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
     expected = isinstance(error, FactorError | InputError)
     text = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
     where = f"{held.factors.name} on {', '.join(named)}: "
-    return GraphError(f"provider {held.provider}: {where}{with_names(graph, text, keys).removeprefix(where)[:500]}")
+    return GraphError(f"provider {held.provider}: {where}{with_names(variables, text, keys).removeprefix(where)[:500]}")
 
 
-def with_names(graph: SceneFactorGraph, text: str, keys: Iterable[int]) -> str:
+def with_names(variables: Variables, text: str, keys: Iterable[int]) -> str:
     """Replace keys in a text by the names of their variables."""
     for key in keys:
         if format_key(key) in text:
-            text = text.replace(format_key(key), str(graph.variables[key]))
+            text = text.replace(format_key(key), str(variables[key]))
     return text
 
 
-def _factors_on(graph: SceneFactorGraph, key: int) -> str:
+def _factors_on(groups: Iterable[HeldGroup], key: int) -> str:
     """Describe the factors on a variable."""
     counts: dict[str, int] = {}
-    for number in graph.touching(key):
-        held = graph.groups[number]
+    for held in groups:
         mine = sum(key in held.factors.rows[row] for row in held.rows.tolist())
         if mine:
             counts[held.factors.name] = counts.get(held.factors.name, 0) + mine

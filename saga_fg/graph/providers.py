@@ -168,7 +168,7 @@ def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> N
         expected = isinstance(error, GraphError | ValueError)
         text = " ".join((str(error) if expected else repr(error)).split()).removeprefix(f"provider {name}: ")
         kind = GraphError if getattr(provider, "internal", False) else ProviderError
-        raise kind(f"provider {name}: {with_names(graph, text, graph.variables)[:500]}") from error
+        raise kind(f"provider {name}: {with_names(graph.variables, text, graph.variables)[:500]}") from error
 
 
 def _ask(name: str, provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:

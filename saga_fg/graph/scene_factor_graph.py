@@ -235,7 +235,7 @@ class SceneFactorGraph:
         try:
             return held.factors.linearised(rows, point)
         except Exception as error:
-            raise factor_error(self, held, rows, error) from error
+            raise factor_error(self._variables, held, rows, error) from error
 
     def moved_to(self, values: gtsam.Values) -> None:
         """Put the variables where a back end has found them."""
@@ -255,7 +255,7 @@ class SceneFactorGraph:
         try:
             solution = solve(native, ours, self._values, settings)
         except FactorError as error:
-            raise solver_error(self, error) from error
+            raise solver_error(self._variables, self._groups, error) from error
         self.moved_to(solution.values)
         return solution
 
@@ -320,7 +320,7 @@ class SceneFactorGraph:
         try:
             return _jacobians(marginal_factors(touched, keys, "qr"))
         except FactorError as error:
-            raise solver_error(self, error) from error
+            raise solver_error(self._variables, self._groups, error) from error
 
     def _choose(self, widest: int) -> None:
         """QR where what is left of marginalised variables is on few dimensions together, else Cholesky."""
