@@ -19,7 +19,7 @@ from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
 from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity, applies
 from saga_fg.model.node import distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
@@ -63,7 +63,8 @@ class Neighbours(Settings):
         SharedVelocity, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        0.3, "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6"
+        0.3,
+        "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6",
     )
     distance_scale: PositiveOrInf = setting(8.0, "sigma of the kernel on the distance, m; .inf: no kernel")
     heading_scale: PositiveOrInf = setting(
@@ -114,7 +115,8 @@ class Following(Settings):
         CarFollowing, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        0.5, "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1"
+        0.5,
+        "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1",
     )
     max_gap: NonNegative = setting(40.0, "no edge from a leader further ahead than this, centre to centre, m")
     gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m; .inf: no kernel")
@@ -229,7 +231,7 @@ def build_graph(
                 mine = pair_kind == k
                 t, s = target[mine], source[mine]
                 law = rule.interaction
-                if not law.applies(nodes.types[t[0]], nodes.types[s[0]]):
+                if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
                     continue
                 if isinstance(law, AccelerationLaw):
                     nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))
