@@ -10,8 +10,8 @@ from saga_fg.errors import InputError
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_groups import HeldGroup
 from saga_fg.graph.keys import described
-from saga_fg.numerics.arrays import IntArray
 from saga_fg.graph.variables import GraphVariable
+from saga_fg.numerics.arrays import IntArray
 
 Variables = Mapping[int, GraphVariable]
 
