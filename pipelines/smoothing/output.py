@@ -22,7 +22,7 @@ from data_tools.export.labels import write_kitti_labels, write_label_table, writ
 from data_tools.files.atomic_files import atomic_directory
 from pipelines.figures import write_figures
 from pipelines.smoothing.scene import SmoothedScene
-from pipelines.smoothing.streamed import StreamedScene
+from pipelines.smoothing.streaming import StreamedScene
 from saga_fg.smoothing import LabelCounts
 
 
