@@ -21,19 +21,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from benchmarks.block_bootstrap import Average, relative_change_of_errors
+from data_tools.datasets.registry import dataset_source
+from data_tools.datasets.source import DatasetSource, names
+from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval
-from pipelines.cli.options import Config, Verbose, names
+from pipelines.cli.options import Config, Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import load_config
-from pipelines.figures import FigureTable, cell, percent
-from pipelines.learning import TrajectorySource
+from pipelines.learning import trajectories
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import (
@@ -58,7 +60,7 @@ CLASSES = {
     "kitti": ("car",),
     "nuscenes": ("car", "pedestrian"),
     "eth_ucy": ("pedestrian",),
-    "argoverse": ("car",),
+    "argoverse2": ("car",),
     "simulated": ("car",),
 }
 """The classes that are hidden, by kind of recordings; all others are neighbours."""
@@ -69,6 +71,20 @@ NOISE_ALONE = "noise alone"
 AVERAGES: tuple[Average, Average] = ("median", "mean")
 BLOCK = 10.0  # s
 BESIDE, ALIKE = 2.0, 0.5  # a companion: another within so many m whose velocity differs by less than so many m/s
+
+
+def annotated_source(kind: str, place: str, recordings: Sequence[str] | None = None) -> DatasetSource:
+    """The recordings of a dataset in a folder, or so many simulated scenes; all, or those that are named.
+
+    Raises `InputError` for a number of scenes that is none.
+    """
+    if kind == "simulated" and (not place.isdecimal() or int(place) == 0):
+        raise InputError(f"--data simulated={place}: expected a number of scenes")
+    chosen: dict[str, Any] = {"scenes": int(place)} if kind == "simulated" else {"dataroot": place}
+    if kind == "nuscenes":
+        chosen["split"] = "all"
+    source = dataset_source(kind)(**chosen)
+    return source if recordings is None else source.restricted(recordings)
 
 
 @dataclass(frozen=True)
@@ -265,7 +281,7 @@ def gaps(
         list[str],
         typer.Option(
             "--data",
-            help="Recordings with ground truth: kitti=, nuscenes=, eth_ucy=, argoverse= with their folder, simulated= "
+            help="Recordings with ground truth: kitti=, nuscenes=, eth_ucy=, argoverse2= with their folder, simulated= "
             "with a number of scenes; repeatable.",
             metavar="KIND=PLACE",
         ),
@@ -300,16 +316,18 @@ def gaps(
         raise InputError(f"--recordings {recordings}: goes with a single --data")
     chosen = names("--recordings", recordings) if recordings is not None else None
     shown, figures, settings = [], {}, GapBenchSettings(folds, tested_folds, most, network)
-    for source in [TrajectorySource.parsed(value, chosen) for value in data]:
-        if source.kind not in CLASSES:
-            raise InputError(f"--data {source.kind}=...: expected recordings with ground truth: {', '.join(CLASSES)}")
-        found = source.trajectories()
+    for kind, _, place in (value.partition("=") for value in data):
+        if kind not in CLASSES or not place:
+            expected = f"expected KIND=PLACE of recordings with ground truth: {', '.join(CLASSES)}"
+            raise InputError(f"--data {kind}={place}: {expected}")
+        source = annotated_source(kind, place, chosen)
+        found = trajectories(source, with_truth=True)
         if len(found) < 2:
-            raise InputError(f"--data {source.kind}={source.place}: expected at least two recordings")
+            raise InputError(f"--data {kind}={place}: expected at least two recordings")
         rules = load_config(source.family, config).tracker.edges
         with progress_bar(unit="recordings") as progress:
-            errors, learned = gap_errors(found, CLASSES[source.kind], rules, settings, progress)
+            errors, learned = gap_errors(found, CLASSES[kind], rules, settings, progress)
         rows = gap_figures(errors)
-        shown.append(gap_table(rows, f"{source.kind}, {len(found)} recordings"))
-        figures[source.kind] = {"recordings": list(found), "figures": rows, "learned": learned}
+        shown.append(gap_table(rows, f"{kind}, {len(found)} recordings"))
+        figures[kind] = {"recordings": list(found), "figures": rows, "learned": learned}
     report(shown, figures, json_file)

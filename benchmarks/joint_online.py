@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from data_tools.figures import FigureTable, percent
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import TrackConfig
-from pipelines.figures import FigureTable, percent
 from pipelines.slam.joint import degraded_drive
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError

@@ -19,13 +19,13 @@ from typing import Annotated, Any
 import typer
 
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
+from data_tools.figures import FigureTable
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
-from pipelines.cli.options import Verbose, Version
+from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import working
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import load_config
-from pipelines.figures import FigureTable
 from pipelines.process import one_thread
 from pipelines.tracking import track_dataset
 from saga_fg.errors import InputError
@@ -120,7 +120,7 @@ def metrics(
         Path | None, typer.Option("--result", help="Tracking-result JSON; without it, simulated scenes are tracked.")
     ] = None,
     dataroot: Annotated[Path | None, typer.Option("--dataroot", help="Folder that holds the folder of tables.")] = None,
-    version: Version = VERSION,
+    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = VERSION,
     split: Annotated[str, typer.Option("--split", help="The split to score.")] = "all",
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes, if there is no result.")] = 2,
     json_file: JsonFile = None,

@@ -18,6 +18,7 @@ import numpy as np
 import typer
 
 from benchmarks.graph_tracking import JointGraphTracking, SeparateGraphTracking
+from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import check_writable, write_bytes
 from data_tools.plots import png
 from pipelines.bench.contenders import Filter, Ours
@@ -26,7 +27,6 @@ from pipelines.bench.measuring import timed
 from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
-from pipelines.figures import FigureTable, cell
 from pipelines.process import one_thread
 from pipelines.tracking import Progress
 from saga_fg.estimators import JointKalmanFilter, Measurements

@@ -18,10 +18,10 @@ import numpy as np
 import typer
 
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
+from data_tools.figures import FigureTable, cell
 from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
-from pipelines.figures import FigureTable, cell
 from pipelines.process import one_thread, resident_memory
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
 from pipelines.tracking import Progress

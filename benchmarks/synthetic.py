@@ -22,12 +22,13 @@ import typer
 
 from benchmarks.in_view_fit import fit_interactions_in_view
 from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sampled_config
+from data_tools.datasets.source import names
+from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
-from pipelines.cli.options import Verbose, names
+from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig
-from pipelines.figures import FigureTable, cell, percent
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
 from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories

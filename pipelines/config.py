@@ -85,11 +85,16 @@ def load_interactions(path: Path) -> LearnedInteractions:
     return load_settings(LearnedInteractions, path)
 
 
-def load_config(family: Family, path: Path | None = None) -> TrackConfig:
+def load_config(family: str | Path, path: Path | None = None) -> TrackConfig:
     """The defaults shipped for a kind of data, with what a YAML file overrides.
+
+    family  name of a kind of data, or the path of a YAML file over the defaults of "file"
 
     Raises `InputError` naming the file and the dotted key of what is wrong in it.
     """
-    shipped = files("pipelines") / "configs" / f"{family}.yaml"
-    config = read_settings(TrackConfig, shipped.read_text(encoding="utf-8"), shipped.name)
+    if isinstance(family, Path):
+        config = load_settings(TrackConfig, family, load_config("file"))
+    else:
+        shipped = files("pipelines") / "configs" / f"{family}.yaml"
+        config = read_settings(TrackConfig, shipped.read_text(encoding="utf-8"), shipped.name)
     return config if path is None else load_settings(TrackConfig, path, config)

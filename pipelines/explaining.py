@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import open_bytes
 from data_tools.files.json_stream import parsed_json
@@ -20,6 +22,7 @@ from data_tools.plots import running_graph_picture
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.journal import Event, Journal, of_scene
 
 
@@ -71,6 +74,19 @@ def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
     if len(scenes) > 1:
         raise InputError(f"--track {number}: expected --scene, the track is in {', '.join(scenes)}")
     return events
+
+
+def journal_innovations(journal: Path) -> dict[str, FloatArray]:
+    """Squared distances in sigmas of tracks and the detections they took, by class.
+
+    Raises `InputError` for a journal that is missing or broken.
+    """
+    found: dict[str, list[float]] = {}
+    for event in read_events(journal):
+        if event.get("event") == "matched":
+            chosen = next(c for c in event["candidates"] if c["outcome"] == "chosen")
+            found.setdefault(event["label"], []).append(chosen["distance2"])
+    return {label: np.array(values) for label, values in sorted(found.items())}
 
 
 def read_graphs(journal: Path) -> dict[str, list[Event]]:

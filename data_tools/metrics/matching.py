@@ -17,14 +17,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from data_tools.metrics.assignment import Candidates, best_pairs
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations
-from saga_fg.types.track import Tracks
+
+
+class FoundBoxes(Protocol):
+    """N boxes with identities at one moment: a tracker's `Tracks`, or the rows of a `TrackTable`."""
+
+    @property
+    def id(self) -> IntArray | StrArray: ...
+    @property
+    def boxes(self) -> Boxes: ...
+    @property
+    def position_covariance(self) -> FloatArray: ...
+    def __len__(self) -> int: ...
+    def select(self, rows: Any) -> Self: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +58,7 @@ class Matching:
 
 
 def match_scene(
-    ground_truth: Sequence[Annotations], tracks: Sequence[Tracks], gate: float = 2.0, same_label: bool = True
+    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], gate: float = 2.0, same_label: bool = True
 ) -> list[Matching]:
     """The matching at each of the K frames of a scene; pairs further apart than `gate` (m) never match.
 
@@ -57,7 +71,8 @@ def match_scene(
     numbers = {
         name: n for n, name in enumerate(np.unique([name for truth in ground_truth for name in truth.id.tolist()]))
     }
-    last_track = np.zeros(len(numbers), dtype=np.int64)
+    ids = {found.id.dtype for found in tracks} or {np.dtype(np.int64)}
+    last_track = np.zeros(len(numbers), dtype=np.result_type(*ids))
     seen = np.zeros(len(numbers), dtype=np.bool_)
     result = []
     for truth, found in zip(ground_truth, tracks, strict=True):
@@ -72,7 +87,7 @@ def match_scene(
     return result
 
 
-def _distances(truth: Annotations, found: Tracks, same_label: bool) -> FloatArray:
+def _distances(truth: Annotations, found: FoundBoxes, same_label: bool) -> FloatArray:
     """(N, M) horizontal distances, infinite between different classes where these must not match."""
     offset = truth.boxes.position[:, None, :2] - found.boxes.position[None, :, :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])

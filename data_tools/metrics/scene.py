@@ -27,12 +27,11 @@ import numpy as np
 
 from data_tools.metrics.consistency import nees
 from data_tools.metrics.error_sample import ErrorSample
-from data_tools.metrics.matching import Matching, match_scene
+from data_tools.metrics.matching import FoundBoxes, Matching, match_scene
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import setting
 from saga_fg.types.dataset import Annotations
-from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ class SceneMetrics:
 
 
 def scene_metrics(
-    ground_truth: Sequence[Annotations], tracks: Sequence[Tracks], settings: SceneMetricSettings | None = None
+    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], settings: SceneMetricSettings | None = None
 ) -> SceneMetrics:
     """The metrics of one scene: K annotations and the K `Tracks` of the same frames, both in world coordinates.
 
@@ -144,7 +143,7 @@ def scene_metrics(
 
 
 def scene_metrics_by_label(
-    ground_truth: Sequence[Annotations], tracks: Sequence[Tracks], settings: SceneMetricSettings | None = None
+    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], settings: SceneMetricSettings | None = None
 ) -> dict[str, SceneMetrics]:
     """`scene_metrics` of each class, by name; with `same_label`, pooling them gives the metrics of the whole scene."""
     boxes = [truth.boxes for truth in ground_truth] + [found.boxes for found in tracks]
@@ -159,7 +158,7 @@ def scene_metrics_by_label(
     }
 
 
-def _pair_errors(truth: Annotations, found: Tracks, matching: Matching) -> FloatArray:
+def _pair_errors(truth: Annotations, found: FoundBoxes, matching: Matching) -> FloatArray:
     """(4, M): position, velocity, heading errors and NEES of the pairs of one frame; NaN where unknown."""
     a, b = truth.boxes.select(matching.object_row), found.boxes.select(matching.track_row)
     velocity = b.velocity - a.velocity
@@ -168,9 +167,9 @@ def _pair_errors(truth: Annotations, found: Tracks, matching: Matching) -> Float
     return np.stack([matching.distance, np.hypot(velocity[:, 0], velocity[:, 1]), heading, consistency])
 
 
-def _carried_errors(frames: Sequence[tuple[Annotations, Tracks, Matching]], cap: float) -> FloatArray:
+def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, Matching]], cap: float) -> FloatArray:
     """Carried errors of all hidden objects, see the module."""
-    carrier: dict[str, int] = {}
+    carrier: dict[str, int | str] = {}
     errors: list[float] = []
     for truth, found, matching in frames:
         row_of = {track: row for row, track in enumerate(found.id.tolist())}

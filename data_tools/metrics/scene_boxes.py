@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -71,3 +72,8 @@ class SceneBoxes(Columns):
         score = np.concatenate([np.empty(0), *(found.score for found in frames)])
         covariance = np.concatenate([np.empty((0, 2, 2)), *(found.position_covariance for found in frames)])
         return cls(frame, numbers.astype(np.str_), boxes, score, covariance)
+
+    def by_frame(self, count: int) -> list[Self]:
+        """The boxes of each of the scene's `count` frames."""
+        bounds = np.searchsorted(self.frame, np.arange(count + 1)).tolist()
+        return [self.select(slice(first, end)) for first, end in pairwise(bounds)]

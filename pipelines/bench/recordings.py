@@ -9,8 +9,12 @@ from pathlib import Path
 from typing import Protocol
 
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
+from data_tools.datasets.kitti.evaluation import CLASSES, kitti_hota, kitti_label_errors
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
+from data_tools.datasets.nuscenes.evaluation import nuscenes_hota, nuscenes_label_errors
+from data_tools.evaluation.hota import HotaRow
+from data_tools.evaluation.placed_detections import placed_detections
 from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
@@ -23,10 +27,6 @@ from data_tools.metrics import (
 )
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
-from pipelines.evaluation.hota import HotaRow, kitti_hota
-from pipelines.evaluation.kitti import CLASSES, kitti_label_errors
-from pipelines.evaluation.nuscenes import nuscenes_hota, nuscenes_label_errors
-from pipelines.evaluation.placed_detections import placed_detections
 from pipelines.tracking import TrackedScene
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_tools.evaluation.hota import HotaRow
 from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.coasting import coasting_errors
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import METHODS, Variant, variants
 from pipelines.config import TrackConfig
-from pipelines.evaluation.hota import HotaRow
 from pipelines.learning import learn_interactions
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, calibration, error_summary, errors_by_class
 from pipelines.bench.tracking import SetResult, verdict
-from pipelines.figures import FigureTable, cell
 
 
 def tables(result: SetResult) -> list[FigureTable]:

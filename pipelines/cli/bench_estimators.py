@@ -13,9 +13,9 @@ from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report, show_tables
 
 if TYPE_CHECKING:
+    from data_tools.figures import FigureTable
     from pipelines.bench.estimator_figures import Row
     from pipelines.bench.estimators import EstimatorBench
-    from pipelines.figures import FigureTable
 
 
 def estimators(
@@ -84,7 +84,7 @@ def estimators(
 
 def _tables(result: EstimatorBench) -> list[FigureTable]:
     """The rows, and the figures to reach."""
-    from pipelines.figures import FigureTable
+    from data_tools.figures import FigureTable
 
     rows = []
     for row in result.rows:

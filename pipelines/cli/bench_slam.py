@@ -33,8 +33,8 @@ def slam(
       saga-fg bench slam --dataroot data/kitti --sequence 0000
     """
     from data_tools.datasets.kitti import KittiScans
+    from data_tools.figures import FigureTable, cell
     from pipelines.bench.slam import bench_slam
-    from pipelines.figures import FigureTable, cell
 
     with progress_bar() as progress:
         rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress)

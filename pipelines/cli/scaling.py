@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,9 @@ from pipelines.cli.summary import counted
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.scale_out import Pool, Report, SceneInput, SceneTask
+    from data_tools.datasets.source import DatasetSource
+    from pipelines.scale_out import Pool, RunSummary, SceneTask
+    from saga_fg.types.dataset import Dataset
 
 FAILED_SCENES = 1  # exit code
 
@@ -37,52 +39,28 @@ RayAddress = Annotated[
     ),
 ]
 
-Detections = Annotated[
-    list[str],
-    typer.Argument(
-        help="Table of detections: .csv, .ndjson, .jsonl or .npz. In parallel: several of them, patterns, URLs, or "
-        "lists of such in a .txt file.",
-    ),
-]
-
 
 def at_scale(workers: int | None, ray: str | None) -> bool:
     """Whether the scenes are to be done in parallel."""
     return workers is not None or ray is not None
 
 
-def several(detections: Sequence[str], scenes: str | None) -> list[str]:
-    """The files of detections to do in parallel; raises `InputError` where --scenes would choose among their scenes."""
-    from data_tools.files.remote_files import expanded
-
-    if scenes is not None:
-        raise InputError("--scenes: all scenes of a file are done with --workers or --ray")
-    return expanded(detections)
-
-
-def only(detections: Sequence[str]) -> str:
-    """The one file of detections; raises `InputError` if there are several."""
-    if len(detections) > 1:
-        raise InputError(
-            "expected one table of detections; several need --workers N or --ray, and a folder as --output"
-        )
-    return detections[0]
-
-
 def run_at_scale(
-    inputs: Iterable[SceneInput],
-    total: int,
+    source: DatasetSource,
     task: SceneTask,
     output: Path,
     workers: int | None,
     ray: str | None,
-    merge: Callable[[], None] | None = None,
+    merged: str,
+    merge: Callable[[Path, Sequence[str], Dataset | None], None],
 ) -> None:
-    """Do the task with all inputs, and print what became of them; `merge` what they left, if all have done it.
+    """Do the task with all parts of a dataset, and print what became of them.
+
+    merge  makes the file `merged` of what they left, if all have done it; "" for none
 
     Scenes that failed are named with their reasons, and end the command with an exit code.
     """
-    from pipelines.scale_out import LocalPool, RayPool, run_scenes
+    from pipelines.scale_out import LocalPool, RayPool, file_name, run_scenes
 
     if output.suffix:
         raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
@@ -90,12 +68,22 @@ def run_at_scale(
     def new_pool(scratch: Path) -> Pool:
         return LocalPool(workers or 0, scratch) if ray is None else RayPool(ray, workers or 0)
 
-    def finish(report: Report) -> None:
-        if merge is not None and not report.failed:
-            merge()
+    def finish(report: RunSummary) -> None:
+        if merged and not report.failed:
+            merge(output, [file_name(name) for name in there.names], there.dataset)
 
-    with progress_bar(unit="scenes") as bar:
-        report = run_scenes(inputs, total, task, output, new_pool, lambda _, done, of: bar("scenes", done, of), finish)
+    with source.parts() as there, progress_bar(unit="scenes") as bar:
+        if merged:
+            (output / merged).unlink(missing_ok=True)
+        report = run_scenes(
+            there.parts,
+            len(there.names),
+            task,
+            output,
+            new_pool,
+            lambda _, done, of: bar("scenes", done, of),
+            finish,
+        )
     counts = "".join(f", {number} {noun}" for noun, number in report.counts.items())
     states = f"{len(report.done)} done, {len(report.unchanged)} unchanged, {len(report.failed)} failed"
     typer.echo(f"{output}: {counted(report.scenes, 'scene')}: {states}{counts}")

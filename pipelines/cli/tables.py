@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from pipelines.figures import FigureTable
+    from data_tools.figures import FigureTable
 
 
 def _writable(path: Path | None) -> Path | None:
@@ -35,8 +35,8 @@ MarkdownFile = Annotated[
 
 def report(tables: Iterable[FigureTable], figures: Any, json_file: Path | None, markdown: Path | None = None) -> None:
     """Print the tables, and write the figures and the tables to the files that were asked for."""
+    from data_tools.figures import write_figures
     from data_tools.files.atomic_files import write_text
-    from pipelines.figures import write_figures
 
     tables = list(tables)
     show_tables(tables)

@@ -11,7 +11,7 @@ from saga_fg.errors import InputError
 from saga_fg.tracking import AssociationName, EstimatorName
 
 if TYPE_CHECKING:
-    from pipelines.config import Family, Method, TrackConfig
+    from pipelines.config import Method, TrackConfig
 
 MethodOption = Annotated[
     Literal["saga", "kf", "centerpoint"],
@@ -52,7 +52,7 @@ ExplainOption = Annotated[
 
 
 def configured(
-    family: Family,
+    family: str | Path,
     config: Path | None,
     method: Method,
     estimator: EstimatorName | None,

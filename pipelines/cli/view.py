@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli import options
-from pipelines.cli.reporting import ReportingGroup, working
+from pipelines.cli.datasets import dataset_commands
+from pipelines.cli.reporting import working
 
 if TYPE_CHECKING:
+    from data_tools.datasets.source import DatasetSource
     from pipelines.view import SceneView
-
-view_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
 Save = Annotated[
     Path | None,
@@ -25,87 +25,36 @@ Save = Annotated[
         metavar="FILE",
     ),
 ]
-Spacing = Annotated[
-    float, typer.Option("--spacing", min=0.0, help="Thin the LiDAR's points to this, m; 0 leaves them out.")
-]
+
+
+def _view(
+    source: DatasetSource,
+    result: options.Result,
+    slam: Annotated[
+        Path | None,
+        typer.Option("--slam", help="Folder that `saga-fg slam` wrote, of the only scene.", metavar="FOLDER"),
+    ] = None,
+    spacing: Annotated[
+        float, typer.Option("--spacing", min=0.0, help="Thin the LiDAR's points to this, m; 0 leaves them out.")
+    ] = 0.1,
+    save: Save = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """See a tracking result, with the ground truth, the detections and the LiDAR scans where they are there."""
+    from pipelines.view.scenes import result_views
+
+    if save is not None:
+        options.apart(save, result, *source.input_files(), option="--save")
+    _show(result, save, lambda: result_views(source, result, spacing), slam)
+
+
+_commands = dataset_commands("view", _view, ("view {result}", "view {result} --save tracks.mcap"))
+view_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 
 
 @view_app.callback()
 def view() -> None:
     """See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (rerun or Foxglove)."""
-
-
-@view_app.command()
-def nuscenes(
-    result: options.TrackingResult,
-    dataroot: options.Tables,
-    version: options.Version = "v1.0-mini",
-    split: options.Split = None,
-    scenes: options.SceneNames = None,
-    detections: options.SeenBySensors = None,
-    spacing: Spacing = 0.1,
-    save: Save = None,
-    verbose: options.Verbose = False,
-) -> None:
-    """See a nuScenes tracking result, with the ground truth and the LiDAR scans where their files are there.
-
-    \b
-    Examples:
-      saga-fg view nuscenes tracks.json --dataroot data/nuscenes --scenes scene-0103
-      saga-fg view nuscenes tracks.json --dataroot data/nuscenes --split mini_train \\
-          --detections lidar=megvii.json --save tracks.mcap
-    """
-    from pipelines.view.sources import nuscenes_view
-
-    chosen, files = options.chosen_scenes(dataroot, version, split, scenes), options.sensor_files(detections or [])
-    if save is not None:
-        options.apart(save, result, *files.values(), option="--save")
-    _show(result, save, lambda: nuscenes_view(result, dataroot, version, chosen, files, spacing))
-
-
-@view_app.command()
-def kitti(
-    result: Annotated[Path, typer.Argument(help="Folder of results NNNN.txt, of any tracker.")],
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="Folder that holds training/, or oxts/, label_02/ ...")],
-    sequences: options.ResultSequences = None,
-    detections: options.SeenFolder = None,
-    slam: Annotated[
-        Path | None, typer.Option("--slam", help="Folder that `saga-fg slam kitti` wrote, of the only sequence.")
-    ] = None,
-    spacing: Spacing = 0.1,
-    save: Save = None,
-    verbose: options.Verbose = False,
-) -> None:
-    """See KITTI tracking results, with the labels, the scans of velodyne/ if it is there, and a map with landmarks.
-
-    \b
-    Example:
-      saga-fg view kitti results --dataroot data/kitti --sequences 0000 --slam slam --save drive.rrd
-    """
-    from pipelines.view.sources import kitti_view
-
-    chosen = options.names("--sequences", sequences) if sequences is not None else None
-    _show(result, save, lambda: kitti_view(result, dataroot, chosen, detections, spacing), slam)
-
-
-@view_app.command()
-def file(
-    result: Annotated[Path, typer.Argument(help="Table of tracks: .csv, .ndjson or .jsonl.")],
-    detections: options.SeenTable = None,
-    save: Save = None,
-    verbose: options.Verbose = False,
-) -> None:
-    """See a table of tracks.
-
-    \b
-    Example:
-      saga-fg view file tracks.csv --detections detections.csv
-    """
-    from pipelines.view.sources import table_view
-
-    if save is not None:
-        options.apart(save, result, *([detections] if detections is not None else []), option="--save")
-    _show(result, save, lambda: table_view(result, detections))
 
 
 @view_app.command()
@@ -148,7 +97,7 @@ def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView
         driven = read_slam_view(slam) if slam is not None else None
         roots = [each.report.scene.name for each in scenes]
         if driven is not None and len(scenes) > 1:
-            raise InputError(f"--slam {slam}: expected one sequence, got {', '.join(roots)}; choose it by --sequences")
+            raise InputError(f"--slam {slam}: expected one sequence, got {', '.join(roots)}; choose one")
         drawings = [draw_scene(each) for each in scenes]
         if driven is not None:
             root = f"{roots[0]}/slam" if roots else "slam"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import SceneMetrics, SceneMetricSettings, scene_metrics
 from pipelines.config import Method, TrackConfig
-from pipelines.figures import FigureTable, cell
 from pipelines.tracking import Progress, TrackedScene, track_scene
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset

@@ -3,6 +3,6 @@
 from pipelines.learning.fragment import learned_fragment
 from pipelines.learning.interactions import learn_interactions
 from pipelines.learning.noise import LearnedNoise, learn_noise
-from pipelines.learning.trajectory_sources import KINDS, TrajectorySource
+from pipelines.learning.trajectories import trajectories
 
-__all__ = ["KINDS", "LearnedNoise", "TrajectorySource", "learn_interactions", "learn_noise", "learned_fragment"]
+__all__ = ["LearnedNoise", "learn_interactions", "learn_noise", "learned_fragment", "trajectories"]

@@ -5,6 +5,7 @@ result + recordings -> `ReportScene`s, tables, charts -> `report_page` -> one fi
 
 from pipelines.report.charts import Chart, Series, accuracy_charts, latency_chart
 from pipelines.report.page import Report, report_page
+from pipelines.report.results import result_report, result_scenes
 from pipelines.report.run_record import RunRecord, read_run_record, record_path
 from pipelines.report.scenes import ReportScene, scene_of_run
 
@@ -19,5 +20,7 @@ __all__ = [
     "read_run_record",
     "record_path",
     "report_page",
+    "result_report",
+    "result_scenes",
     "scene_of_run",
 ]

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from importlib.resources import files
 from typing import Any
 
-from pipelines.figures import FigureTable, as_json
+from data_tools.figures import FigureTable, as_json
 from pipelines.report.charts import Chart
 from pipelines.report.scenes import ReportScene, scene_data
 

@@ -10,39 +10,18 @@ import hashlib
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, Protocol
 
+from data_tools.datasets.parts import Part
 from pipelines.process import one_thread
 from saga_fg.errors import SagaError
 from saga_fg.types.dataset import Dataset
 
 Status = Literal["done", "unchanged", "failed"]
-
-
-@dataclass(frozen=True, eq=False)
-class OpenedInput:
-    """An input at hand: the SHA-256 of each of its parts by name, and how to read it as a dataset."""
-
-    digests: Mapping[str, str]
-    read: Callable[[], Dataset]
-
-
-class SceneInput(Protocol):
-    """The source of one scene. Picklable: it is sent to a worker, maybe on another machine."""
-
-    @property
-    def name(self) -> str:
-        """Unique within a run; results and the manifest are named for it."""
-        ...
-
-    def opened(self) -> AbstractContextManager[OpenedInput]:
-        """Make the input available for the length of a block; raises `InputError` where it is not."""
-        ...
 
 
 class SceneTask(Protocol):
@@ -62,7 +41,7 @@ class SceneTask(Protocol):
 class Job:
     """input; task; known: the digests for which results are there already, None if all is to be done anew."""
 
-    input: SceneInput
+    input: Part
     task: SceneTask
     known: Mapping[str, str] | None = None
 

@@ -13,9 +13,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
+from data_tools.datasets.parts import Part
 from data_tools.files.atomic_files import remove_leftovers
 from pipelines.scale_out.folder import OutputFolder
-from pipelines.scale_out.job import Job, Outcome, SceneInput, SceneTask, sha256
+from pipelines.scale_out.job import Job, Outcome, SceneTask, sha256
 from pipelines.scale_out.manifest import Manifest, Record
 from saga_fg.errors import InputError
 
@@ -31,7 +32,7 @@ class Pool(Protocol):
 
 
 @dataclass
-class Report:
+class RunSummary:
     """Names of the scenes by status; reasons of the failed ones; counts over all results."""
 
     done: list[str] = field(default_factory=list)
@@ -46,14 +47,14 @@ class Report:
 
 
 def run_scenes(
-    inputs: Iterable[SceneInput],
+    inputs: Iterable[Part],
     total: int,
     task: SceneTask,
     output: Path,
     new_pool: Callable[[Path], Pool],
     progress: Callable[[str, int, int], None] | None = None,
-    finish: Callable[[Report], None] | None = None,
-) -> Report:
+    finish: Callable[[RunSummary], None] | None = None,
+) -> RunSummary:
     """Perform a task on every input, in any order; results in `output`, records in `output`/manifest.
 
     new_pool  makes the workers, given a folder for their temporary files
@@ -63,7 +64,7 @@ def run_scenes(
     Failed scenes are in the report and in the manifest; the others go on. Raises `InputError` for two inputs of one
     name, and if another run writes to the folder.
     """
-    folder, report = OutputFolder(output), Report()
+    folder, report = OutputFolder(output), RunSummary()
     manifest = Manifest(folder)
     configuration, here = sha256(task.configuration.encode()), version("saga-fg")
     with folder.held():
@@ -87,9 +88,7 @@ def run_scenes(
     return report
 
 
-def _jobs(
-    inputs: Iterable[SceneInput], task: SceneTask, manifest: Manifest, configuration: str, here: str
-) -> Iterator[Job]:
+def _jobs(inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configuration: str, here: str) -> Iterator[Job]:
     names: set[str] = set()
     for scene in inputs:
         if scene.name in names:
@@ -98,7 +97,7 @@ def _jobs(
         yield Job(scene, task, manifest.valid(scene.name, configuration, here))
 
 
-def _count(report: Report, outcome: Outcome, manifest: Manifest, configuration: str) -> None:
+def _count(report: RunSummary, outcome: Outcome, manifest: Manifest, configuration: str) -> None:
     """Write the results and the record of an outcome, and count it."""
     record: Record | None
     if outcome.status == "unchanged":

@@ -17,7 +17,7 @@ class LogLimit:
         self._latest: dict[Hashable, float] = {}
 
     def due(self, kind: Hashable) -> bool:
-        """Whether to log an event of this kind now."""
+        """Return True if an event of this kind may be logged now."""
         now = time.monotonic()
         if now - self._latest.get(kind, -self._seconds) < self._seconds:
             return False
@@ -35,5 +35,5 @@ class LogLimitFilter(logging.Filter):
         self._limit = LogLimit()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether to log this record."""
+        """Return True if this record may be logged."""
         return self._limit.due((record.name, record.lineno))

@@ -51,10 +51,10 @@ class _Reader(asyncio.StreamReader):
 class Client:
     """One connection.
 
-    subscribed  whether it gets the tracks of all frames
+    subscribed  True if it gets the tracks of all frames
     size        bytes it has sent of an unfinished line, or of one that waits for its turn
     active      time of its last message or answer, by `time.monotonic()`
-    finished    whether all it will send is answered
+    finished    True once all it will send is answered
     """
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str) -> None:
@@ -62,21 +62,19 @@ class Client:
         self.subscribed = self.finished = False
         self.size = 0
         self.active = time.monotonic()
-        task = asyncio.current_task()
-        assert task is not None
-        self.task = task
+        self.task = cast("asyncio.Task[None]", asyncio.current_task())
         self._reader = reader
         self._reading: asyncio.Timeout | None = None
         self._sent = 0
         self._progress = (0, self.active)  # bytes that have left, and since when
 
     async def read(self, stopping: bool) -> bytes:
-        """The next bytes; none at the end, and when stopping none but those that are there."""
+        """Return the next bytes; none at the end, and when stopping only received ones."""
         try:
             async with asyncio.timeout(0 if stopping else None) as self._reading:
                 piece = await self._reader.read(PIECE)
         except TimeoutError:
-            return b""
+            return b"" if stopping else await self.read(stopping=True)
         finally:
             self._reading = None
         self.active = time.monotonic()
@@ -96,7 +94,7 @@ class Client:
             self.writer.write(line)
 
     def stalled(self, now: float) -> float:
-        """Time in s for which the client has read nothing while its answers pile up, or while it is being closed."""
+        """Return the time, s, without progress while answers pile up, or while the client is being closed."""
         waiting = self.transport.get_write_buffer_size()
         delivered = self._sent - waiting
         piled_up = waiting > PIECE or (waiting > 0 and self.transport.is_closing())
@@ -144,10 +142,10 @@ class SocketServer:
             server.close()
             for client in self._clients:
                 client.stop_reading()
-            await self._until(lambda: all(c.finished for c in self._clients), self.settings.stop_timeout / 2)
+            await _until(lambda: all(c.finished for c in self._clients), self.settings.stop_timeout / 2)
             self._deliver(await loop.run_in_executor(self._thread, self._stream.flush))
             self._flushed.set()
-            await self._until(lambda: not self._clients, 2 * self.settings.client_timeout)
+            await _until(lambda: not self._clients, 2 * self.settings.client_timeout)
         finally:
             watching.cancel()
             for client in self._clients:
@@ -155,14 +153,6 @@ class SocketServer:
             self._thread.shutdown()
             if self._address.path is not None:
                 self._address.path.unlink(missing_ok=True)
-
-    async def _until(self, happened: Callable[[], bool], seconds: float) -> None:
-        with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while not happened():
-                    await asyncio.sleep(0.01)
-
-    # one client
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection to its end."""
@@ -225,7 +215,7 @@ class SocketServer:
         await asyncio.wait([work])
 
     def _answers(self, line: bytes | None, client: Client, received: float) -> list[tuple[Client, Any]]:
-        """The stream's answers, in the worker's thread. Whatever happens, there is an answer."""
+        """Return the stream's answers, in the worker's thread; an error is an answer, too."""
         start = time.monotonic()
         try:
             answers = self._stream.handle(line, client, received)
@@ -253,8 +243,6 @@ class SocketServer:
             if answer["type"] == "tracks":
                 for subscriber in [each for each in self._clients if each.subscribed and each is not client]:
                     self._send(subscriber, line)
-
-    # limits
 
     def _send(self, client: Client, line: bytes) -> None:
         if client.transport.get_write_buffer_size() + len(line) > self.settings.max_outbox:
@@ -303,8 +291,6 @@ class SocketServer:
         if self._log_limit.due(reason):
             log.warning("%s: %s: closed; the status counts more of these", client.name, text)
 
-    # the socket
-
     def _complain(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Log an error in the event loop; where no more files can be opened, asyncio tries again after a second."""
         error = context.get("exception")
@@ -314,27 +300,34 @@ class SocketServer:
         else:
             log.error("%s", context.get("message"), exc_info=error)
 
-    def _connection(self) -> asyncio.Protocol:
-        return asyncio.StreamReaderProtocol(_Reader(PIECE), self._serve)
-
     async def _listen(self) -> asyncio.Server:
         loop, address = asyncio.get_running_loop(), self._address
+
+        def connection() -> asyncio.Protocol:
+            return asyncio.StreamReaderProtocol(_Reader(PIECE), self._serve)
+
         try:
             if address.path is not None:
                 _clear_stale(address.path)
                 old = os.umask(0o177)  # for the owner alone
                 try:
-                    server = await loop.create_unix_server(self._connection, str(address.path))
+                    server = await loop.create_unix_server(connection, str(address.path))
                 finally:
                     os.umask(old)
             else:
-                server = await loop.create_server(self._connection, address.host, address.port)
+                server = await loop.create_server(connection, address.host, address.port)
                 address = replace(address, port=server.sockets[0].getsockname()[1])
         except OSError as error:
             raise InputError(f"{address}: cannot listen there: {error.strerror or error}") from error
         if self._ready is not None:
             self._ready(address)
         return server
+
+
+async def _until(happened: Callable[[], bool], seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not happened() and time.monotonic() < end:
+        await asyncio.sleep(0.01)
 
 
 def _clear_stale(path: Path) -> None:

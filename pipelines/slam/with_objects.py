@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from data_tools.lidar.scan_sequence import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
-from pipelines.scan_sequence import ScanSequence
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider

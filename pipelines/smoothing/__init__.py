@@ -1,8 +1,8 @@
-"""From recordings to labels: the online pass, the passes of smoothing, the boxes."""
+"""From recordings to labels: the online pass, the passes of smoothing, the labels."""
 
 from pipelines.smoothing.chunks import ChunkSettings
 from pipelines.smoothing.config import SmoothConfig, load_smooth_config
-from pipelines.smoothing.output import write_kitti_run, write_labels, write_nuscenes_run, write_streamed_labels
+from pipelines.smoothing.output import write_labels, write_streamed_labels
 from pipelines.smoothing.passes import smooth_known_objects
 from pipelines.smoothing.scene import SmoothedScene, smooth_dataset, smooth_scene
 from pipelines.smoothing.streaming import StreamedScene, smooth_stream
@@ -17,8 +17,6 @@ __all__ = [
     "smooth_known_objects",
     "smooth_scene",
     "smooth_stream",
-    "write_kitti_run",
     "write_labels",
-    "write_nuscenes_run",
     "write_streamed_labels",
 ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from pipelines.config import Family, TrackConfig, load_config
+from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings, read_settings
 from saga_fg.settings import settings_group
 from saga_fg.smoothing import SmoothingSettings
@@ -27,12 +27,12 @@ class SmoothConfig:
     smoothing: SmoothingSettings = settings_group(SmoothingSettings, "what makes labels of its tracks")
 
 
-def load_smooth_config(family: Family, path: Path | None = None) -> SmoothConfig:
-    """The defaults shipped for a kind of data, with what a YAML file overrides.
+def load_smooth_config(family: str | Path, path: Path | None = None) -> SmoothConfig:
+    """The defaults shipped for a kind of data, with what a YAML file overrides; kinds are those of `load_config`.
 
     Raises `InputError` naming the file and the dotted key of what is wrong in it.
     """
-    shipped = files("pipelines") / "configs" / "smoothing" / f"{family}.yaml"
+    shipped = files("pipelines") / "configs" / "smoothing" / f"{'file' if isinstance(family, Path) else family}.yaml"
     tracking = load_config(family)
     config = SmoothConfig(tracking=tracking, sensors=tracking.sensors)
     config = read_settings(SmoothConfig, shipped.read_text(encoding="utf-8"), shipped.name, config)

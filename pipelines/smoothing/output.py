@@ -16,23 +16,32 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from data_tools.datasets.kitti import KittiTracking, write_kitti_results
-from data_tools.datasets.nuscenes import ResultMeta, write_tracking_results
-from data_tools.export.labels import write_kitti_labels, write_label_table, write_nuscenes_labels
+from data_tools.datasets.label_table import write_label_table
+from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory
-from pipelines.figures import write_figures
 from pipelines.smoothing.scene import SmoothedScene
 from pipelines.smoothing.streaming import StreamedScene
-from saga_fg.smoothing import LabelCounts
+from saga_fg.smoothing import LabelCounts, Labels
+from saga_fg.types.dataset import Scene
 
 
 def write_labels(
-    directory: str | Path, runs: Iterable[SmoothedScene], suffix: str = ".csv"
+    directory: str | Path,
+    runs: Iterable[SmoothedScene],
+    suffix: str = ".csv",
+    write_others: Callable[[Path, Sequence[tuple[Scene, Sequence[Labels]]]], None] | None = None,
 ) -> tuple[SmoothedScene, ...]:
-    """Write the table of boxes and the summary; the folder is checked before the first run is asked for."""
+    """Write the table of boxes and the summary; the folder is checked before the first run is asked for.
+
+    write_others  adds the labels of all scenes in another format to the folder
+    """
     with atomic_directory(directory) as folder:
         done = tuple(runs)
-        _write_common(folder, done, suffix)
+        labels = [(run.scene, run.labels) for run in done]
+        write_label_table(folder / f"labels{suffix}", labels)
+        _write_summary(folder, {run.scene.name: (run.counts, run.seconds) for run in done})
+        if write_others is not None:
+            write_others(folder, labels)
     return done
 
 
@@ -45,40 +54,6 @@ def write_streamed_labels(
         write_label_table(folder / f"labels{suffix}", chain.from_iterable(run.spool.labels() for run in done))
         _write_summary(folder, {run.name: (run.counts, run.seconds) for run in done})
     return done
-
-
-def write_nuscenes_run(
-    directory: str | Path,
-    runs: Iterable[SmoothedScene],
-    dataroot: str | Path,
-    version: str,
-    meta: ResultMeta,
-    suffix: str = ".csv",
-) -> tuple[SmoothedScene, ...]:
-    """Write the table, the summary, the tracking result and the annotation tables of nuScenes scenes."""
-    with atomic_directory(directory) as folder:
-        done = tuple(runs)
-        _write_common(folder, done, suffix)
-        write_tracking_results(folder / "tracking.json", [(run.scene, run.tracks) for run in done], meta)
-        write_nuscenes_labels(folder, dataroot, version, [(run.scene, run.labels) for run in done])
-    return done
-
-
-def write_kitti_run(
-    directory: str | Path, runs: Iterable[SmoothedScene], dataset: KittiTracking, suffix: str = ".csv"
-) -> tuple[SmoothedScene, ...]:
-    """Write the table, the summary, label files and results of KITTI sequences."""
-    with atomic_directory(directory) as folder:
-        done = tuple(runs)
-        _write_common(folder, done, suffix)
-        write_kitti_labels(folder / "label_02", dataset, [(run.scene, run.labels) for run in done])
-        write_kitti_results(folder / "results", dataset, [(run.scene, run.tracks) for run in done])
-    return done
-
-
-def _write_common(folder: Path, runs: Sequence[SmoothedScene], suffix: str) -> None:
-    write_label_table(folder / f"labels{suffix}", [(run.scene, run.labels) for run in runs])
-    _write_summary(folder, {run.scene.name: (run.counts, run.seconds) for run in runs})
 
 
 def _write_summary(folder: Path, runs: Mapping[str, tuple[LabelCounts, float]]) -> None:

@@ -19,7 +19,7 @@ from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
 from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity, applies
 from saga_fg.model.node import distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
@@ -213,7 +213,7 @@ def build_graph(
                 mine = pair_kind == k
                 t, s = target[mine], source[mine]
                 law = rule.interaction
-                if not law.applies(nodes.types[t[0]], nodes.types[s[0]]):
+                if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
                     continue
                 if isinstance(law, AccelerationLaw):
                     nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))

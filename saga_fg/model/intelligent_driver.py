@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, PositiveOrInf, Settings, setting
 
@@ -50,6 +49,7 @@ class IntelligentDriver(Settings):
     The defaults are those of city traffic in Treiber and Kesting, Traffic Flow Dynamics (2013), table 11.2.
     """
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     free_speed: Positive = setting(15.0, "v_free: speed of a driver whom nobody hinders, m/s")
     headway: Positive = setting(1.0, "T: time headway that drivers want to keep, s")
     standstill_gap: NonNegative = setting(2.0, "s0: gap that drivers keep when they stand, bumper to bumper, m")
@@ -101,20 +101,14 @@ class IntelligentDriver(Settings):
         f = self.alone(v, s, w)
         return highest.where((s >= self.room) & (highest.value < f.value), f)
 
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
-
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
-        v_i, v_j = (nodes.types[rows[0]].index(VELOCITY) for rows in (target, source))
         v, w = speed_along(nodes, target, u_i), speed_along(nodes, source, u_j)
         distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u_i)
         f = self.following(v, distance - (nodes.length[target] + nodes.length[source]) / 2, w)
-        before = f._replace(value=f.value - f.by_leader * w)  # what the leader's speed adds is added below
-        triples = accelerated(nodes, target, source, u_i, v, before, self.time_constant)
-        from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :]
-        triples.A_other[:, v_i[:, None], v_j] = from_leader * f.by_leader[:, None, None]
-        return triples
+        at_rest = f._replace(value=f.value - f.by_leader * w)
+        from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
+        return accelerated(nodes, target, source, u_i, v, at_rest, self.time_constant, from_leader)
 
 
 def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
@@ -123,19 +117,21 @@ def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
 
 
 def accelerated(
-    nodes: NodeTable, target: IntArray, source: IntArray, u: FloatArray, v: FloatArray, f: Linearised, tau: float
+    nodes: NodeTable,
+    target: IntArray,
+    source: IntArray,
+    u: FloatArray,
+    v: FloatArray,
+    f: Linearised,
+    tau: float,
+    by_leader: FloatArray | None = None,
 ) -> Triples:
-    """The triples of an acceleration along u (E, 2), but for what depends on the speed of the source.
+    """The triples of an acceleration f along u (E, 2), linearised at the speeds v (E,) and the distances along u.
 
-    Linearised at the speeds v (E,) and the distances along u.
+    by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out
     """
-    p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-    p_j = nodes.types[source[0]].index(POSITION)
     along = tau * u[:, :, None] * u[:, None, :]
     distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
-    triples = no_triples(nodes, target, source)
-    triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
-    triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
-    triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
-    triples.b[:, v_i] = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
-    return triples
+    by_gap, by_speed = along * f.by_gap[:, None, None], along * f.by_speed[:, None, None]
+    constant = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
+    return velocity_triples(nodes, target, source, -by_gap, by_speed, by_gap, by_leader, constant)

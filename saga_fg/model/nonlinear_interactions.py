@@ -23,15 +23,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import expit
 
 from factors import NonlinearInteraction
 from saga_fg.model.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import Positive, Settings, setting, settings_group
 
@@ -59,7 +58,9 @@ class AccelerationLaw(Protocol):
     def alone(self) -> FloatArray:
         """What `accelerations` is given of a pair where nobody says more."""
 
-    def applies(self, target: NodeType, source: NodeType) -> bool: ...
+    @property
+    def needs(self) -> Needs:
+        """Components that target and source must have."""
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """What of the edges source[k] -> target[k] does not depend on states: (E, ...)."""
@@ -72,6 +73,7 @@ class AccelerationLaw(Protocol):
 class SmoothDriver(Settings):
     """A vehicle follows its leader, the source, as a driver does: an intelligent driver whose law has no corners."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     driver: IntelligentDriver = settings_group(IntelligentDriver, "the driver; `room` plays no part")
     length: Positive = setting(4.5, "of the gap that vehicles fill, between their centres, where boxes do not tell, m")
 
@@ -82,9 +84,6 @@ class SmoothDriver(Settings):
     @property
     def alone(self) -> FloatArray:
         return np.array(self.length)
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         filled = (nodes.length[target] + nodes.length[source]) / 2
@@ -108,6 +107,7 @@ class SmoothDriver(Settings):
 class SocialForce(Settings):
     """A pedestrian keeps away from another, or from a wall: from the nearest point of the source's outline."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2")
     falloff: Positive = setting(0.5, "B: distance over which it falls to a third, m")
     reach: Positive = setting(0.6, "sum of two radii, m; from a wall, one")
@@ -119,9 +119,6 @@ class SocialForce(Settings):
     @property
     def alone(self) -> FloatArray:
         return np.zeros((1, 4))
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E, k, 4) pieces of the outlines, both ends from the source's position; the last one repeated."""

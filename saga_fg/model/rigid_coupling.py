@@ -9,12 +9,12 @@ two is seen to do, the other does as well. From one interval to the next the off
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from saga_fg.model.edge_rules import Pairs
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, velocity_triples
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import (
@@ -30,23 +30,17 @@ from saga_fg.settings import (
 class RigidCoupling(Settings):
     """A node keeps the velocity of another and its present place relative to it."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     time_constant: PositiveOrInf = setting(
         1.0, "tau: time over which a change of the offset is made good, s; .inf for never"
     )
 
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
-
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-        p_j, v_j = (nodes.types[source[0]].index(names) for names in (POSITION, VELOCITY))
-        triples = no_triples(nodes, target, source)
-        triples.A_self[:, v_i, v_i] = -1.0
-        triples.A_self[:, v_i, p_i] = -1 / self.time_constant
-        triples.A_other[:, v_i, v_j] = 1.0
-        triples.A_other[:, v_i, p_j] = 1 / self.time_constant
-        triples.b[:, v_i] = -(nodes.position[source] - nodes.position[target]) / self.time_constant
-        return triples
+        offset = nodes.position[source] - nodes.position[target]
+        stiffness = np.eye(2) / self.time_constant
+        return velocity_triples(
+            nodes, target, source, -stiffness, -np.eye(2), stiffness, np.eye(2), -offset / self.time_constant
+        )
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from benchmarks import synthetic as bench
 from benchmarks.app import app
 from benchmarks.sampled_scenes import INTERVAL, SceneSettings, sample_scene
-from pipelines.cli.options import names
+from data_tools.datasets.source import names
 from saga_fg.model.edge_rules import Neighbours
 
 SHORT = SceneSettings(groups=2, members=3, seconds=6.0)

@@ -18,15 +18,15 @@ import numpy as np
 from kitti_example import write_sequence
 from nuscenes_example import box, results, write_results, write_tables
 
-from data_tools import KittiTracking, NuScenes, read_detections, split_scenes
 from data_tools.datasets.argoverse2 import ArgoverseLogs
-from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.eth_ucy import EthUcy
+from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
-from data_tools.datasets.nuscenes import read_scored_scenes
+from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
 from data_tools.datasets.plaza import read_plaza
 from data_tools.datasets.victoria_park import read_victoria_park
-from data_tools.export.labels import read_label_table
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import read_kitti_poses, read_tum_poses

@@ -14,12 +14,14 @@ from typing import Any
 
 import pytest
 import yaml
+from click import Context
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
+from data_tools.datasets.nuscenes.source import sensor_locations
+from data_tools.datasets.source import names
 from pipelines.cli import app
 from pipelines.cli.config import FIRST
-from pipelines.cli.options import names, sensor_files
 from saga_fg import InputError
 
 SAGA_FG = [sys.executable, "-c", "from pipelines.cli import main; main()"]
@@ -31,8 +33,10 @@ def saga_fg(*arguments: str | Path) -> Result:
 
 def commands(group: Any, path: str = "") -> Iterator[str]:
     """All commands by their full names: `track nuscenes`, ..."""
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
+    context = Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if hasattr(command, "list_commands"):
             yield from commands(command, f"{path}{name} ")
         else:
             yield f"{path}{name}"
@@ -153,12 +157,12 @@ def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_sensor_files_are_named() -> None:
-    assert sensor_files(["a.json"]) == {"lidar": Path("a.json")}
-    assert sensor_files(["lidar=a=b.json", "camera=c"]) == {"lidar": Path("a=b.json"), "camera": Path("c")}
+    assert sensor_locations(["a.json"]) == {"lidar": "a.json"}
+    assert sensor_locations(["lidar=a=b.json", "camera=c"]) == {"lidar": "a=b.json", "camera": "c"}
     with pytest.raises(InputError, match=r"--detections b\.json: expected NAME=FILE, e\.g\. lidar=b\.json"):
-        sensor_files(["a=x", "b.json"])
+        sensor_locations(["a=x", "b.json"])
     with pytest.raises(InputError, match="the sensor a is given twice"):
-        sensor_files(["a=x", "a=y"])
+        sensor_locations(["a=x", "a=y"])
 
 
 def test_names_are_split_at_commas() -> None:

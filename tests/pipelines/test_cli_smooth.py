@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.export.labels import read_label_table
+from data_tools.datasets.label_table import read_label_table
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
 from pipelines.cli import app
 from pipelines.config import Family
@@ -67,14 +67,11 @@ def test_labels_are_judged_beside_online_tracks_and_detections(tmp_path: Path) -
     run = runner.invoke(app, ["smooth", "simulated", "--scenes", "1", "--seed", "9", "-o", str(tmp_path / "labels"),
                               "--simulator", str(_short(tmp_path)), "--method", "kf"])  # fmt: skip
     assert run.exit_code == 0, run.output
-    arguments = ["evaluate", "labels", str(tmp_path / "labels"), "--simulated", "9"]
+    arguments = ["evaluate", "labels", "simulated", str(tmp_path / "labels"), "--seed", "9"]
     run = runner.invoke(app, [*arguments, "--simulator", str(_short(tmp_path)), "--method", "kf"])
     assert run.exit_code == 0, run.output
     for title in ("Precision and recall", "by class", "by range", "by occlusion", "Calibration", "Self-consistency"):
         assert title in run.output
-    run = runner.invoke(app, [*arguments, "--kitti", "x"])
-    assert run.exit_code == 2
-    assert "expected exactly one of" in run.stderr
 
 
 def test_labels_of_a_file_are_judged_without_truth(tmp_path: Path) -> None:
@@ -84,14 +81,23 @@ def test_labels_of_a_file_are_judged_without_truth(tmp_path: Path) -> None:
     run = runner.invoke(app, ["smooth", "file", str(table), "-o", str(tmp_path / "labels")])
     assert run.exit_code == 0, run.output
     figures = tmp_path / "figures.json"
-    arguments = ["evaluate", "labels", str(tmp_path / "labels"), "--file", str(table), "--json", str(figures)]
+    arguments = [
+        "evaluate",
+        "labels",
+        "file",
+        str(tmp_path / "labels"),
+        "--detections",
+        str(table),
+        "--json",
+        str(figures),
+    ]
     run = runner.invoke(app, arguments)
     assert run.exit_code == 0, run.output
     found = json.loads(figures.read_text())
     assert found["precision_recall"] == {}
     assert found["consistency"]["labels"]["boxes"] == 15
     assert found["consistency"]["labels"]["jerkiness"] < 1.0
-    run = runner.invoke(app, ["evaluate", "labels", str(tmp_path / "nothing"), "--file", str(table)])
+    run = runner.invoke(app, ["evaluate", "labels", "file", str(tmp_path / "nothing"), "--detections", str(table)])
     assert run.exit_code == 2
     assert "expected a folder that `saga-fg smooth` wrote" in run.stderr
 

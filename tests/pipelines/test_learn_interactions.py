@@ -9,8 +9,6 @@ from typer.testing import CliRunner
 import pipelines.learning.interactions
 from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
-from pipelines.learning import TrajectorySource
-from saga_fg import InputError
 from saga_fg.learning import fit_interactions
 from saga_fg.model.edge_rules import Following, Neighbours
 
@@ -45,7 +43,7 @@ def learned(detections):
     output = detections.parent / "interactions.yaml"
     with pytest.MonkeyPatch.context() as patch:  # the way to the file is tested here, not how good the fit is
         patch.setattr(pipelines.learning.interactions, "fit_interactions", partial(fit_interactions, iterations=3))
-        result = run(app, ["learn", "interactions", "--data", f"file={detections}", "--output", str(output)])
+        result = run(app, ["learn", "interactions", "file", str(detections), "--output", str(output)])
     assert result.exit_code == 0, result.output
     return output
 
@@ -78,19 +76,9 @@ def test_mistakes_are_answered_with_one_line(learned, detections):
     assert "goes with --method saga" in result.output
 
 
-def test_what_no_trajectories_come_from_is_refused():
-    with pytest.raises(InputError, match="expected KIND=PLACE with a kind of kitti"):
-        TrajectorySource.parsed("somewhere")
-    with pytest.raises(InputError, match="goes with --data kitti"):
-        TrajectorySource.parsed("eth_ucy=data", detections="x")
-    for place in ("none", "0", "\u00b2"):
-        with pytest.raises(InputError, match="expected a number of scenes"):
-            TrajectorySource.parsed(f"simulated={place}").trajectories()
-
-
 def test_the_detections_are_not_overwritten(detections):
     before = detections.read_bytes()
-    result = run(app, ["learn", "interactions", "--data", f"file={detections}", "--output", str(detections)])
+    result = run(app, ["learn", "interactions", "file", str(detections), "--output", str(detections)])
     assert result.exit_code == 2
     assert "expected another file than those that are read" in result.output
     assert detections.read_bytes() == before

@@ -15,11 +15,11 @@ import pytest
 from page_in_browser import tried_in_browser
 from typer.testing import CliRunner
 
+from data_tools.figures import FigureTable
 from data_tools.metrics import SceneBoxes, label_errors
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.figures import FigureTable
 from pipelines.report import (
     Report,
     RunRecord,

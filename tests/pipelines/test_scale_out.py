@@ -9,24 +9,24 @@ from pathlib import Path
 import pytest
 from scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
+from data_tools.datasets.detection_file_source import DetectionFileSource
+from data_tools.datasets.parts import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
+from data_tools.simulator.source import SimulatedScene, SimulatedSource
 from pipelines.scale_out import (
-    HeldScene,
     Job,
     LocalPool,
     Manifest,
-    Report,
+    RunSummary,
     SceneTask,
-    SimulatedInput,
     perform,
     run_scenes,
 )
 from pipelines.scale_out.folder import OutputFolder
-from pipelines.scale_out.job import SceneInput
 from saga_fg.errors import InputError
 
 
-def run(inputs: list[SceneInput], output: Path, task: SceneTask = TRACK, workers: int = 0) -> Report:
+def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> RunSummary:
     def new_pool(scratch):
         return LocalPool(workers, scratch) if workers else InThisProcess()
 
@@ -88,7 +88,7 @@ def test_other_settings_or_another_method_do_everything_again(tmp_path: Path) ->
 def test_results_of_an_earlier_form_do_not_stay_behind(tmp_path: Path) -> None:
     inputs, output = write_recordings(tmp_path / "in", 1), tmp_path / "out"
     run(inputs, output)
-    run(inputs, output, replace(TRACK, form=".ndjson"))
+    run(inputs, output, replace(TRACK, source=DetectionFileSource(table="ndjson")))
     assert list(content(output)) == ["a00.ndjson"]
 
 
@@ -148,7 +148,8 @@ def test_a_scene_that_kills_every_worker_fails_alone(tmp_path: Path) -> None:
 
 def test_simulated_scenes_are_made_at_the_worker(tmp_path: Path) -> None:
     settings = SimulatorSettings(duration=1.0, warm_up=2.0)
-    inputs = [SimulatedInput(settings, 2, 7, f"scene-000{k}") for k in (1, 2)]
+    source = SimulatedSource(simulator=settings, scenes=2, seed=7)
+    inputs = [SimulatedScene(source, f"scene-000{k}") for k in (1, 2)]
     run(inputs, tmp_path / "parallel", workers=2)
     run(inputs, tmp_path / "serial")
     assert content(tmp_path / "parallel") == content(tmp_path / "serial")
@@ -158,7 +159,7 @@ def test_simulated_scenes_are_made_at_the_worker(tmp_path: Path) -> None:
 
 def test_a_held_scene_is_known_by_all_it_holds() -> None:
     settings = SimulatorSettings(duration=1.0, warm_up=2.0)
-    source = SimulatedInput(settings, 1, 7, "scene-0001")
+    source = SimulatedScene(SimulatedSource(simulator=settings, scenes=1, seed=7), "scene-0001")
     with source.opened() as at:
         scene = at.read().scene("scene-0001")
     known = perform(Job(HeldScene(scene), TRACK)).digests

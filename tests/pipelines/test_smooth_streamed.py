@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
-from data_tools.export.labels import read_label_table
+from data_tools.datasets.label_table import read_label_table
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
 from pipelines.smoothing.chunks import Backlog, TrackedFrame

@@ -12,9 +12,9 @@ from nuscenes_example import VERSION, write_results, write_tables
 from typer.testing import CliRunner
 
 from data_tools.datasets.kitti import local_kitti
+from data_tools.datasets.kitti.source import KittiPart, KittiSource
 from data_tools.files.remote_files import local_tree
 from pipelines.cli import app
-from pipelines.scale_out.inputs import KittiInput
 from saga_fg.errors import InputError
 
 Put = Callable[[Path, str], str]
@@ -74,9 +74,10 @@ def test_a_worker_fetches_its_sequence_alone(tmp_path: Path, put: Put) -> None:
     with local_kitti(url, f"{url}/found", ["0008"]) as dataset:
         assert dataset.scenes == ("0008",)
         assert [path.name for path in dataset.files("0008")[0].parent.iterdir()] == ["0008.txt"]
-    with KittiInput(url, f"{url}/found", "0007").opened() as there:
+    with KittiPart(KittiSource(dataroot=url, detections=f"{url}/found", sequences="0007"), "0007").opened() as there:
         digests = there.digests
-    with KittiInput(str(root), str(root / "found"), "0007").opened() as here:
+    local = KittiSource(dataroot=str(root), detections=str(root / "found"), sequences="0007")
+    with KittiPart(local, "0007").opened() as here:
         assert digests == here.digests
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_file
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
+from data_tools.files.input_files import open_bytes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle
 from saga_fg.types.dataset import Scene
@@ -55,10 +57,20 @@ def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[A
         file.detach()
 
 
+def merge_tables(path: Path, parts: Iterable[Path]) -> None:
+    """Write the rows of several CSV tables with the same columns into one. Raises `InputError` where that fails."""
+    with atomic_file(path) as file:
+        for number, part in enumerate(parts):
+            with open_bytes(part) as table:
+                header = table.readline()
+                file.write(b"" if number else header)
+                shutil.copyfileobj(table, file)
+
+
 def track_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
     """The rows of `TRACK_COLUMNS`, None for what is unknown; `path` is named where tracks do not fit their scene."""
     for scene, moments in scenes:
-        with located(f"{path}: scene {scene.name}"):
+        with error_context(f"{path}: scene {scene.name}"):
             if len(moments) != len(scene):
                 raise InputError(f"expected tracks for {len(scene)} moments, got {len(moments)}")
         for timestamp, tracks in zip(scene.timestamps.tolist(), moments, strict=True):

@@ -12,15 +12,21 @@ https://github.com/crowdbotp/OpenTraj.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.located import located, unknown
+from data_tools.datasets.annotated import AnnotatedSource
+from data_tools.datasets.source import option
+from data_tools.files.error_messages import error_context, unknown_name
+from data_tools.files.remote_files import local_tree
 from data_tools.files.text_tables import read_table
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.dataset import Annotations, Dataset, Scene
 
 FRAME_RATES = {"eth": 15.0, "hotel": 25.0}  # of the videos, 1/s
 _COLUMNS = ("frame", "person", "x", "z", "y", "vx", "vz", "vy")
@@ -46,7 +52,7 @@ class EthUcy:
     def scene(self, name: str) -> Scene:
         """Read a recording; raises `InputError` for an unknown name or a line that is not as above."""
         if name not in self._scenes:
-            raise InputError(f"{self._root}: {unknown('recording', name, self._scenes)}")
+            raise InputError(f"{self._root}: {unknown_name('recording', name, self._scenes)}")
         path = self._root / name / "obsmat.txt"
         table = read_table(path, (len(_COLUMNS),), " ".join(_COLUMNS))
         if not len(table):
@@ -65,7 +71,21 @@ class EthUcy:
         frames, first = np.unique(frame[order], return_index=True)
         truth = []
         for number, rows in zip(frames.tolist(), np.split(order, first[1:]), strict=True):
-            with located(f"{path}: frame {number}"):
+            with error_context(f"{path}: frame {number}"):
                 truth.append(Annotations(person[rows].astype(np.str_), boxes.select(rows), np.ones(len(rows), bool)))
         poses = np.tile(np.eye(4), (len(frames), 1, 1))
         return Scene(name, frames / FRAME_RATES[name], poses, tuple(map(str, frames.tolist())), [], truth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EthUcySource(AnnotatedSource):
+    """ETH walking pedestrians: annotated positions on the ground plane, every 0.4 s."""
+
+    name = "eth_ucy"
+    example = "--dataroot data/eth_ucy --scenes hotel"
+    dataroot: str = option("Folder that holds eth/ and hotel/, or its URL.")
+
+    @contextmanager
+    def annotated(self) -> Iterator[Dataset]:
+        with local_tree(self.dataroot, ["*/obsmat.txt"]) as root:
+            yield EthUcy(root)

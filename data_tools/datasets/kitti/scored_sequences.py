@@ -15,27 +15,22 @@ from data_tools.datasets.detection_files import TrackRows, read_tracks
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD, KittiTracking
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
-from data_tools.files.located import located
+from data_tools.datasets.results import SceneResult
+from data_tools.files.error_messages import error_context
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.types.dataset import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredSequence:
-    """One sequence: the lines of its label file and of the result, and both as boxes in world coordinates.
-
-    scene  with the detections, if they were given
-    """
+class ScoredSequence(SceneResult):
+    """One sequence: also the lines of its label file and of the result, and the true boxes in world coordinates."""
 
     labels: KittiObjects
     result: KittiObjects
-    scene: Scene
     truth: SceneBoxes
-    found: SceneBoxes
 
 
 def read_scored_sequences(
@@ -48,12 +43,21 @@ def read_scored_sequences(
 
     Raises `InputError` for missing or broken files, and for results beyond the end of a sequence.
     """
+    chosen = result_sequences(result) if sequences is None else sequences
+    return scored_sequences(result, KittiTracking(dataroot, detections, chosen, ground_truth=True))
+
+
+def result_sequences(result: str | Path) -> tuple[str, ...]:
+    """The sequences that a folder has results for. Raises `InputError` where there are none."""
+    found = tuple(sorted(path.stem for path in Path(result).glob("[0-9]*.txt")))
+    if not found:
+        raise InputError(f"{result}: expected results NNNN.txt, there are none")
+    return found
+
+
+def scored_sequences(result: str | Path, dataset: KittiTracking) -> dict[str, ScoredSequence]:
+    """The sequences of a dataset with ground truth, each with its result; raises as `read_scored_sequences` does."""
     folder = Path(result)
-    if sequences is None:
-        sequences = sorted(path.stem for path in folder.glob("[0-9]*.txt"))
-        if not sequences:
-            raise InputError(f"{folder}: expected results NNNN.txt, there are none")
-    dataset = KittiTracking(dataroot, detections, sequences, ground_truth=True)
     table = read_tracks(folder / TRACK_TABLE) if (folder / TRACK_TABLE).exists() else None
     return {name: _scored(folder / f"{name}.txt", name, dataset, table) for name in dataset.scenes}
 
@@ -66,12 +70,13 @@ def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | No
     if len(result) and result.frame.max() >= len(scene):
         raise InputError(f"{path}: frame {result.frame.max()}: expected frames 0 to {len(scene) - 1} only")
     world_T_camera = scene.world_T_ego @ inverse_transform(dataset.calibration(name).camera_T_imu)
-    with located(str(path)):
+    with error_context(str(path)):
         found = _in_world(result, world_T_camera)
     if table is not None:
         found = _with_motion(found, table, name)
     assert scene.ground_truth is not None
-    return ScoredSequence(dataset.labels(name), result, scene, SceneBoxes.of_annotations(scene.ground_truth), found)
+    truth = SceneBoxes.of_annotations(scene.ground_truth)
+    return ScoredSequence(scene, found, dataset.labels(name), result, truth)
 
 
 def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:

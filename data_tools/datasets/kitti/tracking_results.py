@@ -1,4 +1,4 @@
-"""Tracking results in KITTI's text format: a file `NNNN.txt` for each sequence, one box a line,
+"""Tracking results and labels in KITTI's text format: a file `NNNN.txt` for each sequence, one box a line,
 
     frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y score
 
@@ -23,11 +23,12 @@ from data_tools.datasets.kitti.dataset import KittiTracking
 from data_tools.datasets.kitti.image_boxes import image_boxes, observation_angles
 from data_tools.datasets.kitti.labels import TYPES
 from data_tools.files.atomic_files import atomic_directory
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.kitti_objects import world_boxes_to_camera
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
 
@@ -54,12 +55,28 @@ def write_kitti_results(
 
         def written() -> Iterator[tuple[Scene, Sequence[Tracks]]]:
             for scene, moments in scenes:
-                with located(f"{directory}: sequence {scene.name}"):
+                with error_context(f"{directory}: sequence {scene.name}"):
                     text = kitti_result_text(scene, moments, dataset.calibration(scene.name), image_size)
                 (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
                 yield scene, moments
 
         write_tracks(folder / TRACK_TABLE, written())
+
+
+def write_kitti_labels(
+    directory: str | Path, dataset: KittiTracking, scenes: Iterable[tuple[Scene, Sequence[Labels]]]
+) -> None:
+    """Write labels as text of ground truth, without scores, to directory/NNNN.txt; the files appear when all is done.
+
+    Boxes that do not show in the image are left out. Raises `InputError` for a directory that is not writable, a size
+    or heading that is unknown, a class KITTI does not have.
+    """
+    with atomic_directory(directory) as folder:
+        for scene, moments in scenes:
+            tracks = [moment.tracks for moment in moments]
+            with error_context(f"{directory}: sequence {scene.name}"):
+                text = kitti_result_text(scene, tracks, dataset.calibration(scene.name), with_score=False)
+            (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
 
 
 def kitti_result_text(
@@ -107,5 +124,5 @@ def _lines(
 
 def _type(frame: int, label: str) -> str:
     if label not in _TYPE_OF_LABEL:
-        raise InputError(f"frame {frame}: {unknown('class', label, tuple(_TYPE_OF_LABEL))}")
+        raise InputError(f"frame {frame}: {unknown_name('class', label, tuple(_TYPE_OF_LABEL))}")
     return _TYPE_OF_LABEL[label]

@@ -12,18 +12,18 @@ from data_tools.datasets.nuscenes.bicycle_racks import read_bicycle_racks
 from data_tools.datasets.nuscenes.dataset import NuScenes
 from data_tools.datasets.nuscenes.scenes import SceneRecord
 from data_tools.datasets.nuscenes.tracking_results import MAX_BOXES, TrackingResults, read_tracking_results
+from data_tools.datasets.results import SceneResult
 from data_tools.metrics.nuscenes_tracking import NuScenesTrackingScene
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.dataset import Annotations
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredScene:
-    """One scene: as recorded, with ground truth, and detections if they were given; and as the metrics compare it."""
+class ScoredScene(SceneResult):
+    """One scene: also as the official metrics compare it."""
 
-    scene: Scene
     tracking: NuScenesTrackingScene
 
 
@@ -45,12 +45,11 @@ def read_scored_scenes(
     found = read_tracking_results(result)
     racks = read_bicycle_racks(dataset.folder, dataset.records)
     read = {name: dataset.scene(name) for name in dataset.scenes}
-    return {
-        name: ScoredScene(
-            scene, _scored(str(result), dataset.records[name], scene.ground_truth or (), racks[name], found)
-        )
+    scored = {
+        name: _scored(str(result), dataset.records[name], scene.ground_truth or (), racks[name], found)
         for name, scene in read.items()
     }
+    return {name: ScoredScene(read[name], tracking.found, tracking) for name, tracking in scored.items()}
 
 
 def _scored(

@@ -22,14 +22,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from saga_fg.model.edge_rules import VEHICLES, Pairs
 from saga_fg.model.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised, accelerated, speed_along
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, unit
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit
 from saga_fg.model.nonlinear_interactions import Accelerations, smooth_acceleration
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
@@ -81,11 +80,9 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
 class Stopping(Settings):
     """Even deceleration to a halt before a line; the source is the line."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
     margin: NonNegative = setting(3.0, "way left between the front of a vehicle and the line's middle at the halt, m")
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """g (E,), m, for ways (E,) from the centres to the line."""
@@ -102,10 +99,8 @@ class Stopping(Settings):
 class DriverStopping:
     """Coming to a line as to the end of a queue; the source is the line."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     driver: IntelligentDriver = settings_group(IntelligentDriver, "how he drives; his standstill gap is to the line")
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """Gap (E,), m, for ways (E,) from the centres to the line."""
@@ -122,6 +117,7 @@ class DriverStopping:
 class SmoothStopping:
     """Coming to a line as to the end of a queue, without corners in the law; the source is the line."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     driver: IntelligentDriver = settings_group(IntelligentDriver, "how he drives; `room` plays no part")
 
     @property
@@ -131,9 +127,6 @@ class SmoothStopping:
     @property
     def alone(self) -> FloatArray:
         return np.array([1.0, 0.0, 0.0])
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """Gap (E,), m, for ways (E,) from the centres to the line."""

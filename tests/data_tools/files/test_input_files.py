@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from data_tools import read_detections
-from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
+from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import read_tracking_results
 from data_tools.datasets.plaza import read_plaza
 from data_tools.datasets.victoria_park import read_victoria_park
-from data_tools.export.labels import read_label_table
 from data_tools.files.input_files import open_bytes, read_text
 from data_tools.files.json_stream import open_json, parsed_json
 from data_tools.files.remote_files import expanded

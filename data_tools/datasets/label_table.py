@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ import numpy as np
 from data_tools.datasets.detection_files import TRACK_COLUMNS, TrackRows, track_rows, write_rows
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.datasets.detection_files.track_rows import REQUIRED, track_rows_of
-from data_tools.export.labels.parquet import write_parquet
+from data_tools.files.atomic_files import atomic_file
+from saga_fg.errors import MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Scene
 
 LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality")
+ROWS_AT_A_TIME = 65536  # of a Parquet file
 
 LabelledScenes = Iterable[tuple[Scene, Sequence[Labels]]]
 
@@ -49,7 +52,7 @@ def write_label_table(path: str | Path, scenes: LabelledScenes) -> None:
     """
     rows = _rows(str(path), scenes)
     if Path(path).suffix.lower() == ".parquet":
-        write_parquet(path, LABEL_COLUMNS, rows, texts=("scene", "label", "source", "quality"))
+        _write_parquet(path, LABEL_COLUMNS, rows, texts=("scene", "label", "source", "quality"))
     else:
         write_rows(path, LABEL_COLUMNS, rows)
 
@@ -74,3 +77,23 @@ def _rows(path: str, scenes: LabelledScenes) -> Iterator[list[Any]]:
         extra = zip(variance.tolist(), source.tolist(), quality.tolist(), strict=True)
         for row, (v, s, q) in zip(track_rows(path, [(scene, tracks)]), extra, strict=True):
             yield [*row, None if v != v else v, s, q]
+
+
+def _write_parquet(
+    path: str | Path, columns: tuple[str, ...], rows: Iterable[list[Any]], texts: tuple[str, ...]
+) -> None:
+    """Write rows as they come; columns in `texts` are text, id is a whole number, all others numbers, None is null.
+
+    Raises `MissingExtraError` without pyarrow, `InputError` for a path that is not writable.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        raise MissingExtraError(f"{path}: Parquet needs pyarrow: pip install 'saga-fg[parquet]'") from error
+    kinds = {name: pa.string() if name in texts else pa.int64() if name == "id" else pa.float64() for name in columns}
+    schema = pa.schema(list(kinds.items()))
+    source = iter(rows)
+    with atomic_file(path) as file, pq.ParquetWriter(file, schema) as writer:
+        while block := list(islice(source, ROWS_AT_A_TIME)):
+            writer.write_table(pa.table(dict(zip(columns, zip(*block, strict=True), strict=True)), schema=schema))

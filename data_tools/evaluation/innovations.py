@@ -7,27 +7,15 @@ covariances are right. What lies outside the gate is never matched, which lowers
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import coverages
-from pipelines.explaining import read_events
-from pipelines.figures import FigureTable, cell
 from saga_fg.numerics.arrays import FloatArray
 
 _COLUMNS = ("class", "matches", "NIS / 2", "median", "in 50 %", "in 90 %", "in 99 %")
-
-
-def journal_innovations(journal: Path) -> dict[str, FloatArray]:
-    """Squared distances by class, from a journal of a tracker. Raises `InputError` for one missing or broken."""
-    found: dict[str, list[float]] = {}
-    for event in read_events(journal):
-        if event.get("event") == "matched":
-            chosen = next(c for c in event["candidates"] if c["outcome"] == "chosen")
-            found.setdefault(event["label"], []).append(chosen["distance2"])
-    return {label: np.array(values) for label, values in sorted(found.items())}
 
 
 def innovation_table(by_class: Mapping[str, FloatArray]) -> FigureTable:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_tools.datasets.label_table import LABEL_COLUMNS, read_label_table, write_label_table
 from data_tools.datasets.nuscenes import NuScenes
-from data_tools.export.labels import LABEL_COLUMNS, read_label_table, write_label_table, write_nuscenes_labels
+from data_tools.datasets.nuscenes.labels import write_nuscenes_labels
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
 from saga_fg.errors import InputError
 from saga_fg.smoothing import Labels

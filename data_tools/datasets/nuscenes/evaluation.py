@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.nuscenes import ScoredScene
+from data_tools.datasets.nuscenes.scored_scenes import ScoredScene
+from data_tools.evaluation import Evaluation
+from data_tools.evaluation.hota import HotaRow, hota
+from data_tools.evaluation.placed_detections import PlacedBoxes, placed_detections
+from data_tools.figures import FigureTable, cell, count
 from data_tools.metrics import (
     LabelErrors,
     NuScenesClassMetrics,
@@ -21,11 +23,6 @@ from data_tools.metrics import (
     nuscenes_tracking_metrics,
 )
 from data_tools.plots import recall_sweep
-from pipelines.evaluation.errors import error_json, error_pictures, error_tables
-from pipelines.evaluation.hota import HotaRow, hota, hota_json, hota_table
-from pipelines.evaluation.innovations import innovation_json, innovation_table
-from pipelines.evaluation.placed_detections import PlacedBoxes, placed_detections
-from pipelines.figures import FigureTable, cell, count
 from saga_fg.numerics.arrays import FloatArray
 
 REACH = 1  # keyframes to either side for a label's velocity, 0.5 s
@@ -35,42 +32,9 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class NuScenesEvaluation:
-    """The figures of one result over some scenes; `hota` is empty where it was not asked for."""
-
-    scenes: tuple[str, ...]
-    tracking: NuScenesTrackingMetrics
-    errors: LabelErrors
-    hota: Sequence[HotaRow] = ()
-    innovations: Mapping[str, FloatArray] = field(default_factory=dict)
-
-    def tables(self) -> list[FigureTable]:
-        """For people."""
-        first = nuscenes_table("nuScenes tracking metrics; AMOTP, MOTP in m, TID, LGD in s", self.tracking)
-        innovations = [innovation_table(self.innovations)] if self.innovations else []
-        return [first, *error_tables(self.errors), *innovations, *([hota_table(self.hota)] if self.hota else [])]
-
-    def figures(self) -> dict[str, Any]:
-        """For programs."""
-        return {
-            "scenes": self.scenes,
-            "overall": self.tracking.overall,
-            "per_class": self.tracking.per_class,
-            "curves": self.tracking.curves,
-            **error_json(self.errors),
-            "innovations": innovation_json(self.innovations),
-            "hota": hota_json(self.hota),
-        }
-
-    def pictures(self) -> dict[str, Any]:
-        """matplotlib figures by name."""
-        return {"recall": recall_sweep(self.tracking.curves), **error_pictures(self.errors)}
-
-
 def evaluate_nuscenes(
     scored: Mapping[str, ScoredScene], with_hota: bool = False, innovations: Mapping[str, FloatArray] | None = None
-) -> NuScenesEvaluation:
+) -> Evaluation:
     """Score the tracks of the scenes that were read; errors are judged at the labels that their detections match.
 
     innovations  of the journal of the run, by class, to be among the figures
@@ -78,15 +42,21 @@ def evaluate_nuscenes(
     Raises `MissingExtraError` for HOTA without trackeval.
     """
     tracking = nuscenes_tracking_metrics([each.tracking for each in scored.values()])
-    return NuScenesEvaluation(
-        tuple(scored),
-        tracking,
+    return Evaluation(
+        nuscenes_table("nuScenes tracking metrics; AMOTP, MOTP in m, TID, LGD in s", tracking),
+        {
+            "scenes": tuple(scored),
+            "overall": tracking.overall,
+            "per_class": tracking.per_class,
+            "curves": tracking.curves,
+        },
         LabelErrors.pool(
             nuscenes_label_errors(each.tracking, placed_detections(each.scene) if each.scene.frames else None)
             for each in scored.values()
         ),
         nuscenes_hota([each.tracking for each in scored.values()], tracking) if with_hota else (),
         innovations or {},
+        lambda: {"recall": recall_sweep(tracking.curves)},
     )
 
 

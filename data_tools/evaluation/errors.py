@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Calibration, ErrorSummary, LabelErrors, calibration, error_summary, errors_by_class
 from data_tools.plots import calibration_plot, error_histograms
-from pipelines.figures import FigureTable, cell
 
 _ERRORS = (
     *("class", "labels", "with track", "position", "detection", "velocity", "... parked", "... moving"),

@@ -1,27 +1,32 @@
-"""A KITTI tracking result scored: figures averaged over recall, errors at labels, calibration, HOTA."""
+"""A KITTI tracking result scored: figures averaged over recall, errors at labels, calibration, HOTA.
+
+HOTA is of what the benchmark judges (`data_tools.metrics.kitti_tracking.evaluated_objects`), by the overlap in the
+image as well, as published figures are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence
+from data_tools.evaluation import Evaluation
+from data_tools.evaluation.hota import HotaRow, mean_scores
+from data_tools.evaluation.placed_detections import placed_detections
+from data_tools.figures import FigureTable, cell
+from data_tools.kitti_objects import KittiObjects
 from data_tools.metrics import (
+    KittiSimilarity,
     KittiTrackingMetrics,
     KittiTrackingSequence,
     LabelErrors,
+    kitti_hota_metrics,
     kitti_tracking_metrics,
     label_errors,
     label_velocities,
 )
-from pipelines.evaluation.errors import error_json, error_pictures, error_tables
-from pipelines.evaluation.hota import HotaRow, hota_json, hota_table, kitti_hota
-from pipelines.evaluation.innovations import innovation_json, innovation_table
-from pipelines.evaluation.placed_detections import placed_detections
-from pipelines.figures import FigureTable, cell
 from saga_fg.numerics.arrays import FloatArray
 
 CLASSES = ("car", "pedestrian", "cyclist")
@@ -31,38 +36,8 @@ _COLUMNS = (
     *("class", "3D IoU", "sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
     *("TP", "FP", "FN", "GT", "MT", "ML"),
 )
+SIMILARITIES: dict[str, KittiSimilarity] = {"image": "image", "2D": "bev_iou", "3D": "iou_3d"}
 ByIou = Mapping[float, KittiTrackingMetrics]
-
-
-@dataclass(frozen=True, eq=False)
-class KittiEvaluation:
-    """The figures of one result over some sequences: by class that occurs, and 3D IoU."""
-
-    sequences: tuple[str, ...]
-    tracking: Mapping[str, ByIou]
-    errors: LabelErrors
-    hota: Sequence[HotaRow] = ()
-    innovations: Mapping[str, FloatArray] = field(default_factory=dict)
-
-    def tables(self) -> list[FigureTable]:
-        """For people."""
-        first = kitti_table("KITTI 3D tracking metrics, in %", self.tracking)
-        innovations = [innovation_table(self.innovations)] if self.innovations else []
-        return [first, *error_tables(self.errors), *innovations, *([hota_table(self.hota)] if self.hota else [])]
-
-    def figures(self) -> dict[str, Any]:
-        """For programs."""
-        return {
-            "sequences": self.sequences,
-            "per_class": self.tracking,
-            **error_json(self.errors),
-            "innovations": innovation_json(self.innovations),
-            "hota": hota_json(self.hota),
-        }
-
-    def pictures(self) -> dict[str, Any]:
-        """matplotlib figures by name."""
-        return error_pictures(self.errors)
 
 
 def evaluate_kitti(
@@ -71,7 +46,7 @@ def evaluate_kitti(
     ious: Sequence[float] = IOUS,
     with_hota: bool = False,
     innovations: Mapping[str, FloatArray] | None = None,
-) -> KittiEvaluation:
+) -> Evaluation:
     """Score the tracks of the sequences that were read; errors are judged at the labels that their detections match.
 
     innovations  of the journal of the run, by class, to be among the figures
@@ -85,9 +60,9 @@ def evaluate_kitti(
         if by_iou:
             tracking[label] = by_iou
     best = {label: next(iter(by_iou.values())).threshold for label, by_iou in tracking.items()}
-    return KittiEvaluation(
-        tuple(scored),
-        tracking,
+    return Evaluation(
+        kitti_table("KITTI 3D tracking metrics, in %", tracking),
+        {"sequences": tuple(scored), "per_class": tracking},
         LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
         kitti_hota(pairs, best) if with_hota else (),
         innovations or {},
@@ -99,6 +74,23 @@ def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str]) -> LabelE
     truth = scored.truth.select(np.flatnonzero(np.isin(scored.truth.boxes.label, classes)))
     velocity = label_velocities(truth, scored.scene.timestamps, REACH)
     return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if scored.scene.frames else None)
+
+
+def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[str, float]) -> list[HotaRow]:
+    """Judge the tracks that reach the threshold of their class. Raises `MissingExtraError` without trackeval."""
+    rows = []
+    for label, threshold in thresholds.items():
+        judged = [replace(each, found=_surer_lines(each.found, label, threshold)) for each in sequences]
+        for overlap, similarity in SIMILARITIES.items():
+            rows.append(HotaRow(label, overlap, threshold, kitti_hota_metrics(judged, label, similarity)))
+    return rows
+
+
+def _surer_lines(found: KittiObjects, label: str, threshold: float) -> KittiObjects:
+    """Select the objects of a class in tracks whose mean score is at least `threshold`; no score counts as infinite."""
+    rows = np.flatnonzero(np.char.lower(found.type) == label)
+    score = np.nan_to_num(found.score[rows], nan=np.inf)
+    return found.select(rows[mean_scores(found.track_id[rows], score) >= threshold - 1e-12])
 
 
 def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:

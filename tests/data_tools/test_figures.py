@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.figures import FigureTable, as_json, cell, count, write_figures
+from data_tools.figures import FigureTable, as_json, cell, count, write_figures
 
 
 @dataclass

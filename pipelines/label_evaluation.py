@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.export.labels import LabelRows, read_label_table
+from data_tools.datasets.label_table import LabelRows, read_label_table
+from data_tools.evaluation.placed_detections import placed_detections
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import SceneBoxes, coverages
 from data_tools.metrics.labels import (
     CommonBoxes,
@@ -22,8 +24,6 @@ from data_tools.metrics.labels import (
     self_consistency,
 )
 from pipelines.config import Method
-from pipelines.evaluation.placed_detections import placed_detections
-from pipelines.figures import FigureTable, cell
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError

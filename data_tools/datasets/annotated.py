@@ -1,0 +1,80 @@
+"""Recordings that have ground truth and no detections: these come from a table, or from the annotations."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from data_tools.datasets.detection_files import DetectionFile, read_detections
+from data_tools.datasets.source import ChosenScenes, DatasetSource, option
+from data_tools.files.remote_files import is_url, local_copy
+from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.frame import Detections, Frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnnotatedSource(DatasetSource):
+    """Annotated recordings; without a table, detections are the visible boxes without identities and velocities."""
+
+    detections: str | None = option(
+        "Table of detections (.csv, .ndjson, .jsonl, .npz), s from the recording's first moment; without it, what is "
+        "annotated and visible is detected, without identities and velocities.",
+        None,
+        metavar="TABLE",
+    )
+    scenes: str | None = option("Recordings with commas between them; all if left out.", None)
+
+    @abstractmethod
+    def annotated(self) -> AbstractContextManager[Dataset]:
+        """The recordings with their ground truth, without frames."""
+
+    @contextmanager
+    def open(self, truth: bool = False) -> Iterator[Dataset]:
+        with self.annotated() as recordings:
+            dataset = recordings if self.scenes is None else ChosenScenes(recordings, self.scenes)
+            if self.detections is None:
+                yield DetectedScenes(dataset, None)
+            else:
+                with local_copy(self.detections) as path:
+                    yield DetectedScenes(dataset, read_detections(path))
+
+    def restricted(self, scenes: Collection[str]) -> Self:
+        return replace(self, scenes=",".join(scenes))
+
+    def input_files(self) -> tuple[Path, ...]:
+        return () if self.detections is None or is_url(self.detections) else (Path(self.detections),)
+
+
+class DetectedScenes:
+    """The scenes of a dataset with the detections of a table, or with their annotations as detections."""
+
+    def __init__(self, dataset: Dataset, table: DetectionFile | None) -> None:
+        self._dataset, self._table = dataset, table
+        self.scenes = dataset.scenes
+
+    def scene(self, name: str) -> Scene:
+        """Read one of the scenes; raises `InputError` where the table does not have it."""
+        scene = self._dataset.scene(name)
+        return replace(scene, frames=detected(scene) if self._table is None else self._table.scene(name).frames)
+
+
+def detected(scene: Scene) -> list[Frame]:
+    """A frame for each moment, of sensor "annotations": its visible boxes, of score 1, without ids and velocities.
+
+    Raises `InputError` for a scene without ground truth.
+    """
+    if scene.ground_truth is None:
+        raise InputError(f"scene {scene.name}: expected ground truth to take detections from")
+    frames = []
+    for time, pose, truth in zip(scene.timestamps.tolist(), scene.world_T_ego, scene.ground_truth, strict=True):
+        boxes = truth.boxes.select(truth.visible)
+        unknown = replace(boxes, velocity=np.full((len(boxes), 2), np.nan))
+        frames.append(Frame(time, "annotations", Detections(unknown, np.ones(len(boxes))), pose))
+    return frames

@@ -1,0 +1,148 @@
+"""KITTI tracking as a dataset of the command."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+from data_tools.datasets.detection_files.tracks import merge_tables
+from data_tools.datasets.kitti.dataset import KittiTracking
+from data_tools.datasets.kitti.remote import local_kitti
+from data_tools.datasets.kitti.scored_sequences import ScoredSequence, result_sequences, scored_sequences
+from data_tools.datasets.kitti.tracking_results import TRACK_TABLE, write_kitti_labels, write_kitti_results
+from data_tools.datasets.kitti.velodyne import KittiScans
+from data_tools.datasets.parts import OpenedPart, Parts, file_digest
+from data_tools.datasets.results import SceneResult
+from data_tools.datasets.source import (
+    TRACKING,
+    DatasetSource,
+    Innovations,
+    LabelledScenes,
+    TrackedScenes,
+    names,
+    option,
+)
+from data_tools.files.remote_files import is_url
+from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset
+
+if TYPE_CHECKING:
+    from data_tools.evaluation import Evaluation
+
+
+@dataclass(frozen=True, kw_only=True)
+class KittiSource(DatasetSource):
+    """KITTI tracking sequences; results are the official text, one file a sequence, beside them tracks.csv in full."""
+
+    name = "kitti"
+    family = "kitti"
+    example = "--dataroot data/kitti --detections data/kitti/detections/pointrcnn --sequences 0000,0011"
+    tracks = "Folder to write NNNN.txt to."
+    tracks_example = "results"
+    merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
+    dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
+    detections: str | None = option(
+        "Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.", None, required=TRACKING
+    )
+    sequences: str | None = option("Sequences with commas between them; all, or all results, if left out.", None)
+    iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate",))
+    classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate",))
+
+    def __post_init__(self) -> None:
+        overlaps(self.iou)
+
+    @contextmanager
+    def open(self, truth: bool = False) -> Iterator[KittiTracking]:
+        with local_kitti(self.dataroot, self.detections, self._chosen(), truth) as dataset:
+            yield dataset
+
+    def restricted(self, scenes: Collection[str]) -> Self:
+        return replace(self, sequences=",".join(scenes))
+
+    @contextmanager
+    def parts(self) -> Iterator[Parts]:
+        with self.open() as dataset:
+            scenes = dataset.scenes
+        yield Parts(scenes, (KittiPart(self.restricted([name]), name) for name in scenes))
+
+    def scans(self, scenes: Collection[str]) -> Mapping[str, KittiScans]:
+        if is_url(self.dataroot):
+            return {}
+        root = Path(self.dataroot)
+        root = root / "training" if (root / "training").is_dir() else root
+        there = (name for name in scenes if (root / "velodyne" / name).is_dir())
+        return {name: KittiScans(root, name, timed=False) for name in there}
+
+    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_results(output, dataset, scenes)
+
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_labels(folder / "label_02", dataset, scenes)
+        self.write_tracks(
+            folder / "results", dataset, [(scene, [moment.tracks for moment in labels]) for scene, labels in scenes]
+        )
+
+    def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
+        self.write_tracks(folder / "tracks", dataset, scenes)
+        (folder / "tracks" / TRACK_TABLE).rename(folder / "tracks" / f"{stem}.csv")
+
+    def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
+        self.write_labels(folder, dataset, scenes)
+        (folder / "results" / TRACK_TABLE).rename(folder / "results" / f"{stem}.csv")
+
+    def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
+        merge_tables(output / self.merged[0], [output / "tracks" / f"{stem}.csv" for stem in stems])
+
+    def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
+        merge_tables(output / self.merged[1], [output / "results" / f"{stem}.csv" for stem in stems])
+
+    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+        chosen = self._chosen()
+        chosen = result_sequences(result) if chosen is None else chosen
+        with self.restricted(chosen).open(truth=True) as dataset:
+            return scored_sequences(result, dataset)
+
+    def evaluate(
+        self,
+        results: Mapping[str, SceneResult],
+        hota: bool = False,
+        innovations: Innovations | None = None,
+    ) -> Evaluation:
+        from data_tools.datasets.kitti.evaluation import evaluate_kitti
+
+        scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
+        return evaluate_kitti(scored, names("--classes", self.classes), overlaps(self.iou), hota, innovations)
+
+    def _chosen(self) -> tuple[str, ...] | None:
+        return None if self.sequences is None else names("--sequences", self.sequences)
+
+
+@dataclass(frozen=True)
+class KittiPart:
+    """A sequence, read at the worker."""
+
+    source: KittiSource
+    name: str
+
+    @contextmanager
+    def opened(self) -> Iterator[OpenedPart]:
+        """With the digests of its text files."""
+        with self.source.open() as dataset:
+            files = dataset.files(self.name)
+            yield OpenedPart({f"{path.parent.name}/{path.name}": file_digest(path) for path in files}, lambda: dataset)
+
+
+def overlaps(text: str) -> tuple[float, ...]:
+    """Overlaps with commas between them. Raises `InputError` for others than those above 0 and at most 1."""
+    try:
+        values = tuple(float(value) for value in names("--iou", text))
+    except ValueError:
+        raise InputError(f"--iou: expected numbers with commas between them, got {text!r}") from None
+    if not all(0 < value <= 1 for value in values):
+        raise InputError(f"--iou: expected overlaps above 0 and at most 1, got {text!r}")
+    return values

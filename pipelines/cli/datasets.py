@@ -1,0 +1,170 @@
+"""The commands of a verb: one for each dataset, with the options of both; made when they are asked for."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+
+import typer
+from typer.core import TyperGroup
+
+from saga_fg.errors import InputError
+
+if TYPE_CHECKING:
+    from data_tools.datasets.source import DatasetSource, Verb
+
+Source = type["DatasetSource"]
+_WIDTH = 92  # columns of an example
+
+
+def dataset_commands(
+    verb: Verb,
+    run: Callable[..., None],
+    examples: tuple[str, ...],
+    texts: Callable[[Source], Mapping[str, str | None]] = lambda source: {},
+) -> type[TyperGroup]:
+    """A group with a command `saga-fg VERB DATASET` for each dataset, beside those that are added to it.
+
+    run       called with the dataset and the values of its other parameters, which are the verb's options; its
+              docstring is the help
+    examples  what follows `saga-fg`, with the fields {recordings}: name and options of the dataset, {result}: the same
+              with a result, {name} alone, {tracks}: name of a result alone
+    texts     of the verb's options that differ for a dataset, by parameter; None leaves the option out
+    """
+
+    class DatasetGroup(TyperGroup):
+        def list_commands(self, ctx: Any) -> list[str]:
+            from data_tools.datasets.registry import dataset_names
+
+            return [*dataset_names(), *super().list_commands(ctx)]
+
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+            from data_tools.datasets.registry import dataset_names, dataset_source
+
+            own = super().get_command(ctx, cmd_name)
+            if own is not None:
+                return own
+            try:
+                return _command(verb, run, dataset_source(cmd_name), examples, texts)
+            except InputError as error:
+                if cmd_name not in dataset_names():
+                    raise
+                return _broken(cmd_name, error)  # so that the list of all datasets can be shown
+
+    return DatasetGroup
+
+
+def _command(
+    verb: Verb,
+    run: Callable[..., None],
+    source: Source,
+    examples: tuple[str, ...],
+    texts: Callable[[Source], Mapping[str, str | None]],
+) -> Any:
+    """The command of a verb for one dataset."""
+    _, *of_verb = inspect.signature(run).parameters.values()
+    hints = get_type_hints(run, localns={"DatasetSource": object}, include_extras=True)
+    of_verb = [each.replace(annotation=hints[each.name]) for each in of_verb]
+    reads_result = any(each.name == "result" for each in of_verb)
+    different = texts(source)
+    parameters = [
+        _described(each, different[each.name]) if each.name in different else each
+        for each in of_verb
+        if different.get(each.name, "") is not None
+    ]
+    of_dataset = _parameters(source, verb, reads_result)
+    taken = {each.name for each in parameters} & {each.name for each in of_dataset}
+    if taken:
+        raise InputError(f"dataset {source.name}: {min(taken)}: expected another name, {verb} has such an option")
+    settings = _settings(source)
+
+    def command(**values: Any) -> None:
+        from pipelines.configuration import load_settings
+
+        chosen = {each.name: values.pop(each.name) for each in of_dataset}
+        for name, kind in settings.items():
+            if chosen.get(name) is not None:
+                chosen[name] = load_settings(kind, chosen[name])
+        run(source(**chosen), **values)
+
+    ordered = sorted([*of_dataset, *parameters], key=lambda each: each.name != "result")
+    keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in ordered]
+    command.__signature__ = inspect.Signature(keyword)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in keyword}
+    app = typer.Typer(rich_markup_mode=None, add_completion=False)
+    text = f"{inspect.getdoc(run)}\n\n{inspect.getdoc(source)}\n\n{_examples(verb, source, examples)}"
+    app.command(source.name, help=text, short_help=(inspect.getdoc(source) or "").partition("\n\n")[0])(command)
+    return typer.main.get_command(app)
+
+
+def _broken(name: str, error: InputError) -> Any:
+    """A command in place of one that cannot be made, which says why."""
+    app = typer.Typer(rich_markup_mode=None, add_completion=False)
+
+    def command(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+        raise error
+
+    context = {"ignore_unknown_options": True}
+    app.command(name, help=f"Cannot be loaded: {error}", context_settings=context)(command)
+    return typer.main.get_command(app)
+
+
+def _parameters(source: Source, verb: Verb, reads_result: bool) -> list[inspect.Parameter]:
+    """The options of a dataset that a verb has."""
+    hints, settings, parameters = get_type_hints(source), _settings(source), []
+    for each in fields(source):
+        about = each.metadata
+        if "text" not in about or (about["verbs"] and verb not in about["verbs"]):
+            continue
+        common = {"help": about["text"], "metavar": about["metavar"], "min": about["least"]}
+        flag = about["flag"] or f"--{each.name.replace('_', '-')}"
+        is_argument = about["argument"] and not reads_result
+        info = typer.Argument(**common) if is_argument else typer.Option(flag, **common)
+        required = each.default is MISSING or verb in about["required"]
+        parameters.append(
+            inspect.Parameter(
+                each.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=inspect.Parameter.empty if required else each.default,
+                annotation=Annotated[Path | None if each.name in settings else hints[each.name], info],
+            )
+        )
+    return parameters
+
+
+def _settings(source: Source) -> dict[str, type[Any]]:
+    """The options of a dataset that are read from YAML files: their dataclasses by name."""
+    hints = get_type_hints(source)
+    kinds = {each.name: (hints[each.name], *get_args(hints[each.name])) for each in fields(source)}
+    found = {name: [kind for kind in of if isinstance(kind, type) and is_dataclass(kind)] for name, of in kinds.items()}
+    return {name: of[0] for name, of in found.items() if of}
+
+
+def _described(parameter: inspect.Parameter, text: str | None) -> inspect.Parameter:
+    """The same option with another help."""
+    kind, info = get_args(parameter.annotation)
+    other = copy(info)
+    other.help = text
+    return parameter.replace(annotation=Annotated[kind, other])
+
+
+def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
+    """Worked examples, in lines that are not too long."""
+    required = [each.name for each in _parameters(source, verb, False) if each.default is inspect.Parameter.empty]
+    options = source.example or " ".join(f"--{name.replace('_', '-')} {name.upper()}" for name in required)
+    recordings = f"{source.name} {options}"
+    arguments = [f"--{each.name} " for each in fields(source) if each.metadata.get("argument")]
+    result = "labels" if verb == "evaluate labels" else source.tracks_example
+    beside = f"{source.name} {result} {''.join(arguments)}{options}"
+    lines = []
+    for example in examples:
+        line = "  saga-fg " + example.format(recordings=recordings, result=beside, name=source.name, tracks=result)
+        while len(line) > _WIDTH and (cut := line.rfind(" --", 20, _WIDTH - 2)) > 0:
+            lines.append(f"{line[:cut]} \\")
+            line = f"     {line[cut:]}"
+        lines.append(line)
+    return "\n".join(["\b", "Example:" if len(examples) == 1 else "Examples:", *lines])

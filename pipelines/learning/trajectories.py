@@ -1,0 +1,21 @@
+"""Trajectories of a dataset to learn interactions from."""
+
+from __future__ import annotations
+
+from data_tools.datasets.source import DatasetSource
+from pipelines.config import load_config
+from pipelines.tracking import track_scene
+from saga_fg.learning import Trajectories
+
+
+def trajectories(source: DatasetSource, with_truth: bool) -> dict[str, Trajectories]:
+    """Those of the ground truth by recording, or what the classical tracker makes of the detections.
+
+    Raises `InputError` for what cannot be read.
+    """
+    with source.open(truth=with_truth) as dataset:
+        if with_truth:
+            return {name: Trajectories.of_truth(dataset.scene(name)) for name in dataset.scenes}
+        config = load_config(source.family)
+        runs = (track_scene(dataset.scene(name), config.new_tracker("kf")) for name in dataset.scenes)
+        return {run.scene.name: Trajectories.of_tracks(run.tracks) for run in runs}

@@ -1,0 +1,74 @@
+"""Tracking and smoothing as tasks for many recordings, with the results in the dataset's own format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from data_tools.datasets.source import DatasetSource
+from pipelines.config import Method, TrackConfig
+from pipelines.configuration import write_settings
+from pipelines.scale_out.manifest import file_name
+from pipelines.smoothing import SmoothConfig, smooth_dataset
+from pipelines.tracking import TrackedScene, track_dataset
+from saga_fg.smoothing import LabelCounts
+from saga_fg.types.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class TrackTask:
+    """Track the scenes of a part; results in tracks/, as the dataset writes them."""
+
+    settings: TrackConfig
+    method: Method
+    source: DatasetSource
+
+    @property
+    def configuration(self) -> str:
+        """The method, the form of the results, and the settings."""
+        head = f"# track, method {self.method}, results of {self.source.name} as {self.source.tracks_suffix}\n"
+        return head + write_settings(self.settings, comments=False)
+
+    def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
+        """Write the tracks; counts frames, tracks and boxes."""
+        counts = dict.fromkeys(("frames", "tracks", "boxes"), 0)
+        runs = _counted(track_dataset(dataset, lambda: self.settings.new_tracker(self.method)), counts)
+        (folder / "tracks").mkdir()
+        self.source.write_track_part(folder, file_name(name), dataset, ((run.scene, run.tracks) for run in runs))
+        return counts
+
+
+@dataclass(frozen=True)
+class SmoothTask:
+    """Label the scenes of a part: labels/NAME with a suffix .csv, .ndjson or .parquet, and what the dataset writes."""
+
+    settings: SmoothConfig
+    method: Method
+    source: DatasetSource
+    suffix: str = ".csv"
+
+    @property
+    def configuration(self) -> str:
+        """The method, the form of the results, and the settings."""
+        head = f"# smooth, method {self.method}, results of {self.source.name}, table as {self.suffix}\n"
+        return head + write_settings(self.settings, comments=False)
+
+    def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
+        """Write the labels; counts objects, and boxes by where they come from."""
+        from data_tools.datasets.label_table import write_label_table
+
+        runs = tuple(smooth_dataset(dataset, self.settings, self.method))
+        labels = [(run.scene, run.labels) for run in runs]
+        (folder / "labels").mkdir()
+        write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
+        self.source.write_label_part(folder, file_name(name), dataset, labels)
+        return asdict(LabelCounts.sum(run.counts for run in runs))
+
+
+def _counted(runs: Iterable[TrackedScene], counts: dict[str, int]) -> Iterator[TrackedScene]:
+    for run in runs:
+        counts["frames"] += run.frames
+        counts["tracks"] += len({id_ for tracks in run.tracks for id_ in tracks.id.tolist()})
+        counts["boxes"] += sum(len(tracks) for tracks in run.tracks)
+        yield run
