@@ -18,6 +18,7 @@ import numpy as np
 import typer
 
 from benchmarks.joint_online import bench_online, online_table
+from benchmarks.simulated_poles import poles_at
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.figures import FigureTable, cell, percent, write_figures
 from data_tools.metrics import Interval, paired_bootstrap
@@ -27,7 +28,6 @@ from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig, load_config
 from pipelines.slam.joint import JointRun, run_joint, street
-from pipelines.slam.simulated_poles import poles_at
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.slam.joint import JointSettings, LaneSettings

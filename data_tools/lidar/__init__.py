@@ -5,16 +5,14 @@ Open3D is imported when a PCD or PLY file is read.
 """
 
 from data_tools.lidar.clusters import ClusterSettings, ObjectSize, detect_clusters
-from data_tools.lidar.curbs import CurbSettings, extract_curbs
+from data_tools.lidar.curbs import CurbSettings, Line, LineSettings, extract_curbs, straight_lines
 from data_tools.lidar.deskew import azimuth_times, constant_velocity, deskewed
-from data_tools.lidar.edges import Edge, EdgeSettings, straight_edges
 from data_tools.lidar.ground import Ground, GroundSettings, segment_ground
 from data_tools.lidar.planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
-from data_tools.lidar.ply import write_ply
 from data_tools.lidar.poles import Pole, PoleSettings, extract_poles
 from data_tools.lidar.registration import Registration, RegistrationError, RegistrationSettings, register
 from data_tools.lidar.scan import Scan
-from data_tools.lidar.scan_files import read_scan
+from data_tools.lidar.scan_files import read_scan, write_ply
 from data_tools.lidar.sharpness import scan_to_map_residual
 from data_tools.lidar.surfels import SurfelMap, Surfels, surfels_of
 from data_tools.lidar.voxels import voxel_downsample, voxel_keys
@@ -22,10 +20,10 @@ from data_tools.lidar.voxels import voxel_downsample, voxel_keys
 __all__ = [
     "ClusterSettings",
     "CurbSettings",
-    "Edge",
-    "EdgeSettings",
     "Ground",
     "GroundSettings",
+    "Line",
+    "LineSettings",
     "ObjectSize",
     "Plane",
     "PlaneSettings",
@@ -50,7 +48,7 @@ __all__ = [
     "register",
     "scan_to_map_residual",
     "segment_ground",
-    "straight_edges",
+    "straight_lines",
     "surfels_of",
     "voxel_downsample",
     "voxel_keys",

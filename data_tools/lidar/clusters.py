@@ -1,13 +1,13 @@
-"""Detections without a detector: what stands on the ground, apart from the rest, as oriented boxes.
+"""Detections without a trained detector: clusters of points above the ground as oriented boxes.
 
-Points above the ground are joined from above; parts as high as walls, or longer than any vehicle, are no objects. The
-box of a part has the heading theta for which its points lie close to the box's sides: with c1, c2 the coordinates of a
-point along and across theta, and d its distance from the nearer of the sides that bound c1 and c2,
+Points above the ground are clustered from above; clusters as high as walls, or longer than any vehicle, are discarded.
+The box of a cluster has the heading theta for which its points lie close to the box's sides: with c1, c2 the
+coordinates of a point along and across theta, and d its distance from the nearer of the sides that bound c1 and c2,
 
     theta = argmax over [0, pi/2)  sum_i 1 / max(d_i, d0)         (closeness; Zhang et al., IV 2017)
 
-Of a vehicle one or two sides are seen. Its box is completed to the least size of its class, away from the sensor. Its
-class its size says, and its score the share that it has of the points of a car at its distance.
+One or two sides of a vehicle are visible. Its box is extended to the least size of its class, away from the sensor. The
+class follows from the visible size. The score is the number of points relative to that of a car at this distance.
 
 Source: Zhang, Xu, Dong, Dolan, Efficient L-shape fitting for vehicle detection using laser scanners, IV 2017.
 """
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.lidar.components import connected_from_above
 from data_tools.lidar.ground import segment_ground
+from data_tools.lidar.voxels import clusters_from_above
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Positive, PositiveInt, Settings, setting, settings_group
 from saga_fg.types.boxes import Boxes
@@ -32,12 +32,12 @@ _CLOSE = 0.1  # m, d0
 
 @dataclass(frozen=True)
 class ObjectSize:
-    """Sizes that a class of objects may show, m, and the least that its boxes have."""
+    """Visible sizes of a class of objects, from - to, and the least size of its boxes."""
 
-    length: tuple[float, float] = setting((0.0, 6.0), "shown along the longer side, from - to, m")
-    width: tuple[float, float] = setting((0.0, 2.6), "shown along the shorter, m")
-    height: tuple[float, float] = setting((0.7, 2.6), "above the ground, m")
-    complete: tuple[float, float] = setting((4.2, 1.75), "length and width that a box is completed to, m")
+    length: tuple[float, float] = setting((0.0, 6.0), "visible length of the longer side, m")
+    width: tuple[float, float] = setting((0.0, 2.6), "visible length of the shorter side, m")
+    height: tuple[float, float] = setting((0.7, 2.6), "height above the ground, m")
+    complete: tuple[float, float] = setting((4.2, 1.75), "least length and width of a box, m")
 
 
 def _sizes() -> dict[str, ObjectSize]:
@@ -50,33 +50,30 @@ def _sizes() -> dict[str, ObjectSize]:
 
 @dataclass(frozen=True)
 class ClusterSettings(Settings):
-    """How points become boxes; the first class whose sizes fit is taken."""
+    """Clustering of points into boxes; the first class whose sizes fit is taken."""
 
-    cell: Positive = setting(0.3, "of the grid on which points are joined, m")
-    lowest: Positive = setting(0.25, "height above the ground from which points count, m")
-    highest: Positive = setting(2.6, "and up to which, m")
-    reach: Positive = setting(40.0, "from the sensor, m")
-    foot: Positive = setting(0.6, "height above the ground that the lowest point must not exceed, m")
-    points: PositiveInt = setting(10, "least points")
+    cell: Positive = setting(0.3, "cell of the clustering grid, m; raised: points farther apart join")
+    lowest: Positive = setting(0.25, "lowest height above the ground of clustered points, m")
+    highest: Positive = setting(2.6, "largest height above the ground of an object, m")
+    reach: Positive = setting(40.0, "largest distance from the sensor, m")
+    foot: Positive = setting(0.6, "largest height above the ground of an object's lowest point, m")
+    points: PositiveInt = setting(10, "fewest points of an object")
     classes: Mapping[str, ObjectSize] = settings_group(_sizes, "sizes by class")
 
 
 def detect_clusters(points: FloatArray, settings: ClusterSettings | None = None) -> Detections:
-    """Boxes of what stands on the ground in a scan (N, 3), m; in the sensor's frame, with classes and scores."""
+    """Boxes of the objects on the ground in a scan (N, 3), m; in the sensor's frame, with classes and scores."""
     s = settings or ClusterSettings()
     ground = segment_ground(points)
     near = np.hypot(points[:, 0], points[:, 1]) <= s.reach
     above = near & (ground.height >= s.lowest)
     points, height = points[above], ground.height[above]
-    part = connected_from_above(points, s.cell)
-    order = np.argsort(part, kind="stable")
-    bounds = np.concatenate([[0], np.flatnonzero(np.diff(part[order])) + 1, [len(order)]])
-    rows = []
-    for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        chosen = order[start:end]
-        if len(chosen) >= s.points and height[chosen].max() <= s.highest and height[chosen].min() <= s.foot:
-            rows.append(_detection(points[chosen], float(height[chosen].max()), s))
-    found = [row for row in rows if row is not None]
+    candidates = [
+        _detection(points[rows], float(height[rows].max()), s)
+        for rows in clusters_from_above(points, s.cell)
+        if len(rows) >= s.points and height[rows].max() <= s.highest and height[rows].min() <= s.foot
+    ]
+    found = [candidate for candidate in candidates if candidate is not None]
     if not found:
         return Detections.empty()
     label, position, size, yaw, score = zip(*found, strict=True)
@@ -91,22 +88,22 @@ def _detection(
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     local = points[:, :2] @ axes.T
     low, high = local.min(axis=0), local.max(axis=0)
-    shown = high - low
-    if shown[1] > shown[0]:  # the longer side is the length
+    visible = high - low
+    if visible[1] > visible[0]:  # the longer side is the length
         yaw += np.pi / 2
         low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
         axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-        shown = high - low
-    label = next((name for name, size in s.classes.items() if _fits(shown, top, size)), None)
+        visible = high - low
+    label = next((name for name, size in s.classes.items() if _fits(visible, top, size)), None)
     if label is None:
         return None
     least = np.array(s.classes[label].complete)
-    if label == "car" and shown[0] < least[1] + 0.3:
-        least = least[::-1]  # only its rear or front is seen, and the length lies behind
-    size = np.maximum(shown, least)
+    if label == "car" and visible[0] < least[1] + 0.3:
+        least = least[::-1]  # only the rear or front is visible, the length is away from the sensor
+    size = np.maximum(visible, least)
     centre = (low + high) / 2
-    away = np.sign(centre)  # the sensor is at 0: what is missing lies behind what is seen
-    centre = centre + away * (size - shown) / 2
+    away = np.sign(centre)  # the sensor is at 0: the hidden part lies behind the visible one
+    centre = centre + away * (size - visible) / 2
     if size[1] > size[0]:
         yaw, size = yaw + np.pi / 2, size[::-1]
     centre = axes.T @ centre
@@ -125,11 +122,11 @@ def l_shape_heading(points: FloatArray) -> float:
     return float(_HEADINGS[closeness.argmax()])
 
 
-def _fits(shown: FloatArray, top: float, size: ObjectSize) -> bool:
-    ranges = zip((*shown, top), (size.length, size.width, size.height), strict=True)
+def _fits(visible: FloatArray, top: float, size: ObjectSize) -> bool:
+    ranges = zip((*visible, top), (size.length, size.width, size.height), strict=True)
     return all(low <= value <= high for value, (low, high) in ranges)
 
 
 def _score(points: int, distance: float) -> float:
-    """Between 0 and 1: points against the 3000 / distance that a vehicle has at least, of a sensor of 64 rings."""
+    """Score in [0, 1]: points relative to 3000 / distance, the least of a vehicle with a sensor of 64 rings."""
     return float(min(1.0, 0.2 + 0.8 * points * distance / 3000.0))

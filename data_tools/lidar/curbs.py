@@ -1,29 +1,40 @@
-"""Edges of the road: the first step in height on the way out from the vehicle.
+"""Curbs: points on the edge of the road, and straight lines through them with the covariance of their ends.
 
-Near the ground, each narrow sector is a profile of heights over the distance: the median height in steps of a quarter
-metre. Where the profile rises, within two steps, by more than rough tarmac does and by less than a wall, and stays up,
-is a curb; the first on the way out is the edge of the road. After Zhao and Yuan, Curb detection and tracking using
+Points. Near the ground, each narrow sector is a profile of heights over the distance: the median height in steps of a
+quarter metre. A curb is a rise within two steps that is more than the roughness of tarmac, less than a wall, and stays;
+the first one from the vehicle outwards is the edge of the road. After Zhao and Yuan, Curb detection and tracking using
 3D-LIDAR scanner, ICIP 2012 (height steps along the rays).
+
+Lines. Each pair of points that is far enough apart is a candidate; the line with the most points beside it, without a
+long gap, is fitted by least squares and its points are removed, then the next is searched (RANSAC of Fischler and
+Bolles, 1981, over all pairs, because there are few points). With n points of deviation sigma across the line, at u_i
+along it, the two ends at u and u' have the covariance
+
+    cov(e(u), e(u')) = sigma^2 ( 1/n + (u - m)(u' - m) / sum (u_i - m)^2 ) + bias^2 [u = u']
+
+where the bias is an error that neighbouring points share: rings cross a curb at equal angles.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import Positive, PositiveInt, Settings, setting
+from data_tools.lidar.voxels import cell_order_statistics
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.settings import Positive, PositiveInt, Range, Settings, setting
 
 
 @dataclass(frozen=True)
 class CurbSettings(Settings):
-    """What counts as a curb; lengths in m."""
+    """Detection of points on curbs."""
 
-    sectors: PositiveInt = setting(180, "the horizon is cut into")
-    spacing: Positive = setting(0.25, "of the profile, m")
-    nearest: Positive = setting(2.5, "from the sensor, m")
-    farthest: Positive = setting(20.0, "beyond, rings are too far apart, m")
+    sectors: PositiveInt = setting(180, "number of sectors around the sensor")
+    spacing: Positive = setting(0.25, "spacing of the height profile, m")
+    nearest: Positive = setting(2.5, "nearest distance from the sensor, m")
+    farthest: Positive = setting(20.0, "largest distance from the sensor, limited by the spacing of the rings, m")
     low: Positive = setting(0.05, "least step, m")
     high: Positive = setting(0.3, "largest step, m")
 
@@ -43,7 +54,7 @@ def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings
     turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     sector = (turn * s.sectors).astype(np.int64) % s.sectors
     bin_ = sector * steps + ((distance - s.nearest) / s.spacing).astype(np.int64)
-    profile = _medians(points[:, 2], bin_, s.sectors * steps).reshape(s.sectors, steps)
+    profile = cell_order_statistics(points[:, 2], bin_, s.sectors * steps, 2).reshape(s.sectors, steps)
     found = []
     for row in np.flatnonzero(np.isfinite(profile).sum(axis=1) >= 4):
         edge = _first_step(profile[row], s)
@@ -55,7 +66,7 @@ def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings
 
 
 def _first_step(profile: FloatArray, s: CurbSettings) -> int | None:
-    """Where the profile (steps,) of one sector first rises and stays up."""
+    """Index at which the profile (steps,) of one sector first rises and stays higher, or None."""
     at = np.flatnonzero(np.isfinite(profile))
     z = profile[at]
     for k in range(len(at) - 3):
@@ -66,10 +77,70 @@ def _first_step(profile: FloatArray, s: CurbSettings) -> int | None:
     return None
 
 
-def _medians(values: FloatArray, cell: np.ndarray[tuple[int], np.dtype[np.int64]], cells: int) -> FloatArray:
-    order = np.lexsort((values, cell))
-    count = np.bincount(cell, minlength=cells)
-    start = np.cumsum(count) - count
-    medians = np.full(cells, np.nan)
-    medians[count > 0] = values[order[(start + count // 2)[count > 0]]]
-    return medians
+@dataclass(frozen=True)
+class LineSettings(Settings):
+    """Straight lines through points."""
+
+    width: Positive = setting(0.2, "largest distance of a point from its line, m")
+    gap: Positive = setting(4.0, "longest gap between points of a line, m")
+    length: Positive = setting(6.0, "least length, m")
+    points: Annotated[int, Range(3)] = setting(8, "fewest points")
+    noise: Positive = setting(0.1, "least standard deviation of a point across the line, m")
+    bias: Positive = setting(0.1, "standard deviation of the error that neighbouring points share, m")
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A straight line segment: ends (2, 3), m, and the covariance (2, 2) of the ends across it, m^2."""
+
+    ends: FloatArray
+    covariance: FloatArray
+
+
+def straight_lines(points: FloatArray, most: int, settings: LineSettings | None = None) -> list[Line]:
+    """At most `most` lines through points (M, 3), m, the one with the most points first."""
+    s = settings or LineSettings()
+    found: list[Line] = []
+    while len(found) < most and len(points) >= s.points:
+        chosen = _best_line(points[:, :2], s)
+        if chosen is None:
+            break
+        found.append(_fit_line(points[chosen], s))
+        points = points[~chosen]
+    return found
+
+
+def _best_line(xy: FloatArray, s: LineSettings) -> BoolArray | None:
+    """Mask (M,) of the points on the candidate line with the most points; None if none has enough."""
+    i, j = np.triu_indices(len(xy), 1)
+    apart = xy[j] - xy[i]
+    length = np.linalg.norm(apart, axis=1)
+    far = length >= s.length / 2
+    i, apart, length = i[far], apart[far], length[far]
+    normal = np.stack([-apart[:, 1], apart[:, 0]], axis=1) / length[:, None]
+    off = np.abs(normal @ xy.T - (normal * xy[i]).sum(axis=1)[:, None])
+    count = (off <= s.width).sum(axis=1)
+    for line in np.argsort(-count, kind="stable")[:20]:
+        if count[line] < s.points:
+            return None
+        rows = np.flatnonzero(off[line] <= s.width)
+        u = xy[rows] @ (apart[line] / length[line])
+        order = np.argsort(u)
+        pieces = np.split(order, np.flatnonzero(np.diff(u[order]) > s.gap) + 1)
+        piece = max(pieces, key=len)
+        if len(piece) >= s.points and u[piece[-1]] - u[piece[0]] >= s.length:
+            chosen = np.zeros(len(xy), dtype=np.bool_)
+            chosen[rows[piece]] = True
+            return chosen
+    return None
+
+
+def _fit_line(points: FloatArray, s: LineSettings) -> Line:
+    centre = points.mean(axis=0)
+    xy = points[:, :2] - centre[:2]
+    along = np.linalg.svd(xy, full_matrices=False)[2][0]
+    u, e = xy @ along, xy @ np.array([-along[1], along[0]])
+    variance = max(float(e @ e) / (len(points) - 2), s.noise**2)
+    ends = np.array([u.min(), u.max()])
+    covariance = variance * (1 / len(points) + np.outer(ends, ends) / float(u @ u)) + s.bias**2 * np.eye(2)
+    return Line(np.column_stack([centre[:2] + ends[:, None] * along, np.full(2, centre[2])]), covariance)

@@ -1,7 +1,7 @@
-"""Motion de-skew: points of a sweep brought to one moment.
+"""Motion de-skew: points of a sweep transformed to one time.
 
 While the head turns, the vehicle drives on. With constant velocity xi = (w, v) within the sweep, rad/s and m/s in the
-sensor's frame, a point p taken t after the scan's moment lies, in the sensor's frame of that moment, at
+sensor's frame, a point p measured t after the scan's timestamp lies, in the sensor's frame at the timestamp, at
 
     exp(t xi) p = R(t) p + u(t),      k = w / |w|,  a = |w| t
     R(t) p = p + sin(a) k x p + (1 - cos(a)) k x (k x p)
@@ -9,7 +9,7 @@ sensor's frame, a point p taken t after the scan's moment lies, in the sensor's 
 
 Source: the exponential of SE(3), e.g. Barfoot, State Estimation for Robotics, 2nd ed. 2024, section 8.1.
 
-A sensor that says no times but turns steadily has them in the azimuths of its points: `azimuth_times`.
+For a sensor that turns steadily and gives no times, `azimuth_times` derives them from the azimuths of the points.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Turning = Literal["clockwise", "counter-clockwise"]
 def azimuth_times(points: FloatArray, period: float, turning: Turning = "clockwise") -> FloatArray:
     """Times (N,), s, from -period / 2 to period / 2, of points (N, 3) of a head that turns once a `period` (s).
 
-    The scan is dated when the head looks ahead (along x) and begins and ends behind; `turning` as seen from above.
+    At the timestamp the head looks ahead (along x); the scan begins and ends behind. `turning` is as seen from above.
     KITTI's Velodyne turns clockwise.
     """
     if turning not in get_args(Turning):
@@ -39,7 +39,7 @@ def azimuth_times(points: FloatArray, period: float, turning: Turning = "clockwi
 
 
 def deskewed(scan: Scan, velocity: FloatArray) -> Scan:
-    """The scan with all points at its moment; `velocity` (6,): turn rate, rad/s, and velocity, m/s, sensor's frame.
+    """The scan with all points at its timestamp; `velocity` (6,): turn rate, rad/s, and velocity, m/s, sensor's frame.
 
     Raises `InputError` for a scan without times.
     """
@@ -60,5 +60,5 @@ def deskewed(scan: Scan, velocity: FloatArray) -> Scan:
 
 
 def constant_velocity(before_T_now: FloatArray, duration: float) -> FloatArray:
-    """Velocity (6,), rad/s and m/s, that takes `duration` s for a rigid motion (4, 4)."""
+    """Velocity (6,), rad/s and m/s, of a rigid motion (4, 4) within `duration` s."""
     return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(before_T_now)) / duration)

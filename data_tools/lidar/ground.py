@@ -1,10 +1,10 @@
 """Ground segmentation on a polar grid, ring by ring from the vehicle outwards.
 
-In each sector the ground of a ring is the low tenth of its points' heights, as long as it differs from the ground of
-the ring inside by no more than the steepest road would rise; else (a car, a wall, a reflection from below) the height
-inside goes on. A point is ground if it lies within a clearance of the height between the rings around it. After
+In each sector the ground height of a ring is the lowest decile of its points' heights, if it differs from that of the
+next inner ring by no more than the steepest road would rise; otherwise (a car, a wall, a reflection from below) the
+inner height is kept. A point is ground if it lies within a clearance of the height interpolated between rings. After
 Himmelsbach, Hundelshausen, Wuensche, Fast segmentation of 3D point clouds for ground vehicles, IV 2010, with heights
-for lines.
+instead of lines.
 """
 
 from __future__ import annotations
@@ -13,25 +13,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_tools.lidar.voxels import cell_order_statistics
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
 @dataclass(frozen=True)
 class GroundSettings(Settings):
-    """For roads and pavements; lengths in m."""
+    """Ground segmentation of roads and pavements."""
 
-    sectors: PositiveInt = setting(60, "the horizon is cut into")
+    sectors: PositiveInt = setting(60, "number of sectors of the polar grid")
     ring: Positive = setting(1.5, "width of a ring, m")
     reach: Positive = setting(80.0, "outer radius of the last ring, m")
     slope: Positive = setting(0.15, "steepest rise, m per m")
-    step: Positive = setting(0.1, "change of height that is no slope, m")
-    clearance: Positive = setting(0.2, "from the ground, within which a point belongs to it, m")
+    step: Positive = setting(0.1, "change of height between rings allowed beyond the slope, m")
+    clearance: Positive = setting(0.2, "largest distance of a ground point from the ground height, m")
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """is_ground (N,) which points of the scan; height (N,) of each above the ground below it, m."""
+    """Segmentation of N points: is_ground (N,), and height (N,) of each point above the ground, m."""
 
     is_ground: BoolArray
     height: FloatArray
@@ -46,8 +47,8 @@ def segment_ground(points: FloatArray, settings: GroundSettings | None = None) -
     sector = ((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * s.sectors).astype(np.int64) % s.sectors
     rings = int(np.ceil(s.reach / s.ring))
     ring = np.minimum((distance / s.ring).astype(np.int64), rings - 1)
-    low = _low_heights(points[:, 2], sector * rings + ring, s.sectors * rings).reshape(s.sectors, rings)
-    ground = _followed(low, s)
+    low = cell_order_statistics(points[:, 2], sector * rings + ring, s.sectors * rings, 10).reshape(s.sectors, rings)
+    ground = _ground_heights(low, s)
     place = np.clip(distance / s.ring - 0.5, 0, rings - 1)
     inner = np.minimum(place.astype(np.int64), rings - 2)
     share = place - inner
@@ -55,25 +56,14 @@ def segment_ground(points: FloatArray, settings: GroundSettings | None = None) -
     return Ground(np.abs(height) <= s.clearance, height)
 
 
-def _low_heights(z: FloatArray, cell: np.ndarray[tuple[int], np.dtype[np.int64]], cells: int) -> FloatArray:
-    """The low tenth of the heights in each cell (cells,), NaN in empty ones."""
-    order = np.lexsort((z, cell))
-    count = np.bincount(cell, minlength=cells)
-    start = np.cumsum(count) - count
-    low = np.full(cells, np.nan)
-    filled = count > 0
-    low[filled] = z[order[(start + count // 10)[filled]]]
-    return low
-
-
-def _followed(low: FloatArray, s: GroundSettings) -> FloatArray:
+def _ground_heights(low: FloatArray, s: GroundSettings) -> FloatArray:
     """Heights (sectors, rings) of the ground, from the innermost ring on."""
     near = low[:, : max(int(10.0 / s.ring), 1)]
     start = float(np.nanmedian(near)) if np.isfinite(near).any() else float(np.nanmin(low))
     height, since = np.full(len(low), start), np.ones(len(low))
     ground = np.empty_like(low)
     for k in range(low.shape[1]):
-        fits = np.abs(low[:, k] - height) <= s.step + s.slope * s.ring * since  # False where there is none
+        fits = np.abs(low[:, k] - height) <= s.step + s.slope * s.ring * since  # False in empty cells
         height = np.where(fits, low[:, k], height)
         since = np.where(fits, 1.0, since + 1.0)
         ground[:, k] = height

@@ -6,9 +6,9 @@ eigenvector of a and d = - n . c. With a noise of sigma across the plane, and k 
 
     var(tilt) = sigma^2 / b        (the worse of the two directions),        var(d) = sigma^2 / k + |c|^2 var(tilt)
 
-where the last term is the lever of the centre on the distance at the sensor. Walls are found by consensus: of all
-upright flat surfels the one with the most others in its plane makes a wall with those of them that hang together; then
-again among the rest.
+where the last term is the effect of the tilt on the distance at the sensor. Walls are found by consensus: the upright
+flat surfel with the most others in its plane forms a wall with the connected ones among them; this is repeated with
+the remaining surfels.
 """
 
 from __future__ import annotations
@@ -29,28 +29,29 @@ from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 @dataclass(frozen=True)
 class PlaneSettings(Settings):
-    """What counts as a wall; lengths in m."""
+    """Detection of walls and of the ground plane."""
 
-    surfel: Positive = setting(1.0, "voxel of the surfels, m")
-    reach: Positive = setting(50.0, "from the sensor, m")
-    upright: Positive = setting(0.15, "largest share of z in the normal of a wall")
+    surfel: Positive = setting(1.0, "voxel size of the surfels, m")
+    reach: Positive = setting(50.0, "largest distance from the sensor, m")
+    upright: Positive = setting(0.15, "largest z component of the normal of a wall")
     aligned: Positive = setting(0.97, "least cosine between normals of one wall")
-    thickness: Positive = setting(0.15, "of a wall, to either side, m")
+    thickness: Positive = setting(0.15, "largest distance of a surfel from the plane of its wall, m")
     gap: Positive = setting(3.0, "largest gap within a wall, m")
-    surfels: PositiveInt = setting(8, "least surfels of a wall")
+    surfels: PositiveInt = setting(8, "fewest surfels of a wall")
     length: Positive = setting(3.0, "least length of a wall, m")
-    noise: Positive = setting(0.03, "of a surfel across its wall: ranges, bricks, windows, m")
-    ground_noise: Positive = setting(0.02, "of the ground's surfels, m")
+    noise: Positive = setting(0.03, "standard deviation of surfels across their wall, m")
+    ground_noise: Positive = setting(0.02, "standard deviation of surfels of the ground, m")
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A plane and the piece of it that was seen, in the sensor's frame.
+    """A plane and its visible part, in the sensor's frame.
 
     coefficients  (4,) n and d, d > 0
     covariance    (3, 3) of two tilts of n (rad^2) and of d (m^2); no correlations, the tilts alike
-    centre        (3,) of what was seen, m
-    extent        (2, 3) its ends: for a wall lowest point of one end and highest of the other; for the ground corners
+    centre        (3,) of the visible part, m
+    extent        (2, 3) its ends: for a wall the lowest point of one end and the highest of the other; for the ground
+                  two corners
     """
 
     coefficients: FloatArray
@@ -75,20 +76,20 @@ def fit_plane(points: FloatArray, noise: float) -> Plane:
     return Plane(np.append(normal, d), covariance, centre, ends)
 
 
-def near_walls(places: FloatArray, walls: Sequence[Plane], distance: float) -> BoolArray:
-    """Which places (N, 3), m, lie within `distance` m of the seen piece of a wall, from above."""
-    near = np.zeros(len(places), dtype=np.bool_)
+def near_walls(positions: FloatArray, walls: Sequence[Plane], distance: float) -> BoolArray:
+    """Mask of the positions (N, 3), m, within a horizontal `distance`, m, of the visible part of a wall."""
+    near = np.zeros(len(positions), dtype=np.bool_)
     for wall in walls:
         along = np.array([-wall.coefficients[1], wall.coefficients[0]])
         ends = np.sort(wall.extent[:, :2] @ along)
-        u = places[:, :2] @ along
-        across = np.abs(places @ wall.coefficients[:3] + wall.coefficients[3])
+        u = positions[:, :2] @ along
+        across = np.abs(positions @ wall.coefficients[:3] + wall.coefficients[3])
         near |= (across <= distance) & (u >= ends[0] - distance) & (u <= ends[1] + distance)
     return near
 
 
 def fit_ground(ground: FloatArray, settings: PlaneSettings | None = None, reach: float = 15.0) -> Plane | None:
-    """The plane of the ground points (N, 3) within `reach` m; None if there are too few."""
+    """The plane of the ground points (N, 3) within `reach` m; None for too few points."""
     s = settings or PlaneSettings()
     near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
     near = near[voxel_downsample(near, s.surfel)]
@@ -118,7 +119,7 @@ def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> 
         best = int(support.argmax())
         if support[best] < s.surfels:
             break
-        rows = _joined(mean, np.flatnonzero(coplanar[best] & left), best, s.gap)
+        rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, s.gap)
         left[rows] = left[best] = False
         if len(rows) < s.surfels:
             continue
@@ -128,8 +129,8 @@ def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> 
     return walls
 
 
-def _joined(mean: FloatArray, rows: IntArray, seed: int, gap: float) -> IntArray:
-    """Those of the rows that hang together with `seed` by gaps of at most `gap` m."""
+def _connected(mean: FloatArray, rows: IntArray, seed: int, gap: float) -> IntArray:
+    """The rows connected with `seed` by gaps of at most `gap` m."""
     pairs = cKDTree(mean[rows]).query_pairs(gap, output_type="ndarray")
     links = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
     _, part = connected_components(links, directed=False)

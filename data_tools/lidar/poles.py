@@ -1,10 +1,9 @@
 """Poles in a scan: masts, posts and trunks.
 
-Points above the ground are joined from above (`connected_from_above`), on cells as small as a pole. A part is a pole if
-it is thin, tall, filled from its foot to its top, and stands alone: few points in the ring around it at its own height.
-Its place is the mean of its points, moved away from the sensor by what a cylinder hides: seen from one side, the
-points of a circle of radius r lie on average pi/4 r in front of its centre. r comes from the width w across the line
-of sight, r = w / 2.
+Points above the ground are clustered from above (`clusters_from_above`) on small cells. A cluster is a pole if it is
+thin, tall, filled from its foot to its top, and isolated: few points in the ring around it at its own height.
+Its position is the mean of its points, moved away from the sensor, because the visible points of a circle of radius r
+lie on average pi/4 r in front of its centre. The width w across the line of sight gives r = w / 2.
 """
 
 from __future__ import annotations
@@ -15,40 +14,40 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from data_tools.lidar.components import connected_from_above
 from data_tools.lidar.planes import Plane, near_walls
+from data_tools.lidar.voxels import clusters_from_above
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
 @dataclass(frozen=True)
 class PoleSettings(Settings):
-    """What counts as a pole; lengths in m."""
+    """Detection of poles."""
 
-    cell: Positive = setting(0.2, "of the grid on which points are joined, m")
-    reach: Positive = setting(40.0, "from the sensor, m")
-    lowest: Positive = setting(0.3, "height above the ground from which points count, m")
+    cell: Positive = setting(0.2, "cell of the clustering grid, m")
+    reach: Positive = setting(40.0, "largest distance from the sensor, m")
+    lowest: Positive = setting(0.3, "lowest height above the ground of clustered points, m")
     height: Positive = setting(1.2, "least height from the lowest to the highest point, m")
-    width: Positive = setting(0.6, "largest extent from above, m")
-    points: PositiveInt = setting(8, "least points")
-    filled: Positive = setting(0.5, "least share of half-metre steps of the height that hold points")
-    alone: Positive = setting(0.6, "nothing else within this distance of the axis, m")
+    width: Positive = setting(0.6, "largest horizontal extent, m")
+    points: PositiveInt = setting(8, "fewest points")
+    filled: Positive = setting(0.5, "least share of half-metre steps of the height that contain points")
+    alone: Positive = setting(0.6, "radius around the axis without other objects, m")
     alone_share: Positive = setting(
-        0.1, "nor within this share of the range: columns of a wall seen aslant are no poles"
+        0.1, "the same radius as a share of the range, against columns of walls at grazing angles"
     )
-    noise: Positive = setting(0.05, "of the axis: ranges, radius, bent trunks, m")
-    bearing_noise: Positive = setting(0.006, "across the line of sight: rays hit or miss a thin pole, rad")
-    depth_noise: Positive = setting(0.1, "along it: how much of a round pole lies behind is guessed from its width, m")
+    noise: Positive = setting(0.05, "standard deviation of the axis, m")
+    bearing_noise: Positive = setting(0.006, "standard deviation across the line of sight, rad")
+    depth_noise: Positive = setting(0.1, "standard deviation along the line of sight, from the unknown radius, m")
 
 
 @dataclass(frozen=True, eq=False)
 class Pole:
     """An upright pole, in the sensor's frame.
 
-    foot        (3,) lowest point of its axis that was seen, m
-    top         height of the highest, m
+    foot        (3,) lowest visible point of the axis, m
+    top         height of the highest visible point, m
     radius      m
-    covariance  (2, 2) of the axis' place, x and y, m^2
+    covariance  (2, 2) of the axis' position, x and y, m^2
     """
 
     foot: FloatArray
@@ -60,20 +59,16 @@ class Pole:
 def extract_poles(
     points: FloatArray, height: FloatArray, walls: Sequence[Plane] = (), settings: PoleSettings | None = None
 ) -> list[Pole]:
-    """The poles among points (N, 3), m, with their `height` (N,) above the ground, m; none along the `walls`."""
+    """The poles among points (N, 3), m, at `height` (N,) above the ground, m, except near `walls`."""
     s = settings or PoleSettings()
     points = points[(height >= s.lowest) & (np.hypot(points[:, 0], points[:, 1]) <= s.reach)]
     everything = points
     points = points[~near_walls(points, walls, s.cell)]
-    part = connected_from_above(points, s.cell)
-    order = np.argsort(part, kind="stable")
-    grouped = points[order]
-    bounds = np.concatenate([[0], np.flatnonzero(np.diff(part[order])) + 1, [len(order)]])
-    tree = cKDTree(everything[:, :2]) if len(points) else None
+    tree = cKDTree(everything[:, :2])
     poles = []
-    for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        candidate = grouped[start:end]
-        if tree is None or not _slender(candidate, s):
+    for rows in clusters_from_above(points, s.cell):
+        candidate = points[rows]
+        if not _slender(candidate, s):
             continue
         pole = _pole(candidate, s)
         around = everything[

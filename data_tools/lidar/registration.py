@@ -2,9 +2,9 @@
 
     minimise over T   sum_i rho( n_i . (T p_i - m_i) ),        rho(r) = s^2/2 log(1 + r^2 / s^2)      (Cauchy)
 
-p_i points of the scan, m_i and n_i mean and normal of the nearest flat surfel of the map. Each iteration pairs anew and
-takes one Gauss-Newton step x = (rotation, translation) in the scan's own frame, T <- T exp(x), with the weights
-w = 1 / (1 + r^2 / s^2) of the present residuals:
+p_i are points of the scan, m_i and n_i mean and normal of the nearest flat surfel of the map. Each iteration updates
+the pairs and takes one Gauss-Newton step x = (rotation, translation) in the scan's own frame, T <- T exp(x), with the
+weights w = 1 / (1 + r^2 / s^2) of the present residuals:
 
     J_i = [ (p_i x R^T n_i)^T,  (R^T n_i)^T ],      (sum w J^T J) x = - sum w r J^T
 
@@ -31,32 +31,32 @@ from saga_fg.numerics.geometry import transform_points
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 LEAST_PAIRS = 12  # twice the unknowns
-OPEN = 1e-3  # smallest share of the best-known direction's information in the worst-known one's
+UNCONSTRAINED = 1e-3  # least ratio of the smallest to the largest eigenvalue of the information
 
 
 class RegistrationError(SagaError):
-    """The scan does not overlap the map, or what overlaps does not fix the pose."""
+    """The scan does not overlap the map, or the overlap does not determine the pose."""
 
 
 @dataclass(frozen=True)
 class RegistrationSettings(Settings):
-    """When to stop."""
+    """Convergence criteria of the registration."""
 
-    iterations: PositiveInt = setting(30, "at most so many")
-    translation: Positive = setting(1e-3, "step below which the pose is reached, m")
-    rotation: Positive = setting(1e-4, "the same for the rotation, rad")
+    iterations: PositiveInt = setting(30, "largest number of iterations")
+    translation: Positive = setting(1e-3, "largest translation of the last step, m")
+    rotation: Positive = setting(1e-4, "largest rotation of the last step, rad")
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where a scan lies in the map.
+    """Pose of a scan in the map.
 
     map_T_scan  (4, 4)
     covariance  (6, 6) of (rotation, translation) in the scan's frame, rad^2 and m^2
     residual    mean distance of the paired points from their surfels, m
-    pairs       number of them
-    iterations  it took
-    converged   whether the last step was short enough
+    pairs       number of paired points
+    iterations  number of iterations
+    converged   True if the last step was short enough
     """
 
     map_T_scan: FloatArray
@@ -77,12 +77,11 @@ def register(
 ) -> Registration:
     """Register points (N, 3) of a scan, m, in its sensor's frame, with a map.
 
-    map_T_scan  (4, 4) where the search starts
-    farthest    from a point to the mean of its surfel, above which it has none, m
-    scale       s, residual from which a point loses weight, m
+    map_T_scan  (4, 4) initial pose
+    farthest    largest distance of a point from the mean of its surfel, m
+    scale       s of the robust loss, m
 
-    Raises `RegistrationError` where fewer points than `LEAST_PAIRS` have a surfel, or their normals leave a direction
-    open.
+    Raises `RegistrationError` for fewer pairs than `LEAST_PAIRS`, and for an unconstrained direction.
     """
     T = _rigid(map_T_scan)
     span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
@@ -110,11 +109,11 @@ def _linearised(
 
 
 def _solved(H: FloatArray, g: FloatArray, span: float) -> FloatArray:
-    """The step; `span`, a typical distance of the points, m, makes rotations compare with translations."""
+    """The Gauss-Newton step; `span`, a typical distance of the points, m, scales rotations to translations."""
     scale = np.array([span, span, span, 1.0, 1.0, 1.0])
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
-    if values[0] < OPEN * values[-1]:
-        raise RegistrationError("registration: the surfaces seen leave a direction of motion open")
+    if values[0] < UNCONSTRAINED * values[-1]:
+        raise RegistrationError("registration: the visible surfaces leave a direction of motion unconstrained")
     return np.asarray(vectors @ ((vectors.T @ (g / scale)) / values) / scale)
 
 
@@ -129,7 +128,7 @@ def _covariance(J: FloatArray, r: FloatArray, w: FloatArray, group: IntArray) ->
 
 
 def _rigid(T: FloatArray) -> FloatArray:
-    """The rigid transform nearest to T: products of many drift off, and feeding them back lets that grow."""
+    """The rigid transform nearest to T, which has accumulated rounding errors."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     rigid = T.copy()
     rigid[:3, :3] = U @ Vt

@@ -1,4 +1,4 @@
-"""One sweep of a LiDAR: points as the sensor gives them."""
+"""One sweep of a LiDAR."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Scan:
     """N points of one sweep, in the sensor's frame (x ahead, y left, z up).
 
     points     (N, 3) m
-    intensity  (N,) strength of the echo in the sensor's own unit, NaN where it says none
-    time       (N,) s from the moment the scan is dated at, negative before it; None where the sensor says nothing
+    intensity  (N,) strength of the echo in the sensor's own unit, NaN where unknown
+    time       (N,) s relative to the timestamp of the scan; None where unknown
 
     Raises `InputError` for arrays of other shapes and positions that are not finite.
     """
@@ -34,7 +34,7 @@ class Scan:
 
     @classmethod
     def of(cls, points: FloatArray) -> Self:
-        """A scan of points alone."""
+        """A scan without intensities and times."""
         return cls(points, np.full(len(points), np.nan))
 
     def __len__(self) -> int:
@@ -46,6 +46,6 @@ class Scan:
         return replace(self, points=self.points[rows], intensity=self.intensity[rows], time=time)
 
     def within(self, nearest: float, farthest: float) -> Self:
-        """The points from `nearest` to `farthest` m away: no echoes of the vehicle itself, no lone far ones."""
+        """The points at distances from `nearest` to `farthest` m, without echoes of the vehicle itself."""
         square = np.einsum("ni,ni->n", self.points, self.points)
         return self.select((square >= nearest**2) & (square <= farthest**2))

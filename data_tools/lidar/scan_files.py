@@ -1,4 +1,4 @@
-"""Scans from files, by the ending of their name.
+"""Scans read from files, by the suffix of their name, and point clouds written as PLY.
 
     .bin      KITTI: float32 x, y, z, intensity of each point, without a header
     .pcd.bin  nuScenes: float32 x, y, z, intensity, ring of each point, without a header
@@ -9,7 +9,7 @@
 
 Points are metres in the sensor's frame. Points that are not finite mean "no echo" in PCD files and are left out there;
 elsewhere they are errors. Sources: development kits of KITTI (https://www.cvlibs.net/datasets/kitti) and nuScenes
-(https://github.com/nutonomy/nuscenes-devkit, LidarPointCloud).
+(https://github.com/nutonomy/nuscenes-devkit, LidarPointCloud); G. Turk, The PLY polygon file format, 1994.
 """
 
 from __future__ import annotations
@@ -19,15 +19,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
+from data_tools.files.atomic_files import write_bytes
+from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes
-from data_tools.files.located import located
 from data_tools.files.numpy_files import load_archive, load_array
 from data_tools.lidar.cloud_headers import check_pcd, check_ply
 from data_tools.lidar.scan import Scan
 from data_tools.open3d_loader import load_open3d
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray, checked
 
 
 def read_scan(path: str | Path) -> Scan:
@@ -37,8 +39,31 @@ def read_scan(path: str | Path) -> Scan:
     ending = next((ending for ending in _READERS if name.endswith(ending)), None)
     if ending is None:
         raise InputError(f"{path}: expected a name that ends in {', '.join(_READERS)}")
-    with open_bytes(path) as file, located(str(path)):
+    with open_bytes(path) as file, error_context(str(path)):
         return _READERS[ending](file, path)
+
+
+def write_ply(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:
+    """Write points (N, 3), m, as float32, and red, green, blue (N, 3) from 0 to 255 if given; atomically.
+
+    Raises `InputError` for positions that are not finite, and for colours of another shape or type.
+    """
+    points = checked("points", points, (None, 3))
+    properties = [(axis, "<f4") for axis in "xyz"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    if colours is not None:
+        if colours.shape != points.shape or colours.dtype != np.uint8:
+            raise InputError(f"colours: expected {points.shape} bytes, got {colours.dtype} {colours.shape}")
+        properties += [(colour, "u1") for colour in ("red", "green", "blue")]
+        header += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    vertices = np.empty(len(points), dtype=properties)
+    for k, axis in enumerate("xyz"):
+        vertices[axis] = points[:, k]
+    if colours is not None:
+        for k, colour in enumerate(("red", "green", "blue")):
+            vertices[colour] = colours[:, k]
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode("ascii") + vertices.tobytes())
 
 
 def _kitti(file: BinaryIO, _: Path) -> Scan:
@@ -53,7 +78,7 @@ def _records(content: bytes, columns: int) -> FloatArray:
     size = 4 * columns
     if not content or len(content) % size:
         raise InputError(f"expected records of {size} bytes ({columns} float32 a point), got {len(content)} bytes")
-    with np.errstate(invalid="ignore"):  # numbers that are none are refused by the scan
+    with np.errstate(invalid="ignore"):  # NaN is refused by the scan
         return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)
 
 

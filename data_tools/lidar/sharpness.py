@@ -1,8 +1,8 @@
-"""How sharp is the map that a trajectory makes of its scans? A measure that needs no true trajectory.
+"""Sharpness of the map of scans along a trajectory, a measure without a true trajectory.
 
-A scan is laid over the others around it: each of its points q has k nearest neighbours in their map, with mean c and
-normal n (of the least spread); its residual is | n . (q - c) |. Where poses are wrong, surfaces are double or thick and
-residuals grow. The scan itself is not part of the map, so that no scan explains itself. Compare Razlaw et al.,
+A scan is compared with a map of the scans around it: each of its points q has k nearest neighbours in the map, with
+mean c and normal n (direction of the least spread); its residual is | n . (q - c) |. Wrong poses make surfaces thick,
+which increases residuals. The scan itself is not part of the map. Compare Razlaw et al.,
 Evaluation of registration methods for sparse 3D laser scans, ECMR 2015 (mean plane variance).
 """
 
@@ -20,7 +20,7 @@ from saga_fg.numerics.geometry import transform_points
 NEIGHBOURS = 8
 SPACING = 0.2  # m, of the map's points
 THINNED = 0.5  # m, of the scan's
-NEAREST_WITHIN = 0.5  # m; a point without a neighbour so near is seen for the first time
+NEAREST_WITHIN = 0.5  # m; points without a neighbour this near are new and left out
 FARTHEST = 50.0  # m from the sensor: beyond, rings are too far apart for planes
 
 

@@ -5,8 +5,8 @@
     n = n_a + n_b,   m = m_a + n_b/n d,   S = S_a + S_b + n_a n_b / n d d^T            (Chan et al., 1979)
 
 The eigenvector of S with the smallest eigenvalue is the normal of a surfel whose points lie flat: smallest eigenvalue
-below a share of the second, and the second not that of a line's. Points come and go at the cost of a sort: the voxels
-are kept sorted by key, and those too far from the vehicle are dropped. Sources: Chan, Golub, LeVeque, Updating
+below a share of the second, and the second above that of a line. The voxels are sorted by key, and those too far from
+the vehicle are dropped. Sources: Chan, Golub, LeVeque, Updating
 formulae and a pairwise algorithm for computing sample variances, 1979; Biber and Strasser, The normal distributions
 transform, IROS 2003.
 """
@@ -22,10 +22,10 @@ from data_tools.lidar.voxels import voxel_keys
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 
-LEAST_POINTS = 6  # of a surfel that may be called flat
+LEAST_POINTS = 6  # of a flat surfel
 FLAT = 1 / 9  # largest share of the smallest eigenvalue in the second: a third of the standard deviation
 WIDTH = 0.05  # least standard deviation along the surface, of a voxel's size: a line is not a surface
-MEMORY = 200.0  # points after which a surfel forgets the oldest
+MEMORY = 200.0  # points after which older points lose weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Surfels(Columns):
     """M Gaussians, sorted by voxel.
 
     voxel    (M,) keys
-    count    (M,) points, forgotten ones not counted
+    count    (M,) points, older ones with less weight
     mean     (M, 3) m
     scatter  (M, 3, 3) sum of the squares about the mean, m^2
     normal   (M, 3) unit normals, 0 where `flat` is False; flat (M,)
@@ -63,7 +63,7 @@ class SurfelMap:
     """Surfels around the vehicle, in the map's frame, and the search for the nearest flat one.
 
     size   of a voxel, m
-    reach  surfels farther than this from the last scan's place are dropped, m
+    reach  largest distance of surfels from the last scan's position, m
     """
 
     def __init__(self, size: float, reach: float) -> None:
@@ -72,8 +72,8 @@ class SurfelMap:
         self._flat = self.surfels
         self._tree = cKDTree(np.empty((0, 3)))
 
-    def add(self, points: FloatArray, place: FloatArray) -> None:
-        """Take in points (N, 3) seen from `place` (3,), both in the map's frame."""
+    def add(self, points: FloatArray, position: FloatArray) -> None:
+        """Add points (N, 3) observed from `position` (3,), both in the map's frame."""
         old, new = self.surfels, _moments(points, self.size)
         row = np.searchsorted(old.voxel, new.voxel)
         known = np.zeros(len(new), dtype=np.bool_)
@@ -86,7 +86,7 @@ class SurfelMap:
         changed = np.zeros(len(both), dtype=np.bool_)
         changed[row[known]] = changed[len(old) :] = True
         order = np.argsort(both.voxel, kind="stable")
-        order = order[np.linalg.norm(both.mean[order] - place, axis=1) <= self.reach]
+        order = order[np.linalg.norm(both.mean[order] - position, axis=1) <= self.reach]
         self.surfels = _with_normals(both.select(order), changed[order], self.size)
         self._flat = self.surfels.select(self.surfels.flat)
         self._tree = cKDTree(self._flat.mean, balanced_tree=False, compact_nodes=False)

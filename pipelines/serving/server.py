@@ -154,8 +154,6 @@ class SocketServer:
             if self._address.path is not None:
                 self._address.path.unlink(missing_ok=True)
 
-    # one client
-
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection to its end."""
         self._served += 1
@@ -246,8 +244,6 @@ class SocketServer:
                 for subscriber in [each for each in self._clients if each.subscribed and each is not client]:
                     self._send(subscriber, line)
 
-    # limits
-
     def _send(self, client: Client, line: bytes) -> None:
         if client.transport.get_write_buffer_size() + len(line) > self.settings.max_outbox:
             self._drop(client)
@@ -294,8 +290,6 @@ class SocketServer:
         self._closed[reason] += 1
         if self._log_limit.due(reason):
             log.warning("%s: %s: closed; the status counts more of these", client.name, text)
-
-    # the socket
 
     def _complain(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Log an error in the event loop; where no more files can be opened, asyncio tries again after a second."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
-from data_tools.lidar.ply import write_ply
+from data_tools.lidar import write_ply
 from data_tools.plots import paths_from_above, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses

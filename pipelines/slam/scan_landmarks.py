@@ -9,8 +9,8 @@ import numpy as np
 
 from data_tools.lidar import (
     CurbSettings,
-    EdgeSettings,
     GroundSettings,
+    LineSettings,
     PlaneSettings,
     PoleSettings,
     extract_curbs,
@@ -18,7 +18,7 @@ from data_tools.lidar import (
     extract_walls,
     fit_ground,
     segment_ground,
-    straight_edges,
+    straight_lines,
 )
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.model.landmarks.line import LineLandmark
@@ -38,15 +38,15 @@ LINE = LineLandmark()
 class ScanLandmarkSettings:
     """Settings of the detection of landmarks in a scan."""
 
-    ground: bool = setting(False, "the ground as one plane: for level places only")
-    walls: int = setting(6, "walls of a scan at most, the largest ones")
-    poles: int = setting(12, "poles of a scan at most, the nearest ones")
-    edges: int = setting(2, "straight pieces of the road's edge at most, those with the most points")
-    segmentation: GroundSettings = settings_group(GroundSettings, "of the ground")
-    plane: PlaneSettings = settings_group(PlaneSettings, "of walls and ground")
-    pole: PoleSettings = settings_group(PoleSettings, "of poles")
-    curb: CurbSettings = settings_group(CurbSettings, "of points on the road's edge")
-    edge: EdgeSettings = settings_group(EdgeSettings, "of straight pieces of it")
+    ground: bool = setting(False, "detect the ground as one plane, for level areas only")
+    walls: int = setting(6, "largest number of walls of a scan; the largest ones are kept")
+    poles: int = setting(12, "largest number of poles of a scan; the nearest ones are kept")
+    lines: int = setting(2, "largest number of curb lines of a scan; those with the most points are kept")
+    segmentation: GroundSettings = settings_group(GroundSettings, "ground segmentation")
+    plane: PlaneSettings = settings_group(PlaneSettings, "walls and ground plane")
+    pole: PoleSettings = settings_group(PoleSettings, "poles")
+    curb: CurbSettings = settings_group(CurbSettings, "points on curbs")
+    line: LineSettings = settings_group(LineSettings, "straight lines through points on curbs")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +78,9 @@ def observe_landmarks(
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
         found.append(ObservedLandmark(Observation(POLE, pole.foot, pole.covariance), extent))
-    curbs = extract_curbs(points, ground.height, s.curb) if s.edges else np.empty((0, 3))
-    for edge in straight_edges(curbs, s.edges, s.edge):
-        found.append(ObservedLandmark(Observation(LINE, edge.ends.ravel(), edge.covariance), edge.ends))
+    curbs = extract_curbs(points, ground.height, s.curb) if s.lines else np.empty((0, 3))
+    for line in straight_lines(curbs, s.lines, s.line):
+        found.append(ObservedLandmark(Observation(LINE, line.ends.ravel(), line.covariance), line.ends))
     others = [other for detector in detectors for other in detector.observations(points)]
     found += [ObservedLandmark(other, np.zeros((2, 3))) for other in others]
     return found

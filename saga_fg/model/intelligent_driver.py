@@ -4,26 +4,25 @@ r"""How a driver follows, and how he comes to a halt: the Intelligent Driver Mod
 
 is the acceleration at speed v with the gap s, bumper to bumper, to a leader of speed w (Treiber, Hennecke, Helbing
 2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line where he has to stop is a leader that stands. Nobody
-drives backwards, so braking is at most -v / t_halt. An edge of rate 1 / tau acts with all of it, linearised at the
+drives backwards, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with all of it, linearised at the
 estimate (v', s', w'):
 
     dv_i/dt += rate tau u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
 
 Nobody starts behind one who stands, f <= max(v, w) / tau: parked cars stay where they are, and so does a queue.
-A gap with `room` for another vehicle may hold one that nobody sees. Then a driver does not speed up into it: he does as
-the leader does at most, f <= (w - v) / tau, and before a line he keeps his speed at most, f <= 0.
+A gap of at least `hidden_vehicle_gap` may hold an undetected vehicle. Then a driver does not speed up into it: at most
+as the leader does, f <= (w - v) / tau, and before a line at most at constant speed, f <= 0.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, PositiveOrInf, Settings, setting
 
@@ -50,15 +49,18 @@ class IntelligentDriver(Settings):
     The defaults are those of city traffic in Treiber and Kesting, Traffic Flow Dynamics (2013), table 11.2.
     """
 
-    free_speed: Positive = setting(15.0, "v_free: speed of a driver whom nobody hinders, m/s")
-    headway: Positive = setting(1.0, "T: time headway that drivers want to keep, s")
-    standstill_gap: NonNegative = setting(2.0, "s0: gap that drivers keep when they stand, bumper to bumper, m")
-    acceleration: Positive = setting(1.0, "a: highest acceleration, m/s^2")
-    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2")
-    hardest: Positive = setting(6.0, "no driver brakes harder, m/s^2")
-    halt_time: Positive = setting(0.4, "t_halt: time constant with which the last of the speed goes, s")
-    room: PositiveOrInf = setting(7.0, "a gap of this length may hold a vehicle that nobody sees, m; .inf: never")
-    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau accelerates as the driver does, s")
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
+    free_speed: Positive = setting(15.0, "v_free: desired speed on a free road, m/s; about the speed limit")
+    headway: Positive = setting(1.0, "T: desired time headway, s; usual 0.8 to 2; higher: larger gaps")
+    standstill_gap: NonNegative = setting(2.0, "s0: gap at rest, bumper to bumper, m; usual 1 to 3")
+    acceleration: Positive = setting(1.0, "a: maximum acceleration, m/s^2; usual 0.5 to 2")
+    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2; usual 1 to 3")
+    max_deceleration: Positive = setting(6.0, "limit of the deceleration, m/s^2")
+    stop_time: Positive = setting(0.4, "t_stop: time constant with which the last of the speed fades, s")
+    hidden_vehicle_gap: PositiveOrInf = setting(
+        7.0, "gap that may hold an undetected vehicle, into which nobody speeds up, m; .inf: there are none"
+    )
+    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau has the full acceleration of the law, s")
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """f (E,) where nobody hides in the gap; v, w >= 0 m/s, s m."""
@@ -78,9 +80,9 @@ class IntelligentDriver(Settings):
             2 * a * share**2 / s,
             by_gap_wanted * np.where(closing, -v / root, 0.0),
         )
-        hardest = Linearised(none - self.hardest, none, none, none)
-        halt = Linearised(-v / self.halt_time, none - 1 / self.halt_time, none, none)
-        f = hardest.where(f.value < -self.hardest, f)
+        hardest = Linearised(none - self.max_deceleration, none, none, none)
+        halt = Linearised(-v / self.stop_time, none - 1 / self.stop_time, none, none)
+        f = hardest.where(f.value < -self.max_deceleration, f)
         f = halt.where(f.value < halt.value, f)
         rate = np.where(np.maximum(v, w) < f.value * self.time_constant, 1 / self.time_constant, 0.0)
         start = Linearised(rate * np.maximum(v, w), rate * (v >= w), none, rate * (v < w))
@@ -99,22 +101,16 @@ class IntelligentDriver(Settings):
     def _capped(self, v: FloatArray, s: FloatArray, w: FloatArray, highest: Linearised) -> Linearised:
         """f, but at most `highest` where the gap has room for somebody else."""
         f = self.alone(v, s, w)
-        return highest.where((s >= self.room) & (highest.value < f.value), f)
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
+        return highest.where((s >= self.hidden_vehicle_gap) & (highest.value < f.value), f)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
-        v_i, v_j = (nodes.types[rows[0]].index(VELOCITY) for rows in (target, source))
         v, w = speed_along(nodes, target, u_i), speed_along(nodes, source, u_j)
         distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u_i)
         f = self.following(v, distance - (nodes.length[target] + nodes.length[source]) / 2, w)
-        before = f._replace(value=f.value - f.by_leader * w)  # what the leader's speed adds is added below
-        triples = accelerated(nodes, target, source, u_i, v, before, self.time_constant)
-        from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :]
-        triples.A_other[:, v_i[:, None], v_j] = from_leader * f.by_leader[:, None, None]
-        return triples
+        at_rest = f._replace(value=f.value - f.by_leader * w)
+        from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
+        return accelerated(nodes, target, source, u_i, v, at_rest, self.time_constant, from_leader)
 
 
 def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
@@ -123,19 +119,21 @@ def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
 
 
 def accelerated(
-    nodes: NodeTable, target: IntArray, source: IntArray, u: FloatArray, v: FloatArray, f: Linearised, tau: float
+    nodes: NodeTable,
+    target: IntArray,
+    source: IntArray,
+    u: FloatArray,
+    v: FloatArray,
+    f: Linearised,
+    tau: float,
+    by_leader: FloatArray | None = None,
 ) -> Triples:
-    """The triples of an acceleration along u (E, 2), but for what depends on the speed of the source.
+    """The triples of an acceleration f along u (E, 2), linearised at the speeds v (E,) and the distances along u.
 
-    Linearised at the speeds v (E,) and the distances along u.
+    by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out
     """
-    p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-    p_j = nodes.types[source[0]].index(POSITION)
     along = tau * u[:, :, None] * u[:, None, :]
     distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
-    triples = no_triples(nodes, target, source)
-    triples.A_self[:, v_i[:, None], v_i] = along * f.by_speed[:, None, None]
-    triples.A_self[:, v_i[:, None], p_i] = -along * f.by_gap[:, None, None]
-    triples.A_other[:, v_i[:, None], p_j] = along * f.by_gap[:, None, None]
-    triples.b[:, v_i] = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
-    return triples
+    by_gap, by_speed = along * f.by_gap[:, None, None], along * f.by_speed[:, None, None]
+    constant = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
+    return velocity_triples(nodes, target, source, -by_gap, by_speed, by_gap, by_leader, constant)

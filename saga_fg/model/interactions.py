@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from saga_fg.settings import (
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
+Needs = tuple[tuple[str, ...], tuple[str, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +76,9 @@ class Triples(NamedTuple):
 class Interaction(Protocol):
     """An interaction function, evaluated for E edges between nodes of one type and nodes of one type."""
 
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        """Whether both types have the components the interaction acts on."""
+    @property
+    def needs(self) -> Needs:
+        """Components that target and source must have."""
         ...
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
@@ -88,54 +90,46 @@ class Interaction(Protocol):
 class SharedVelocity:
     """Consensus of velocities: a node relaxes towards the velocity of its neighbour at the edge's rate."""
 
+    needs: ClassVar[Needs] = (VELOCITY, VELOCITY)
     along_heading: bool = setting(
-        False, "turn the neighbour's velocity by the difference of headings, so that a queue keeps its speed in a bend"
+        False,
+        "true: turn the neighbour's velocity by the difference of headings, for queues in bends",
     )
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(VELOCITY) and source.has(VELOCITY)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         turn = nodes.heading[target] - nodes.heading[source] if self.along_heading else np.zeros(len(target))
         c, s = np.cos(turn), np.sin(turn)
         R = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-        triples = no_triples(nodes, target, source)
-        v_i = nodes.types[target[0]].index(VELOCITY)
-        v_j = nodes.types[source[0]].index(VELOCITY)
-        triples.A_self[:, v_i, v_i] = -1.0
-        triples.A_other[:, v_i[:, None], v_j] = R
-        return triples
+        return velocity_triples(nodes, target, source, by_velocity=-np.eye(2), by_other_velocity=R)
 
 
 @dataclass(frozen=True)
 class CarFollowing(Settings):
     """Helly's linear car-following law along the follower's heading; the source is the leader."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     time_constant: PositiveOrInf = setting(
-        4.0, "tau: time over which a wrong gap is made good, s; .inf: only speeds are shared"
+        4.0, "tau: time constant with which a wrong gap closes, s; usual 1 to 10; .inf: share speeds only"
     )
-    headway: NonNegative = setting(0.0, "part of the desired gap that grows with the follower's speed, s")
+    headway: NonNegative = setting(0.0, "growth of the desired gap with the follower's speed, s; usual 0 to 2")
     gap: Literal["present", "standstill"] = setting(
-        "present", "desired gap: the one of the present estimate (formation), or standstill_gap + headway * speed"
+        "present", "desired gap: present: that of the present estimate; standstill: standstill_gap + headway * speed"
     )
-    standstill_gap: NonNegative = setting(2.0, "bumper to bumper, m; used with gap: standstill")
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return all(t.has(POSITION + VELOCITY) for t in (target, source))
+    standstill_gap: NonNegative = setting(2.0, "gap at rest with gap: standstill, bumper to bumper, m; usual 1 to 3")
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
         along = u_i[:, :, None] * u_i[:, None, :]
-        from_leader = u_i[:, :, None] * u_j[:, None, :]
-        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-        p_j, v_j = (nodes.types[source[0]].index(names) for names in (POSITION, VELOCITY))
-        triples = no_triples(nodes, target, source)
-        triples.A_self[:, v_i[:, None], p_i] = -along / self.time_constant
-        triples.A_self[:, v_i[:, None], v_i] = -along * (1 + self.headway / self.time_constant)
-        triples.A_other[:, v_i[:, None], p_j] = along / self.time_constant
-        triples.A_other[:, v_i[:, None], v_j] = from_leader
-        triples.b[:, v_i] = -u_i * (self._gap(nodes, target, source, u_i) / self.time_constant)[:, None]
-        return triples
+        return velocity_triples(
+            nodes,
+            target,
+            source,
+            by_position=-along / self.time_constant,
+            by_velocity=-along * (1 + self.headway / self.time_constant),
+            by_other_position=along / self.time_constant,
+            by_other_velocity=u_i[:, :, None] * u_j[:, None, :],
+            constant=-u_i * (self._gap(nodes, target, source, u_i) / self.time_constant)[:, None],
+        )
 
     def _gap(self, nodes: NodeTable, target: IntArray, source: IntArray, u_i: FloatArray) -> FloatArray:
         """Desired distance between the centres at speed zero, m (E,)."""
@@ -147,18 +141,14 @@ class CarFollowing(Settings):
 
 @dataclass(frozen=True)
 class SharedCourse:
-    """A node turns to where its leader heads: what of its velocity is across the leader's heading fades."""
+    """A node turns to the heading of its leader: its velocity across that heading decays."""
 
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(VELOCITY)
+    needs: ClassVar[Needs] = (VELOCITY, ())
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_j = unit(nodes.heading[source])
         m_j = np.stack([-u_j[:, 1], u_j[:, 0]], axis=-1)
-        v_i = nodes.types[target[0]].index(VELOCITY)
-        triples = no_triples(nodes, target, source)
-        triples.A_self[:, v_i[:, None], v_i] = -m_j[:, :, None] * m_j[:, None, :]
-        return triples
+        return velocity_triples(nodes, target, source, by_velocity=-m_j[:, :, None] * m_j[:, None, :])
 
 
 def unit(heading: FloatArray) -> FloatArray:
@@ -166,7 +156,37 @@ def unit(heading: FloatArray) -> FloatArray:
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
-def no_triples(nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-    """Triples of E edges, all zero, of the sizes that their nodes' types have."""
-    d_i, d_j, E = nodes.types[target[0]].dim, nodes.types[source[0]].dim, len(target)
-    return Triples(np.zeros((E, d_i, d_i)), np.zeros((E, d_i, d_j)), np.zeros((E, d_i)))
+def applies(needs: Needs, target: NodeType, source: NodeType) -> bool:
+    """Whether nodes of these types have the components that an interaction needs."""
+    own, other = needs
+    return target.has(own) and source.has(other)
+
+
+def velocity_triples(
+    nodes: NodeTable,
+    target: IntArray,
+    source: IntArray,
+    by_position: FloatArray | None = None,
+    by_velocity: FloatArray | None = None,
+    by_other_position: FloatArray | None = None,
+    by_other_velocity: FloatArray | None = None,
+    constant: FloatArray | None = None,
+) -> Triples:
+    """The triples of E edges that act on velocities in the plane.
+
+    by_...: derivatives of dv_i/dt, (2, 2) or (E, 2, 2), by position and velocity of target and source; constant (E, 2)
+    """
+    own, other, v = nodes.types[target[0]], nodes.types[source[0]], nodes.types[target[0]].index(VELOCITY)
+    E = len(target)
+    triples = Triples(np.zeros((E, own.dim, own.dim)), np.zeros((E, own.dim, other.dim)), np.zeros((E, own.dim)))
+    for matrix, kind, names, block in (
+        (triples.A_self, own, POSITION, by_position),
+        (triples.A_self, own, VELOCITY, by_velocity),
+        (triples.A_other, other, POSITION, by_other_position),
+        (triples.A_other, other, VELOCITY, by_other_velocity),
+    ):
+        if block is not None:
+            matrix[:, v[:, None], kind.index(names)] = block
+    if constant is not None:
+        triples.b[:, v] = constant
+    return triples

@@ -13,7 +13,7 @@ linearisation, and solvers go round it for ever.
 
     f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + hardest
     s* = s0 + S(v T + v (v - w) / (2 sqrt(a b))),    S(x) = log(1 + e^x) for max(0, x), s likewise, m
-    f  = -v / t_halt + h S((f0 + v / t_halt) / h)    for max(f0, -v / t_halt): nobody drives backwards; h 0.05 m/s^2
+    f  = -v / t_stop + h S((f0 + v / t_stop) / h)    for max(f0, -v / t_stop): nobody drives backwards; h 0.05 m/s^2
 
 An edge rule whose `interaction` is one of these makes `NonlinearEdges` of a scene graph: a filter linearises them at
 the start of the interval, smoothers wherever their estimates are. `interaction` gives the same law for factors by hand.
@@ -23,15 +23,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import expit
 
 from factors import NonlinearInteraction
 from saga_fg.model.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import Positive, Settings, setting, settings_group
 
@@ -59,7 +58,9 @@ class AccelerationLaw(Protocol):
     def alone(self) -> FloatArray:
         """What `accelerations` is given of a pair where nobody says more."""
 
-    def applies(self, target: NodeType, source: NodeType) -> bool: ...
+    @property
+    def needs(self) -> Needs:
+        """Components that target and source must have."""
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """What of the edges source[k] -> target[k] does not depend on states: (E, ...)."""
@@ -72,8 +73,13 @@ class AccelerationLaw(Protocol):
 class SmoothDriver(Settings):
     """A vehicle follows its leader, the source, as a driver does: an intelligent driver whose law has no corners."""
 
-    driver: IntelligentDriver = settings_group(IntelligentDriver, "the driver; `room` plays no part")
-    length: Positive = setting(4.5, "of the gap that vehicles fill, between their centres, where boxes do not tell, m")
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
+    driver: IntelligentDriver = settings_group(
+        IntelligentDriver, "parameters of the driver; `hidden_vehicle_gap` is not used"
+    )
+    length: Positive = setting(
+        4.5, "part of the distance between centres that vehicles fill where no boxes are known, m"
+    )
 
     @property
     def time_constant(self) -> float:
@@ -82,9 +88,6 @@ class SmoothDriver(Settings):
     @property
     def alone(self) -> FloatArray:
         return np.array(self.length)
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return all(kind.has(POSITION + VELOCITY) for kind in (target, source))
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         filled = (nodes.length[target] + nodes.length[source]) / 2
@@ -108,9 +111,10 @@ class SmoothDriver(Settings):
 class SocialForce(Settings):
     """A pedestrian keeps away from another, or from a wall: from the nearest point of the source's outline."""
 
-    strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2")
-    falloff: Positive = setting(0.5, "B: distance over which it falls to a third, m")
-    reach: Positive = setting(0.6, "sum of two radii, m; from a wall, one")
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
+    strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2; higher: larger berth")
+    falloff: Positive = setting(0.5, "B: distance over which the force falls to a third, m")
+    reach: Positive = setting(0.6, "sum of the radii of both, m; for a wall, one radius")
 
     @property
     def time_constant(self) -> float:
@@ -119,9 +123,6 @@ class SocialForce(Settings):
     @property
     def alone(self) -> FloatArray:
         return np.zeros((1, 4))
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E, k, 4) pieces of the outlines, both ends from the source's position; the last one repeated."""
@@ -162,15 +163,15 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
     gap = LEAST_GAP + np.logaddexp(0.0, s - LEAST_GAP)
     share = wanted / gap
     by_approach = 2 * a * share / gap * expit(approach)
-    G = a + driver.hardest
+    G = a + driver.max_deceleration
     g = a * (v / driver.free_speed) ** 4 + a * share**2
     slope = -((1 + (g / G) ** 4) ** -1.25)
-    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / driver.halt_time) / _HALT  # the halt
+    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / driver.stop_time) / _HALT  # the halt
     slope = slope * expit(above)
     by_speed = slope * (4 * a * v**3 / driver.free_speed**4 + by_approach * (driver.headway + (2 * v - w) / root))
     return Linearised(
-        np.asarray(_HALT * np.logaddexp(0.0, above) - v / driver.halt_time),
-        by_speed + (expit(above) - 1) / driver.halt_time,
+        np.asarray(_HALT * np.logaddexp(0.0, above) - v / driver.stop_time),
+        by_speed + (expit(above) - 1) / driver.stop_time,
         slope * (-2 * a * share**2 / gap * expit(s - LEAST_GAP)),
         slope * by_approach * -v / root,
     )

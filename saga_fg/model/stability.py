@@ -25,7 +25,7 @@ from saga_fg.errors import InputError
 from saga_fg.model.discretisation import discretise, joint_generator
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
-from saga_fg.model.interactions import NodeTable, unit
+from saga_fg.model.interactions import NodeTable, applies, unit
 from saga_fg.model.node import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
@@ -121,7 +121,7 @@ def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[Sce
         scale = math.inf if isinstance(rule, EdgeNetwork) else rule.heading_scale
         rate = highest_rate(rule) * np.exp(-((turns[target // 2] / scale) ** 2) / 2)
         law = rule.interaction
-        if not isinstance(law, AccelerationLaw) and law.applies(node_type, node_type):
+        if not isinstance(law, AccelerationLaw) and applies(law.needs, node_type, node_type):
             total += float(rate.max())
             groups.append(Edges(type(law).__name__, target, source, rate, *law.triples(nodes, target, source)))
     return SceneGraph.of(nodes.id, node_type, groups), total

@@ -13,10 +13,12 @@ from typer.testing import CliRunner
 from benchmarks.app import app
 from benchmarks.joint import JointBench, bench_joint
 from benchmarks.joint_online import bench_online
+from benchmarks.simulated_poles import observe_poles
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.slam.joint import run_joint, street
 from saga_fg import InputError
+from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint import JointSettings
 
 SHORT = replace(street(), duration=2.0)
@@ -77,3 +79,15 @@ def test_the_command_prints_and_writes_the_changes(tmp_path: Path, monkeypatch: 
         assert done.exit_code == 0, done.output
         assert expected in done.stdout
         assert len(json.loads(file.read_text())["rows"]) == 2
+
+
+def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
+    poses = np.stack([yaw_transform(0.5 * k) for k in range(60)])
+    seen = observe_poles(poses, 1, reach=20.0)
+    assert len(seen) == len(poses)
+    places = np.array([pose[:2, 3] + o.value[:2] for pose, now in zip(poses, seen, strict=True) for o in now])
+    assert max(np.hypot(*o.value[:2]) for now in seen for o in now) < 21
+    first = places[np.linalg.norm(places - places[0], axis=1) < 2]
+    assert 0.05 < first.std(axis=0).mean() < 0.2
+    again = observe_poles(poses, 1, reach=20.0)
+    assert [len(now) for now in seen] == [len(now) for now in again]

@@ -16,9 +16,7 @@ from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.slam.joint import keyframes, run_joint, street
-from pipelines.slam.simulated_poles import SimulatedPoleSettings, observe_poles
 from saga_fg import InputError
-from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint import JointSettings
 
 SHORT = replace(street(), duration=2.0)
@@ -63,16 +61,3 @@ def test_keyframes_lie_apart_in_time() -> None:
 def test_a_sensor_without_frames_is_named() -> None:
     with pytest.raises(InputError, match="expected frames of radar, there are those of"):
         run_joint(simulate_scene(SHORT, 1, "s"), load_config("simulated"), JointSettings(), "radar", 0)
-
-
-def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
-    poses = np.stack([yaw_transform(0.5 * k) for k in range(60)])
-    settings = SimulatedPoleSettings(reach=20.0, noise=0.1)
-    seen = observe_poles(poses, 1, settings)
-    assert len(seen) == len(poses)
-    places = np.array([pose[:2, 3] + o.value[:2] for pose, now in zip(poses, seen, strict=True) for o in now])
-    assert max(np.hypot(*o.value[:2]) for now in seen for o in now) < 21
-    first = places[np.linalg.norm(places - places[0], axis=1) < 2]
-    assert 0.05 < first.std(axis=0).mean() < 0.2
-    again = observe_poles(poses, 1, settings)
-    assert [len(now) for now in seen] == [len(now) for now in again]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, Edges, NodeType, RandomWalk, SceneGraph
-from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 
 CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
 BUS = NodeType("bus", ConstantAcceleration(jerk_noise=0.4))
@@ -41,7 +41,7 @@ def interaction_edges(rng, nodes, interaction, density, max_rate):
     groups = []
     for target_type in dict.fromkeys(nodes.types):
         for source_type in dict.fromkeys(nodes.types):
-            if not interaction.applies(target_type, source_type):
+            if not applies(interaction.needs, target_type, source_type):
                 continue
             rows = [[k for k, t in enumerate(nodes.types) if t is kind] for kind in (target_type, source_type)]
             target, source = random_pairs(rng, *rows, density)

@@ -14,13 +14,13 @@ the lane beside it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from saga_fg.model.cone_geometry import MIN_SPEED, ConeGeometry, cones_ahead
 from saga_fg.model.edge_rules import VEHICLES, Pairs
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import IntArray, of_classes
 from saga_fg.settings import (
     NonNegative,
@@ -34,26 +34,18 @@ from saga_fg.settings import (
 class PassCones:
     """Driving to where the line of cones is just cleared; the source is a cone."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     geometry: ConeGeometry
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         vehicles, number = np.unique(target, return_inverse=True)
         side = cones_ahead(nodes, vehicles, self.geometry).side[number]
         u = unit(nodes.heading[target])
         n = np.stack([-u[:, 1], u[:, 0]], axis=-1)
-        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-        p_j = nodes.types[source[0]].index(POSITION)
         across = n[:, :, None] * n[:, None, :]
         gain = 1 / self.geometry.preview  # w / L
-        triples = no_triples(nodes, target, source)
-        triples.A_self[:, v_i[:, None], v_i] = -across
-        triples.A_self[:, v_i[:, None], p_i] = -gain * across
-        triples.A_other[:, v_i[:, None], p_j] = gain * across
-        triples.b[:, v_i] = gain * self.geometry.clearance * side[:, None] * n
-        return triples
+        constant = gain * self.geometry.clearance * side[:, None] * n
+        return velocity_triples(nodes, target, source, -gain * across, -across, gain * across, constant=constant)
 
 
 @dataclass(frozen=True)
@@ -61,9 +53,11 @@ class ConeLine:
     """Vehicles ahead of which cones form a line pass it on its free side."""
 
     cones: ConeGeometry = settings_group(ConeGeometry, "which cones concern a vehicle, and how it passes them")
-    rate: NonNegative = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
-    band: PositiveOrInf = setting(0.5, "sigma of the kernel on the distance from where the line is just cleared, m")
-    vehicles: tuple[str, ...] = setting(VEHICLES, "classes that are pushed")
+    rate: NonNegative = setting(3.0, "strength of an edge of a vehicle that has to move aside, 1/s")
+    clearance_scale: PositiveOrInf = setting(
+        0.5, "sigma of the kernel on the distance to where the line is just cleared, m"
+    )
+    vehicles: tuple[str, ...] = setting(VEHICLES, "classes that move aside")
 
     @property
     def interaction(self) -> PassCones:
@@ -85,7 +79,7 @@ class ConeLine:
         gap = np.maximum(line.ahead[rows, far] - line.ahead[rows, near], 1e-9)
         share = np.where(far > near, (distance[rows] - line.ahead[rows, near]) / gap, 0.0)
         demand = (1 - share) * line.demand[rows, near] + share * line.demand[rows, far]
-        rate = self.rate * np.exp(-((np.minimum(demand, 0.0) / self.band) ** 2) / 2)
+        rate = self.rate * np.exp(-((np.minimum(demand, 0.0) / self.clearance_scale) ** 2) / 2)
         apart = far > near
         return Pairs(
             vehicles[np.concatenate([rows, rows[apart]])],

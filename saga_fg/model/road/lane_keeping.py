@@ -11,13 +11,13 @@ state.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_rules import VEHICLES, Pairs
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, no_triples, unit
-from saga_fg.model.node import NodeType
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.polyline import direction_at, feet, on_it
 from saga_fg.settings import (
@@ -36,18 +36,14 @@ PUSHED = 0.5  # m aside, from which cones decide and no longer the lane
 class KeepLane(Settings):
     """Attraction to the centre line of a lane and to its direction; the source is the lane."""
 
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     offset_time: PositiveOrInf = setting(
-        3.0, "tau: time over which an offset from the centre is made good, s; .inf for never"
+        3.0, "tau: time constant with which an offset from the centre line fades, s; usual 2 to 5; .inf: never"
     )
-    lag: NonNegative = setting(0.5, "time that vehicles look ahead along the lane, s")
-
-    def applies(self, target: NodeType, source: NodeType) -> bool:
-        return target.has(POSITION + VELOCITY) and source.has(POSITION)
+    lag: NonNegative = setting(0.5, "time by which vehicles look ahead along the lane, s")
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-        p_i, v_i = (nodes.types[target[0]].index(names) for names in (POSITION, VELOCITY))
-        p_j = nodes.types[source[0]].index(POSITION)
-        triples = no_triples(nodes, target, source)
+        across, constant = np.zeros((len(target), 2, 2)), np.zeros((len(target), 2))
         for lane in np.unique(source).tolist():
             rows = np.flatnonzero(source == lane)
             centre, mine = nodes.outline[lane], target[rows]
@@ -55,14 +51,12 @@ class KeepLane(Settings):
             n = np.stack([-at.direction[:, 1], at.direction[:, 0]], axis=-1)
             speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[mine], at.direction), 0.0)
             ahead = direction_at(centre, at.s + speed * self.lag)
-            across, e = n[:, :, None] * n[:, None, :], rows[:, None, None]
-            triples.A_self[e, v_i[:, None], v_i] = -across
-            triples.A_self[e, v_i[:, None], p_i] = -across / self.offset_time
-            triples.A_other[e, v_i[:, None], p_j] = across / self.offset_time
+            across[rows] = n[:, :, None] * n[:, None, :]
             foot = np.einsum("ei,ei->e", at.point - nodes.position[lane], n)
             sideways = speed * np.einsum("ei,ei->e", ahead, n) + foot / self.offset_time
-            triples.b[rows[:, None], v_i] = n * sideways[:, None]
-        return triples
+            constant[rows] = n * sideways[:, None]
+        pull = across / self.offset_time
+        return velocity_triples(nodes, target, source, -pull, -across, pull, constant=constant)
 
 
 @dataclass(frozen=True)
@@ -70,13 +64,13 @@ class InLane(Settings):
     """A vehicle that drives along a lane of the map, within its borders, keeps it."""
 
     interaction: KeepLane = settings_group(KeepLane, "interaction function of the edges")
-    rate: NonNegative = setting(2.0, "strength of an edge, 1/s")
-    drift_scale: PositiveOrInf = setting(
-        0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go"
+    rate: NonNegative = setting(2.0, "strength of an edge, 1/s; higher: vehicles keep their lane more strictly")
+    lateral_speed_scale: PositiveOrInf = setting(
+        0.8, "sigma of the kernel on the speed across the lane, m/s; lower: vehicles that leave it are let go sooner"
     )
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
     cones: ConeGeometry | None = settings_group(
-        lambda: None, "who is pushed out of the lane by cones does not keep it; null: cones play no part"
+        lambda: None, "vehicles that these cones push out of the lane do not keep it; null: ignore cones"
     )
 
     def pairs(self, nodes: NodeTable) -> Pairs:
@@ -95,7 +89,7 @@ class InLane(Settings):
             mine = vehicles[inside]
             targets.append(mine)
             sources.append(np.full(len(mine), lane, dtype=np.int64))
-            rates.append(self.rate * np.exp(-((drift[inside] / self.drift_scale) ** 2) / 2))
+            rates.append(self.rate * np.exp(-((drift[inside] / self.lateral_speed_scale) ** 2) / 2))
         return Pairs(np.concatenate(targets), np.concatenate(sources), np.concatenate(rates))
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_tools.lidar import (
-    EdgeSettings,
+    LineSettings,
     Scan,
     detect_clusters,
     extract_curbs,
@@ -17,10 +17,10 @@ from data_tools.lidar import (
     fit_ground,
     fit_plane,
     segment_ground,
-    straight_edges,
+    straight_lines,
 )
 from data_tools.lidar.clusters import l_shape_heading
-from data_tools.lidar.components import connected_from_above
+from data_tools.lidar.voxels import clusters_from_above
 from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
 from data_tools.simulator.street import KERB, SENSOR_HEIGHT, street
 from saga_fg.errors import InputError
@@ -167,35 +167,34 @@ def test_the_heading_of_an_l_is_that_of_its_sides(yaw: float, seed: int) -> None
 
 def test_parts_are_joined_across_cells_and_apart_beyond() -> None:
     chain = np.array([[0.1, 0.1, 0], [0.4, 0.4, 5], [0.7, 0.1, 0], [3.0, 0.1, 0], [-5.0, -5.0, 0]])
-    part = connected_from_above(chain, 0.3)
-    assert part[0] == part[1] == part[2]
-    assert len(set(part.tolist())) == 3
-    assert not len(connected_from_above(np.empty((0, 3)), 0.3))
+    clusters = clusters_from_above(chain, 0.3)
+    assert sorted(rows.tolist() for rows in clusters) == [[0, 1, 2], [3], [4]]
+    assert clusters_from_above(np.empty((0, 3)), 0.3) == []
 
 
 def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
     squares = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        settings = EdgeSettings(noise=0.05, bias=0.05, width=0.3)
+        settings = LineSettings(noise=0.05, bias=0.05, width=0.3)
         points = np.column_stack([np.arange(-8.0, 9.0, 0.5), np.full(34, 4.0), np.full(34, -1.7)])
         points[:, 1] += rng.normal(0, 0.1, 34) + np.interp(points[:, 0], [-8, 8.5], rng.normal(0, settings.bias, 2))
         stray = np.column_stack([rng.uniform(-8, 8, 12), rng.uniform(-10, 0, 12), np.full(12, -1.7)])
         turn = yaw_transform(yaw=rng.uniform(-3, 3))
-        (edge, *_) = straight_edges(transform_points(turn, np.concatenate([points, stray])), 1, settings)
+        (edge, *_) = straight_lines(transform_points(turn, np.concatenate([points, stray])), 1, settings)
         off = transform_points(turn.T, edge.ends)[:, 1] - 4.0
         squares.append(off @ np.linalg.solve(edge.covariance, off) / 2)
     assert 0.5 < np.mean(squares) < 1.5
-    assert straight_edges(np.empty((0, 3)), 2) == []
+    assert straight_lines(np.empty((0, 3)), 2) == []
     with pytest.raises(InputError, match="points"):
-        EdgeSettings(points=2)  # which every line fits
-    assert straight_edges(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
+        LineSettings(points=2)  # which every line fits
+    assert straight_lines(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
 
 
-def test_kerbs_of_a_simulated_street_are_straight_edges() -> None:
+def test_kerbs_of_a_simulated_street_are_straight_lines() -> None:
     for seed in range(3):
         points = seen(street(seed, kerbs=True), seed).points
-        edges = straight_edges(extract_curbs(points, segment_ground(points).height), 2)
+        edges = straight_lines(extract_curbs(points, segment_ground(points).height), 2)
         assert edges
         for edge in edges:
             np.testing.assert_allclose(np.abs(edge.ends[:, 1]), KERB, atol=0.35)

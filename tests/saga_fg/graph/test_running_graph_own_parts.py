@@ -36,8 +36,7 @@ class Spring:
     time_constant = 1.0
     alone = np.zeros((1, 0))
 
-    def applies(self, target, source):
-        return True
+    needs = ((), ())
 
     def given(self, nodes, target, source):
         return np.zeros((len(target), 0))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
 
 from saga_fg import NodeType, RandomWalk
-from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 from saga_fg.numerics.geometry import yaw_transform
 
 seeds = st.integers(0, 2**32 - 1)
@@ -152,7 +152,9 @@ def test_many_edges_are_the_edges_one_by_one():
 def test_interactions_say_which_types_they_act_on():
     rider = NodeType("drifting", RandomWalk(("vx", "vy"), drift=0.1))
     for interaction in INTERACTIONS:
-        assert all(interaction.applies(a, b) for a in MOVING for b in MOVING)
-        assert not any(interaction.applies(a, b) or interaction.applies(b, a) for a in MOVING for b in (CONE, POLE))
-    assert SharedVelocity().applies(CAR, rider)
-    assert not CarFollowing().applies(CAR, rider)
+        assert all(applies(interaction.needs, a, b) for a in MOVING for b in MOVING)
+        assert not any(
+            applies(interaction.needs, a, b) or applies(interaction.needs, b, a) for a in MOVING for b in (CONE, POLE)
+        )
+    assert applies(SharedVelocity.needs, CAR, rider)
+    assert not applies(CarFollowing.needs, CAR, rider)

@@ -14,7 +14,7 @@ from saga_fg import InputError
 from saga_fg.learning import TEMPLATE
 from saga_fg.model.edge_network import FEATURES, EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity, no_triples
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity, velocity_triples
 from saga_fg.model.learned_interactions import LearnedInteractions
 
 
@@ -79,13 +79,10 @@ def test_dynamics_that_run_away_are_refused():
     class Flight:
         """Nodes flee: the velocity grows."""
 
-        def applies(self, target, source):
-            return True
+        needs = ((), ())
 
         def triples(self, nodes, target, source):
-            triples = no_triples(nodes, target, source)
-            triples.A_self[:, 2:, 2:] = np.eye(2)
-            return triples
+            return velocity_triples(nodes, target, source, by_velocity=np.eye(2))
 
     with pytest.raises(InputError, match=r"edges\[0\]: expected stable dynamics"):
         LearnedInteractions(edges=(Neighbours(Flight(), rate=1.0),))
