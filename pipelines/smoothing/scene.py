@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 from pipelines.config import Method
 from pipelines.process import one_thread
-from pipelines.smoothing.assembly import count_labels, label_moments
 from pipelines.smoothing.config import SmoothConfig
-from pipelines.smoothing.online import track_evidence
-from pipelines.smoothing.rounds import smooth_objects
+from pipelines.smoothing.labelling import count_labels, label_moments
+from pipelines.smoothing.passes import smooth_objects, track_evidence
 from pipelines.tracking import Progress
 from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
