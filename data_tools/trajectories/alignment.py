@@ -45,8 +45,8 @@ def rigid_alignment(source: ArrayLike, target: ArrayLike) -> FloatArray:
 def aligned(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "rigid") -> Trajectory:
     """`estimate` in the coordinates of `truth`; both of the same length, pose for pose.
 
-    rigid: least squared distances; start: equal first poses, which shows the drift; none: unchanged. Raises `InputError`
-    for other names and different lengths.
+    rigid: least squared distances; start: equal first poses, which shows the drift; none: unchanged. Raises
+    `InputError` for other names and different lengths.
     """
     if len(estimate) != len(truth):
         raise InputError(f"estimate: expected {len(truth)} poses, one for each of the truth, got {len(estimate)}")
