@@ -19,7 +19,7 @@ from saga_fg.types.dataset import Dataset, Scene
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionFileSource(DatasetSource):
-    """Your own detections: a table with one a row.
+    """Your own detections: a table with a row for each.
 
     The columns timestamp (s), x and y (m) are needed; label, score, sensor, size, heading and more are used where they
     are there (see docs/formats.md).
@@ -32,6 +32,7 @@ class DetectionFileSource(DatasetSource):
         "Table of detections: .csv, .ndjson, .jsonl or .npz. In parallel: several of them, patterns, URLs, or lists of "
         "such in a .txt file.",
         None,
+        metavar="TABLE",
         required=(*TRACKING, "learn interactions"),
         argument=True,
     )

@@ -18,7 +18,7 @@ from saga_fg.types.dataset import Dataset
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedSource(DatasetSource):
-    """Simulated traffic, whose truth is known: hidden objects are scored as well."""
+    """Simulated traffic, whose ground truth has the hidden objects too."""
 
     name = "simulated"
     family = "simulated"

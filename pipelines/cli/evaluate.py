@@ -28,7 +28,7 @@ def _evaluate(
         Path | None,
         typer.Argument(help="Result of any tracker, as `saga-fg track` writes it; left out, one is made and scored."),
     ] = None,
-    method: how.MethodOption | None = None,
+    method: how.MethodOrNone = None,
     estimator: how.EstimatorOption = None,
     lag: how.LagOption = None,
     association: how.AssociationOption = None,

@@ -13,13 +13,12 @@ from saga_fg.tracking import AssociationName, EstimatorName
 if TYPE_CHECKING:
     from pipelines.config import Method, TrackConfig
 
-MethodOption = Annotated[
-    Literal["saga", "kf", "centerpoint"],
-    typer.Option(
-        "--method",
-        help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
-    ),
-]
+_METHOD = typer.Option(
+    "--method",
+    help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
+)
+MethodOption = Annotated[Literal["saga", "kf", "centerpoint"], _METHOD]
+MethodOrNone = Annotated[Literal["saga", "kf", "centerpoint"] | None, _METHOD]
 
 EstimatorOption = Annotated[
     EstimatorName | None,

@@ -34,7 +34,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class KittiSource(DatasetSource):
-    """KITTI tracking sequences; results are the official text, one file a sequence, beside them tracks.csv in full."""
+    """KITTI tracking sequences.
+
+    Results are the benchmark's text, one file a sequence, and beside them tracks.csv with velocities and covariances.
+    """
 
     name = "kitti"
     family = "kitti"
