@@ -91,7 +91,7 @@ def label_states(
     yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "position_bias")
     turning = yaw_drift**2 * duration
     turning = np.where(_stands(objects), 1e-6, turning)
-    (moving,) = class_values(settings.classes, OfflineClass, lives.label, "motion_heading")
+    (moving,) = class_values(settings.classes, OfflineClass, lives.label, "min_heading_speed")
     headings = smooth_headings(states, lives, evidence, rows, at, turning, moving)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])

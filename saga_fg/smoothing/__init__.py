@@ -11,11 +11,11 @@ from saga_fg.smoothing.labels import LabelCounts, Labels, Quality, Source, quali
 from saga_fg.smoothing.random_walk import previous_rows, scalar_readings, smooth_walks
 from saga_fg.smoothing.scoring import evidence_scores, look_rate, looks_in_view
 from saga_fg.smoothing.settings import (
-    JoiningSettings,
     OfflineClass,
     QualitySettings,
     SmoothingSettings,
     StationarySettings,
+    StitchingSettings,
 )
 from saga_fg.smoothing.sizes import constant_sizes, size_weights, weighted_medians
 from saga_fg.smoothing.standing import standing_states
@@ -24,7 +24,6 @@ from saga_fg.smoothing.states import Lives, StateTable, lives_of_evidence
 __all__ = [
     "Evidence",
     "Headings",
-    "JoiningSettings",
     "LabelCounts",
     "Labels",
     "Lives",
@@ -38,6 +37,7 @@ __all__ = [
     "Standing",
     "StateTable",
     "StationarySettings",
+    "StitchingSettings",
     "attribute",
     "claim_detections",
     "constant_sizes",

@@ -116,7 +116,9 @@ def _epochs(
         if k > begin:
             graph = graph_of(k - 1, lives.id[present], tuple(types[i] for i in present.tolist()))
             still = standing.at(k - 1, graph.nodes) & standing.at(k, graph.nodes)
-            graph = replace(graph, diffusion_scale=np.where(still, standing.settings.noise, graph.diffusion_scale))
+            graph = replace(
+                graph, diffusion_scale=np.where(still, standing.settings.noise_scale, graph.diffusion_scale)
+            )
             transition = discretise(graph, float(evidence.times[k] - evidence.times[k - 1]))
         born = np.flatnonzero(lives.first == k)
         P = np.zeros((len(born), 4, 4))
@@ -127,7 +129,7 @@ def _epochs(
         measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
         pinned = lives.id[present][standing.at(k, lives.id[present])]
         if len(pinned):
-            H, R = types[0].selector(VELOCITY), standing.settings.velocity**2 * np.eye(2)
+            H, R = types[0].selector(VELOCITY), standing.settings.velocity_deviation**2 * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lives.last[present] == k
         yield Epoch(k, transition, births, measured, lives.id[present[gone]])

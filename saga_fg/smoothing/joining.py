@@ -3,7 +3,7 @@ r"""Tracklets that are one object: the assignment of ends to beginnings of least
 An end i and a later beginning j, extended towards each other by the smoother, meet at the moment j begins with the
 difference d of their states. That they are one object rather than that i left unseen and j is new costs
 
-    1/2 d^T S^-1 d + 1/2 log |2 pi S| + miss * looks - ( -log(new_objects) + 1/2 log |2 pi V| ),   S = P_i + P_j
+    1/2 d^T S^-1 d + 1/2 log |2 pi S| + miss_cost * looks + log(new_object_density) - 1/2 log |2 pi V|,  S = P_i + P_j
 
 nats, with V the covariance of the velocity of something new and looks the frames in the gap that should have shown it;
 pairs are joined where that is negative in total. Objects are chains of tracklets that do not overlap, so that the
@@ -19,12 +19,12 @@ from scipy.optimize import linear_sum_assignment
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import gate
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.settings import JoiningSettings
+from saga_fg.smoothing.settings import StitchingSettings
 from saga_fg.smoothing.states import Lives, StateTable
 
 
 def join_tracklets(
-    seen: Lives, states: StateTable, velocity_prior: FloatArray, evidence: Evidence, settings: JoiningSettings
+    seen: Lives, states: StateTable, velocity_prior: FloatArray, evidence: Evidence, settings: StitchingSettings
 ) -> IntArray:
     """(n,) the object of each tracklet: the id of the first tracklet of its chain.
 
@@ -41,8 +41,8 @@ def join_tracklets(
     d = states.mean[a] - states.mean[b]
     S = states.covariance[a] + states.covariance[b]
     d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[..., None])[..., 0])
-    cost = (d2 + _log_det(S)) / 2 + settings.miss * _looks_between(evidence, seen, states, end, begin)
-    cost -= _log_det(velocity_prior[begin]) / 2 - np.log(settings.new_objects)
+    cost = (d2 + _log_det(S)) / 2 + settings.miss_cost * _looks_between(evidence, seen, states, end, begin)
+    cost -= _log_det(velocity_prior[begin]) / 2 - np.log(settings.new_object_density)
     cost[d2 > gate(settings.gate, 4)] = np.inf
     gain = np.zeros((len(seen), len(seen)))
     gain[end, begin] = np.minimum(cost, 0.0)

@@ -17,15 +17,15 @@ from saga_fg.smoothing.states import Lives, StateTable
 
 
 def evidence_scores(
-    evidence: Evidence, object_of: IntArray, lives: Lives, states: StateTable, prior_time: float
+    evidence: Evidence, object_of: IntArray, lives: Lives, states: StateTable, prior_opportunity_time: float
 ) -> FloatArray:
-    """(n,) scores in [0, 1). prior_time: how long the prior's looks take at the rate of this recording's frames, s."""
+    """(n,) scores in [0, 1). prior_opportunity_time: of the prior's opportunities, s."""
     rows = np.flatnonzero(object_of >= 0)
     owner = lives.rows_of(object_of[rows])
     total = np.bincount(owner, evidence.probability[rows], minlength=len(lives))
     seen = np.bincount(owner, minlength=len(lives))
     looks = np.maximum(looks_in_view(evidence, lives, states), seen)
-    return np.asarray(total / (looks + prior_time * look_rate(evidence)))
+    return np.asarray(total / (looks + prior_opportunity_time * look_rate(evidence)))
 
 
 def looks_in_view(evidence: Evidence, lives: Lives, states: StateTable) -> IntArray:

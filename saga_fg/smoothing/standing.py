@@ -1,11 +1,11 @@
 r"""Objects that stand still, recognised from smoothed states and what was measured of them.
 
-A run of moments is a stand if the smoothed speed stays below the class's `stand_speed` for at least `min_time`, and the
+An object is stationary where its smoothed speed stays below `stationary_speed` for at least `min_time`, and the
 positions measured meanwhile do not drift: with the weighted regression
 
     z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2
 
-the drift |u*| T over its duration T is below the class's `stand_drift`. A parked vehicle stands in all its life.
+the drift |u*| T over its duration T is below the class's `stationary_drift`. A parked vehicle stands in all its life.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def standing_states(
     order = np.lexsort((states.moment, states.id))
     ids, moments = states.id[order], states.moment[order]
     label = lives.label[lives.rows_of(ids)]
-    stand_speed, max_drift = class_values(classes, OfflineClass, label, "stand_speed", "stand_drift")
-    slow = np.hypot(*states.mean[order, 2:].T) <= stand_speed
+    stationary_speed, max_drift = class_values(classes, OfflineClass, label, "stationary_speed", "stationary_drift")
+    slow = np.hypot(*states.mean[order, 2:].T) <= stationary_speed
     begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
     ends = np.flatnonzero(slow & np.concatenate([(ids[1:] != ids[:-1]) | ~slow[1:], [True]]))
     times = evidence.times
