@@ -86,7 +86,7 @@ def _default_of(cls: type) -> Any:
 def _default_text(schema: Schema, value: Any) -> str:
     match schema:
         case Section(classes):
-            return f"`{kind_of(type(value))}`" if len(classes) > 1 else ""
+            return f"`{kind_of(type(value))}`" if len(classes) > 1 else "see below"
         case Table():
             return ", ".join(f"`{key}`" for key in value) or "empty"
         case Nullable(inner) if value is not None:
