@@ -61,7 +61,7 @@ class WindowedSmoother(RecordedSmoother):
 
     @property
     def bound(self) -> float:
-        """Largest change that later measurements could make to final epochs; above `tolerance` where forced by `longest`."""
+        """Largest change that later measurements could make to final epochs; forced by `longest` above `tolerance`."""
         return self._bound
 
     def final(self) -> tuple[SmoothedState, ...]:
