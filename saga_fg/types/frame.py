@@ -58,13 +58,12 @@ class Detections(Columns):
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
-        object.__setattr__(self, "score", checked("score", self.score, (n,)))
         rate = np.full(n, self.range_rate) if np.ndim(self.range_rate) == 0 else self.range_rate
         rate = checked("range_rate", rate, (n,), "finite-or-nan")
         if (np.abs(rate) > MAX_SPEED).any():
             row = int(np.argmax(np.abs(rate) > MAX_SPEED))
             raise InputError(f"range_rate[{row}]: expected numbers within {MAX_SPEED:g}, got {rate[row]:g}")
-        object.__setattr__(self, "range_rate", rate)
+        vars(self).update(score=checked("score", self.score, (n,)), range_rate=rate)
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Self:
@@ -143,7 +142,7 @@ class Frame:
         timestamp = finite_seconds(self.timestamp)
         if abs(timestamp) > LATEST:
             raise InputError(f"timestamp: expected seconds, got {timestamp:g}: milli-, micro- or nanoseconds?")
-        object.__setattr__(self, "timestamp", timestamp)
+        vars(self)["timestamp"] = timestamp
         if not isinstance(self.sensor, str) or not self.sensor:
             raise InputError(f"sensor: expected a name, got {self.sensor!r}")
         if not isinstance(self.detections, Detections):
@@ -159,7 +158,7 @@ class Frame:
             if (np.abs(pose[:3, 3]) > MAX_POSITION).any():
                 place = pose[:3, 3].tolist()
                 raise InputError(f"world_T_ego: expected a place within {MAX_POSITION:g} m, got {place}")
-            object.__setattr__(self, "world_T_ego", pose)
+            vars(self)["world_T_ego"] = pose
         elif self.ego is not None:
             return
         elif self.coordinates != "world":

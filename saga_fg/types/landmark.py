@@ -70,9 +70,9 @@ class Observation:
 
     def __post_init__(self) -> None:
         d = self.kind.variable.dim
-        object.__setattr__(self, "value", checked(f"observed {self.kind.name}", self.value, (None,)))
+        value = checked(f"observed {self.kind.name}", self.value, (None,))
         covariance = checked_covariances(f"covariance of a {self.kind.name}", [self.covariance], 1, d)[0]
-        object.__setattr__(self, "covariance", covariance)
+        vars(self).update(value=value, covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)

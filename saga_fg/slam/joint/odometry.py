@@ -76,9 +76,8 @@ class OdometryIncrements:
             checked_transform(f"a_T_b[{k}]", increment)
         if self.covariances is not None:
             covariances = checked_covariances("covariances", self.covariances, len(increments), 6)
-            object.__setattr__(self, "covariances", covariances)
-        object.__setattr__(self, "timestamps", timestamps)
-        object.__setattr__(self, "a_T_b", increments)
+            vars(self)["covariances"] = covariances
+        vars(self).update(timestamps=timestamps, a_T_b=increments)
 
     @classmethod
     def of(cls, timestamps: ArrayLike, world_T_ego: ArrayLike) -> Self:
