@@ -45,10 +45,10 @@ def test_links_within_the_documentation_lead_somewhere(page: Path) -> None:
 
 
 def test_the_contents_name_every_page() -> None:
-    contents = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    contents = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     for page in (ROOT / "docs").rglob("*.md"):
         name = page.relative_to(ROOT / "docs").as_posix()
-        assert name == "README.md" or f"]({name})" in contents, f"docs/README.md does not name {name}"
+        assert name == "index.md" or f"]({name})" in contents, f"docs/index.md does not name {name}"
 
 
 def test_the_site_has_every_page() -> None:
@@ -128,7 +128,7 @@ def test_links_to_the_top_of_the_repository_are_links_of_the_site() -> None:
         "from site_hooks import on_page_markdown\n"
         "def site(uri, text):\n"
         "    return on_page_markdown(text, Some(file=Some(src_uri=uri)), None, None)\n"
-        "print(site('README.md', '[a](../CONTRIBUTING.md#b) [c](install.md)'))\n"
+        "print(site('index.md', '[a](../CONTRIBUTING.md#b) [c](install.md)'))\n"
         "print(site('guides/slam.md', '[a](../../CHANGELOG.md) [c](../model.md)'))\n"
         "print(site('CONTRIBUTING.md', '[a](docs/guides/slam.md#b)'))\n"
     )

@@ -13,7 +13,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 
 from data_tools.datasets.source import DatasetSource
-from data_tools.files.located import unknown
+from data_tools.files.error_messages import unknown_name
 from saga_fg.errors import InputError
 
 GROUP = "saga_fg.datasets"
@@ -44,7 +44,7 @@ def dataset_source(name: str) -> type[DatasetSource]:
         return _loaded(BUILT_IN[name], f"dataset {name}")
     found = _external().get(name, ())
     if not found:
-        raise InputError(unknown("dataset", name, dataset_names()))
+        raise InputError(unknown_name("dataset", name, dataset_names()))
     packages = [entry.dist.name if entry.dist is not None else entry.value for entry in found]
     packages += ["saga-fg"] * (name in BUILT_IN)
     if len(packages) > 1:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows, read_tracks
-from data_tools.files.located import unknown
+from data_tools.files.error_messages import unknown_name
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -41,7 +41,7 @@ def read_table_results(path: Path, dataset: Dataset | None) -> dict[str, SceneRe
     if dataset is None:
         return {name: _placed(_scene(rows, name), rows, path) for name in there}
     if there and not set(there) & set(dataset.scenes):
-        raise InputError(f"{path}: {unknown('scene', there[0], dataset.scenes)}")
+        raise InputError(f"{path}: {unknown_name('scene', there[0], dataset.scenes)}")
     return {name: _placed(dataset.scene(name), rows, path) for name in dataset.scenes}
 
 

@@ -25,7 +25,7 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from data_tools.files.located import unknown
+from data_tools.files.error_messages import unknown_name
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class ChosenScenes:
         self._dataset, self.scenes = dataset, names(option, chosen)
         for name in self.scenes:
             if name not in dataset.scenes:
-                raise InputError(f"{option}: {unknown('scene', name, dataset.scenes)}")
+                raise InputError(f"{option}: {unknown_name('scene', name, dataset.scenes)}")
 
     def scene(self, name: str) -> Scene:
         """Read one of the scenes."""

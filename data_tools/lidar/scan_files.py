@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_tools.files.atomic_files import write_bytes
+from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes
-from data_tools.files.located import located
 from data_tools.files.numpy_files import load_archive, load_array
 from data_tools.lidar.cloud_headers import check_pcd, check_ply
 from data_tools.lidar.scan import Scan
@@ -39,7 +39,7 @@ def read_scan(path: str | Path) -> Scan:
     ending = next((ending for ending in _READERS if name.endswith(ending)), None)
     if ending is None:
         raise InputError(f"{path}: expected a name that ends in {', '.join(_READERS)}")
-    with open_bytes(path) as file, located(str(path)):
+    with open_bytes(path) as file, error_context(str(path)):
         return _READERS[ending](file, path)
 
 

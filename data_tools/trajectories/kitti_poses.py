@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from data_tools.files.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
 from saga_fg.errors import InputError
@@ -35,7 +35,7 @@ def read_kitti_poses(path: str | Path, times: str | Path | None = None, period: 
     timestamps = (
         np.arange(len(table), dtype=np.float64) * period if times is None else _read_times(Path(times), len(table))
     )
-    with located(str(path)):
+    with error_context(str(path)):
         return Trajectory(timestamps, poses)
 
 

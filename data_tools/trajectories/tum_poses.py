@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_tools.files.atomic_files import write_text
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from data_tools.files.text_tables import read_table
 from data_tools.trajectories.trajectory import Trajectory
 from saga_fg.errors import InputError
@@ -37,7 +37,7 @@ def read_tum_poses(path: str | Path) -> Trajectory:
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = quaternion_rotation(numbers[:, [7, 4, 5, 6]] / norm[:, None])
     poses[:, :3, 3] = numbers[:, 1:4]
-    with located(str(path)):
+    with error_context(str(path)):
         return Trajectory(numbers[:, 0], poses)
 
 

@@ -38,7 +38,7 @@ def explain(
     """
     from data_tools.figures import write_figures
     from data_tools.files.atomic_files import atomic_file, check_writable
-    from data_tools.files.located import located
+    from data_tools.files.error_messages import error_context
     from pipelines.explaining import graph_picture, journal_of, read_graphs, read_track, story
     from saga_fg.errors import InputError
 
@@ -47,7 +47,7 @@ def explain(
         if output is None or output.suffix not in (".png", ".svg", ".pdf"):
             raise InputError("--graph: expected --output FILE, a name that ends in .png, .svg or .pdf")
         graphs = read_graphs(journal)
-        with located(str(journal)):
+        with error_context(str(journal)):
             figure = graph_picture(graphs, scene, time, track)
         with atomic_file(output) as file:
             figure.savefig(file, format=output.suffix[1:], dpi=130)
@@ -57,7 +57,7 @@ def explain(
     if json_file is not None:
         check_writable(json_file)
     events = read_track(journal, track, scene)
-    with located(str(journal)):
+    with error_context(str(journal)):
         lines = story(events)
     for line in lines:
         typer.echo(line)

@@ -14,7 +14,7 @@ from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource
-    from pipelines.scale_out import Pool, Report, SceneTask
+    from pipelines.scale_out import Pool, RunSummary, SceneTask
     from saga_fg.types.dataset import Dataset
 
 FAILED_SCENES = 1  # exit code
@@ -68,7 +68,7 @@ def run_at_scale(
     def new_pool(scratch: Path) -> Pool:
         return LocalPool(workers or 0, scratch) if ray is None else RayPool(ray, workers or 0)
 
-    def finish(report: Report) -> None:
+    def finish(report: RunSummary) -> None:
         if merged and not report.failed:
             merge(output, [file_name(name) for name in there.names], there.dataset)
 

@@ -44,7 +44,7 @@ def g2o(
       saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
     """
     from data_tools.files.atomic_files import check_writable_folder
-    from data_tools.files.located import located
+    from data_tools.files.error_messages import error_context
     from data_tools.pose_graphs import read_g2o
     from factors import Robust
     from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
@@ -59,7 +59,7 @@ def g2o(
     check_writable_folder(output)
     loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
-    with working("optimising"), located(str(file)):  # a graph that is whole may have no optimum, as one in pieces
+    with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         optimised = optimise_poses(graph, loss)
         covariances = optimised.covariances()
     guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))

@@ -41,11 +41,11 @@ def _view(
     verbose: options.Verbose = False,
 ) -> None:
     """See a tracking result, with the ground truth, the detections and the LiDAR scans where they are there."""
-    from pipelines.view.sources import result_view
+    from pipelines.view.scenes import result_views
 
     if save is not None:
         options.apart(save, result, *source.input_files(), option="--save")
-    _show(result, save, lambda: result_view(source, result, spacing), slam)
+    _show(result, save, lambda: result_views(source, result, spacing), slam)
 
 
 _commands = dataset_commands("view", _view, ("view {result}", "view {result} --save tracks.mcap"))

@@ -5,7 +5,7 @@ result + recordings -> `ReportScene`s, tables, charts -> `report_page` -> one fi
 
 from pipelines.report.charts import Chart, Series, accuracy_charts, latency_chart
 from pipelines.report.page import Report, report_page
-from pipelines.report.results import Results, result_report, shown_results
+from pipelines.report.results import result_report, result_scenes
 from pipelines.report.run_record import RunRecord, read_run_record, record_path
 from pipelines.report.scenes import ReportScene, scene_of_run
 
@@ -13,7 +13,6 @@ __all__ = [
     "Chart",
     "Report",
     "ReportScene",
-    "Results",
     "RunRecord",
     "Series",
     "accuracy_charts",
@@ -22,6 +21,6 @@ __all__ = [
     "record_path",
     "report_page",
     "result_report",
+    "result_scenes",
     "scene_of_run",
-    "shown_results",
 ]

@@ -4,7 +4,7 @@ from pipelines.scale_out.job import Job, Outcome, SceneTask, perform
 from pipelines.scale_out.local_pool import LocalPool
 from pipelines.scale_out.manifest import Manifest, Record, file_name
 from pipelines.scale_out.ray_pool import RayPool
-from pipelines.scale_out.run import Pool, Report, run_scenes
+from pipelines.scale_out.run import Pool, RunSummary, run_scenes
 from pipelines.scale_out.tasks import SmoothTask, TrackTask
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "Pool",
     "RayPool",
     "Record",
-    "Report",
+    "RunSummary",
     "SceneTask",
     "SmoothTask",
     "TrackTask",

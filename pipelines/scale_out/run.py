@@ -32,7 +32,7 @@ class Pool(Protocol):
 
 
 @dataclass
-class Report:
+class RunSummary:
     """Names of the scenes by status; reasons of the failed ones; counts over all results."""
 
     done: list[str] = field(default_factory=list)
@@ -53,8 +53,8 @@ def run_scenes(
     output: Path,
     new_pool: Callable[[Path], Pool],
     progress: Callable[[str, int, int], None] | None = None,
-    finish: Callable[[Report], None] | None = None,
-) -> Report:
+    finish: Callable[[RunSummary], None] | None = None,
+) -> RunSummary:
     """Perform a task on every input, in any order; results in `output`, records in `output`/manifest.
 
     new_pool  makes the workers, given a folder for their temporary files
@@ -64,7 +64,7 @@ def run_scenes(
     Failed scenes are in the report and in the manifest; the others go on. Raises `InputError` for two inputs of one
     name, and if another run writes to the folder.
     """
-    folder, report = OutputFolder(output), Report()
+    folder, report = OutputFolder(output), RunSummary()
     manifest = Manifest(folder)
     configuration, here = sha256(task.configuration.encode()), version("saga-fg")
     with folder.held():
@@ -97,7 +97,7 @@ def _jobs(inputs: Iterable[Part], task: SceneTask, manifest: Manifest, configura
         yield Job(scene, task, manifest.valid(scene.name, configuration, here))
 
 
-def _count(report: Report, outcome: Outcome, manifest: Manifest, configuration: str) -> None:
+def _count(report: RunSummary, outcome: Outcome, manifest: Manifest, configuration: str) -> None:
     """Write the results and the record of an outcome, and count it."""
     record: Record | None
     if outcome.status == "unchanged":

@@ -24,13 +24,16 @@ import colorsys
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.source import DatasetSource
 from data_tools.lidar import voxel_downsample
 from data_tools.lidar.scan_sequence import ScanSequence
 from data_tools.metrics import SceneBoxes
+from pipelines.report.results import result_scenes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections
 from pipelines.view.drawing import (
     VEHICLE,
@@ -71,6 +74,16 @@ class SceneView:
     scans: ScanSequence | None = None
     spacing: float = 0.1
     graphs: Sequence[Mapping[str, Any]] = ()
+
+
+def result_views(source: DatasetSource, result: Path, spacing: float) -> list[SceneView]:
+    """Read the scenes of the result of any tracker; points are thinned to `spacing` m, 0 leaves them out.
+
+    Raises `InputError` for missing or broken files, and for a result that does not fit the dataset.
+    """
+    scenes = result_scenes(source, result, source.read_results(result))
+    scans = source.scans([each.scene.name for each in scenes]) if spacing else {}
+    return [SceneView(each, scans.get(each.scene.name), spacing) for each in scenes]
 
 
 def draw_scene(view: SceneView) -> Iterator[Drawing]:

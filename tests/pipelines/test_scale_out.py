@@ -17,7 +17,7 @@ from pipelines.scale_out import (
     Job,
     LocalPool,
     Manifest,
-    Report,
+    RunSummary,
     SceneTask,
     perform,
     run_scenes,
@@ -26,7 +26,7 @@ from pipelines.scale_out.folder import OutputFolder
 from saga_fg.errors import InputError
 
 
-def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> Report:
+def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> RunSummary:
     def new_pool(scratch):
         return LocalPool(workers, scratch) if workers else InThisProcess()
 

@@ -13,14 +13,14 @@ from scale_out_example import TRACK, InThisProcess, content, write_recordings
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.scale_out import Manifest, Report, run_scenes
+from pipelines.scale_out import Manifest, RunSummary, run_scenes
 from pipelines.scale_out.folder import OutputFolder, is_inside
 from pipelines.scale_out.manifest import file_name
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 
 
-def run(folder: Path, scenes: int = 1) -> Report:
+def run(folder: Path, scenes: int = 1) -> RunSummary:
     inputs = write_recordings(folder / "in", scenes)
     return run_scenes(inputs, scenes, TRACK, folder / "out", lambda scratch: InThisProcess())
 

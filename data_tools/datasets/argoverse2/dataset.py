@@ -24,8 +24,8 @@ import numpy as np
 from data_tools.central_differences import central_differences
 from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.source import option
+from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.files.input_files import open_bytes
-from data_tools.files.located import located, unknown
 from data_tools.files.remote_files import local_tree
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -72,13 +72,13 @@ class ArgoverseLogs:
     def scene(self, name: str) -> Scene:
         """Read a log; raises `InputError` for an unknown name, a missing column, or a time without a pose."""
         if name not in self._scenes:
-            raise InputError(f"{self._root}: {unknown('log', name, self._scenes)}")
+            raise InputError(f"{self._root}: {unknown_name('log', name, self._scenes)}")
         path = self._root / name / "annotations.feather"
         rows = _columns(path, _ANNOTATIONS)
         stamp: IntArray = rows["timestamp_ns"]
         stamps, moment = np.unique(stamp, return_inverse=True)
         poses = self._poses(name, stamps)
-        with located(str(path)):
+        with error_context(str(path)):
             ego_T_box = _transforms(rows)
             world_T_box = poses[moment] @ ego_T_box
             category: StrArray = rows["category"].astype(np.str_)
@@ -106,7 +106,7 @@ class ArgoverseLogs:
             raise InputError(
                 f"{path}: timestamp_ns: expected a pose at every annotated time, {stamps[absent][0]} has none"
             )
-        with located(str(path)):
+        with error_context(str(path)):
             return _transforms(rows)[order][at]
 
 

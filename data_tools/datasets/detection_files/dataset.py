@@ -12,7 +12,7 @@ import numpy as np
 from data_tools.datasets.detection_files.columns import POSE, RawTable
 from data_tools.datasets.detection_files.ego_columns import EgoColumns
 from data_tools.datasets.detection_files.formats import read_raw_parts, read_raw_table
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_transform
@@ -59,10 +59,10 @@ class DetectionFile:
         """One of the scenes; raises `InputError` for an unknown name."""
         path = self._rows.raw.path
         if name not in self._scenes:
-            raise InputError(f"{path}: {unknown('scene', name, self._scenes)}")
+            raise InputError(f"{path}: {unknown_name('scene', name, self._scenes)}")
         rows = np.flatnonzero(self._rows.scene == name)
         times, moment = np.unique(self._rows.timestamp[rows], return_inverse=True)
-        with located(f"{path}: scene {name}"):
+        with error_context(f"{path}: scene {name}"):
             poses = self._poses(rows, moment, len(times))
             world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
             return Scene(name, times, world_T_ego, ("",) * len(times), self._frames(rows, moment, poses))
@@ -149,7 +149,7 @@ def read_scenes_in_parts(
                 yield scene
     for wanted in scenes or ():
         if wanted not in done and wanted != name:
-            raise InputError(f"{path}: {unknown('scene', wanted, tuple(sorted({*done, name} - {''})))}")
+            raise InputError(f"{path}: {unknown_name('scene', wanted, tuple(sorted({*done, name} - {''})))}")
 
 
 def _checked(raw: RawTable) -> _Rows:

@@ -15,9 +15,9 @@ from typing import Any, TextIO, TypeVar
 import numpy as np
 
 from data_tools.datasets.detection_files.columns import COLUMNS, REQUIRED, RawTable, Values
+from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes, open_text
 from data_tools.files.json_stream import parsed_json
-from data_tools.files.located import located
 from data_tools.files.numpy_files import load_archive
 from saga_fg.errors import InputError
 
@@ -159,7 +159,7 @@ def _line(lines: list[int], row: int) -> str:
 
 
 def _read_npz(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
-    with open_bytes(path) as file, located(str(path)):
+    with open_bytes(path) as file, error_context(str(path)):
         names, arrays = load_archive(file, layout.columns)
     columns: dict[str, Values] = dict(arrays)
     _check_names(path, names, layout)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_file
+from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes
-from data_tools.files.located import located
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle
 from saga_fg.types.dataset import Scene
@@ -70,7 +70,7 @@ def merge_tables(path: Path, parts: Iterable[Path]) -> None:
 def track_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
     """The rows of `TRACK_COLUMNS`, None for what is unknown; `path` is named where tracks do not fit their scene."""
     for scene, moments in scenes:
-        with located(f"{path}: scene {scene.name}"):
+        with error_context(f"{path}: scene {scene.name}"):
             if len(moments) != len(scene):
                 raise InputError(f"expected tracks for {len(scene)} moments, got {len(moments)}")
         for timestamp, tracks in zip(scene.timestamps.tolist(), moments, strict=True):

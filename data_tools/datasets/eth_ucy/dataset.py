@@ -21,7 +21,7 @@ import numpy as np
 
 from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.source import option
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.files.remote_files import local_tree
 from data_tools.files.text_tables import read_table
 from saga_fg.errors import InputError
@@ -52,7 +52,7 @@ class EthUcy:
     def scene(self, name: str) -> Scene:
         """Read a recording; raises `InputError` for an unknown name or a line that is not as above."""
         if name not in self._scenes:
-            raise InputError(f"{self._root}: {unknown('recording', name, self._scenes)}")
+            raise InputError(f"{self._root}: {unknown_name('recording', name, self._scenes)}")
         path = self._root / name / "obsmat.txt"
         table = read_table(path, (len(_COLUMNS),), " ".join(_COLUMNS))
         if not len(table):
@@ -71,7 +71,7 @@ class EthUcy:
         frames, first = np.unique(frame[order], return_index=True)
         truth = []
         for number, rows in zip(frames.tolist(), np.split(order, first[1:]), strict=True):
-            with located(f"{path}: frame {number}"):
+            with error_context(f"{path}: frame {number}"):
                 truth.append(Annotations(person[rows].astype(np.str_), boxes.select(rows), np.ones(len(rows), bool)))
         poses = np.tile(np.eye(4), (len(frames), 1, 1))
         return Scene(name, frames / FRAME_RATES[name], poses, tuple(map(str, frames.tolist())), [], truth)

@@ -22,7 +22,7 @@ from data_tools.datasets.kitti.calibration import Calibration, read_calibration
 from data_tools.datasets.kitti.detections import detection_files, read_kitti_detections
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.oxts import read_poses
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -67,7 +67,7 @@ class KittiTracking:
         self._sequences = present if sequences is None else tuple(dict.fromkeys(sequences))
         for name in self._sequences:
             if name not in present:
-                raise InputError(f"{self._root / 'oxts'}: {unknown('sequence', name, present)}")
+                raise InputError(f"{self._root / 'oxts'}: {unknown_name('sequence', name, present)}")
         if self._detections is not None and not self._detections.is_dir():
             raise InputError(f"{self._detections}: expected a folder with Car/, Pedestrian/, Cyclist/")
 
@@ -97,18 +97,18 @@ class KittiTracking:
         frames = [] if self._detections is None else self._frames(name, times, poses, world_T_camera)
         truth = self._annotations(name, times, world_T_camera) if self._ground_truth else None
         tokens = tuple(f"{k:06d}" for k in range(len(poses)))
-        with located(str(self._root)):
+        with error_context(str(self._root)):
             return Scene(name, times, poses, tokens, frames, truth)
 
     def _file(self, folder: str, name: str) -> Path:
         if name not in self._sequences:
-            raise InputError(f"{self._root}: {unknown('sequence', name, self._sequences)}")
+            raise InputError(f"{self._root}: {unknown_name('sequence', name, self._sequences)}")
         return self._root / folder / f"{name}.txt"
 
     def _frames(self, name: str, times: FloatArray, poses: FloatArray, world_T_camera: FloatArray) -> list[Frame]:
         assert self._detections is not None
         found = read_kitti_detections(self._detections, name, len(times))
-        with located(f"{self._detections}: sequence {name}"):
+        with error_context(f"{self._detections}: sequence {name}"):
             boxes = camera_boxes_to_world(found.boxes, np.strings.lower(found.type), world_T_camera[found.frame])
             seen = Detections(boxes, found.score)
         bounds = np.searchsorted(found.frame, np.arange(len(times) + 1)).tolist()
@@ -123,7 +123,7 @@ class KittiTracking:
         objects = objects.select(has_box(objects))
         if len(objects) and objects.frame.max() >= len(times):
             raise InputError(f"{path}: frame {objects.frame.max()}: expected frames 0 to {len(times) - 1} only")
-        with located(f"{path}"):
+        with error_context(f"{path}"):
             boxes = camera_boxes_to_world(objects.boxes, np.strings.lower(objects.type), world_T_camera[objects.frame])
         ids = objects.track_id.astype(np.str_)
         velocity = central_differences(ids, times[objects.frame], boxes.position[:, :2], _LONGEST_GAP, _REACH)

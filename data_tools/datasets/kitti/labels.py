@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.located import unknown
+from data_tools.files.error_messages import unknown_name
 from data_tools.files.text_tables import TextTable, read_table
 from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
 
@@ -47,7 +47,7 @@ def _check(table: TextTable, objects: KittiObjects) -> None:
     strange = ~np.isin(objects.type, TYPES)
     if strange.any():
         row = int(np.argmax(strange))
-        raise table.fault(row, f"type: {unknown('class', str(objects.type[row]), TYPES)}")
+        raise table.fault(row, f"type: {unknown_name('class', str(objects.type[row]), TYPES)}")
     flat = has_box(objects) & (objects.boxes.size <= 0).any(axis=1)
     if flat.any():
         row = int(np.argmax(flat))

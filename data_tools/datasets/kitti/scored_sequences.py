@@ -16,7 +16,7 @@ from data_tools.datasets.kitti.dataset import FRAME_PERIOD, KittiTracking
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
 from data_tools.datasets.results import SceneResult
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
@@ -70,7 +70,7 @@ def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | No
     if len(result) and result.frame.max() >= len(scene):
         raise InputError(f"{path}: frame {result.frame.max()}: expected frames 0 to {len(scene) - 1} only")
     world_T_camera = scene.world_T_ego @ inverse_transform(dataset.calibration(name).camera_T_imu)
-    with located(str(path)):
+    with error_context(str(path)):
         found = _in_world(result, world_T_camera)
     if table is not None:
         found = _with_motion(found, table, name)

@@ -23,7 +23,7 @@ from data_tools.datasets.kitti.dataset import KittiTracking
 from data_tools.datasets.kitti.image_boxes import image_boxes, observation_angles
 from data_tools.datasets.kitti.labels import TYPES
 from data_tools.files.atomic_files import atomic_directory
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.kitti_objects import world_boxes_to_camera
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -55,7 +55,7 @@ def write_kitti_results(
 
         def written() -> Iterator[tuple[Scene, Sequence[Tracks]]]:
             for scene, moments in scenes:
-                with located(f"{directory}: sequence {scene.name}"):
+                with error_context(f"{directory}: sequence {scene.name}"):
                     text = kitti_result_text(scene, moments, dataset.calibration(scene.name), image_size)
                 (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
                 yield scene, moments
@@ -74,7 +74,7 @@ def write_kitti_labels(
     with atomic_directory(directory) as folder:
         for scene, moments in scenes:
             tracks = [moment.tracks for moment in moments]
-            with located(f"{directory}: sequence {scene.name}"):
+            with error_context(f"{directory}: sequence {scene.name}"):
                 text = kitti_result_text(scene, tracks, dataset.calibration(scene.name), with_score=False)
             (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
 
@@ -124,5 +124,5 @@ def _lines(
 
 def _type(frame: int, label: str) -> str:
     if label not in _TYPE_OF_LABEL:
-        raise InputError(f"frame {frame}: {unknown('class', label, tuple(_TYPE_OF_LABEL))}")
+        raise InputError(f"frame {frame}: {unknown_name('class', label, tuple(_TYPE_OF_LABEL))}")
     return _TYPE_OF_LABEL[label]

@@ -19,7 +19,7 @@ from data_tools.central_differences import central_differences
 from data_tools.datasets.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS
 from data_tools.datasets.nuscenes.scenes import SceneRecord
 from data_tools.datasets.nuscenes.tables import read_table
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_yaw
 from saga_fg.types.boxes import Boxes
@@ -54,7 +54,7 @@ def read_annotations(folder: Path, scenes: Mapping[str, SceneRecord]) -> dict[st
                 raise InputError(f"{where}: expected 3, 3 and 4 numbers as translation, size, rotation") from error
     result = {}
     for name, scene in scenes.items():
-        with located(f"{path}: scene {name}"):
+        with error_context(f"{path}: scene {name}"):
             result[name] = rows[name].annotations(scene)
     return result
 
@@ -105,6 +105,6 @@ class _Rows:
         result = []
         for token, first, last in zip(scene.tokens, bounds[:-1], bounds[1:], strict=True):
             chosen = order[first:last]
-            with located(f"sample {token}"):
+            with error_context(f"sample {token}"):
                 result.append(Annotations(instance[chosen], boxes.select(chosen), visible[chosen]))
         return result

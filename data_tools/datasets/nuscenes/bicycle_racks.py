@@ -7,7 +7,7 @@ from pathlib import Path
 
 from data_tools.datasets.nuscenes.scenes import SceneRecord
 from data_tools.datasets.nuscenes.tables import read_table
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from saga_fg.numerics.arrays import checked
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_yaw
 from saga_fg.types.boxes import Boxes
@@ -32,7 +32,7 @@ def read_bicycle_racks(folder: Path, scenes: Mapping[str, SceneRecord]) -> dict[
     for name, scene in scenes.items():
         result[name] = []
         for token in scene.tokens:
-            with located(f"{path}: sample {token}, {CATEGORY}"):
+            with error_context(f"{path}: sample {token}, {CATEGORY}"):
                 result[name].append(_boxes(found[token]))
     return result
 

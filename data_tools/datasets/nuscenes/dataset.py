@@ -16,7 +16,7 @@ from data_tools.datasets.nuscenes.result_files import ResultFile, ResultMeta, re
 from data_tools.datasets.nuscenes.scenes import SceneRecord, read_scenes
 from data_tools.datasets.nuscenes.splits import split_scenes
 from data_tools.datasets.nuscenes.tables import table_folder
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Annotations, Scene
@@ -85,7 +85,7 @@ class NuScenes:
     def scene(self, name: str) -> Scene:
         """One of the chosen scenes; raises `InputError` for another name."""
         if name not in self.records:
-            raise InputError(f"{self.dataroot}: {unknown('scene', name, self.scenes)}")
+            raise InputError(f"{self.dataroot}: {unknown_name('scene', name, self.scenes)}")
         self._check_seen(name)
         record = self.records[name]
         frames = [
@@ -94,7 +94,7 @@ class NuScenes:
             for frame in self._frames(token, time, pose)
         ]
         truth: Sequence[Annotations] | None = None if self._annotations is None else self._annotations[name]
-        with located(str(self.dataroot)):
+        with error_context(str(self.dataroot)):
             return Scene(name, record.timestamps, record.world_T_ego, record.tokens, frames, truth)
 
     def _frames(self, token: str, time: float, world_T_ego: FloatArray) -> list[Frame]:

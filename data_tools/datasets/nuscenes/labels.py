@@ -34,9 +34,9 @@ from data_tools.datasets.nuscenes.records import (
 )
 from data_tools.datasets.nuscenes.tables import read_table, table_folder
 from data_tools.files.atomic_files import atomic_directory, atomic_file, write_text
+from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes
 from data_tools.files.json_stream import open_json, parsed_json
-from data_tools.files.located import located
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle
 from saga_fg.smoothing import Labels
@@ -85,7 +85,7 @@ def _read_part(path: Path) -> Iterator[LabelledObject]:
 def _objects(where: str, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> Iterator[LabelledObject]:
     """The objects of some scenes; a class that nuScenes does not have is an `InputError`."""
     for scene, frames in scenes:
-        with located(f"{where}: scene {scene.name}"):
+        with error_context(f"{where}: scene {scene.name}"):
             if len(frames) != len(scene):
                 raise InputError(f"expected labels for {len(scene)} samples, got {len(frames)}")
             for label, records in _annotations(scene, frames):

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from data_tools.datasets.nuscenes.classes import DETECTION_CLASSES, TRACKING_CLASSES
-from data_tools.files.located import unknown
+from data_tools.files.error_messages import unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, from_upper_triangle
 from saga_fg.numerics.geometry import quaternion_norms, quaternion_yaw
@@ -113,7 +113,7 @@ class ResultColumns:
         strange = ~np.isin(labels, known)
         if strange.any():
             row = int(np.argmax(strange))
-            raise InputError(f"{self._where(row)}: {self._task}_name: {unknown('class', str(labels[row]), known)}")
+            raise InputError(f"{self._where(row)}: {self._task}_name: {unknown_name('class', str(labels[row]), known)}")
         boxes = Boxes(
             label=labels,
             position=columns["translation"],

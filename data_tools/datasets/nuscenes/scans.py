@@ -14,7 +14,7 @@ import numpy as np
 from data_tools.datasets.nuscenes.dataset import NuScenes
 from data_tools.datasets.nuscenes.scenes import LIDAR, rigid_transform
 from data_tools.datasets.nuscenes.tables import read_table
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from data_tools.lidar import Scan, read_scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -72,7 +72,7 @@ def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScene
         if not rows:
             continue
         sensor = taken[record.tokens[rows[0]]][1]
-        with located(f"{dataset.folder / 'calibrated_sensor.json'}: record {sensor}"):
+        with error_context(f"{dataset.folder / 'calibrated_sensor.json'}: record {sensor}"):
             ego_T_lidar = rigid_transform(*mounted[sensor])
         files = [taken[record.tokens[k]][0] for k in rows]
         scans[scene] = NuScenesScans(files, record.timestamps[rows], record.world_T_ego[np.array(rows)], ego_T_lidar)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.nuscenes.tables import read_table
-from data_tools.files.located import located, unknown
+from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import checked_quaternions, checked_transform, quaternion_rotation
@@ -46,7 +46,7 @@ def read_scenes(folder: Path, names: Collection[str] | None) -> SceneTables:
     chosen = tuple(scenes) if names is None else tuple(dict.fromkeys(names))
     for name in chosen:
         if name not in scenes:
-            raise InputError(f"{folder / 'scene.json'}: {unknown('scene', name, tuple(scenes))}")
+            raise InputError(f"{folder / 'scene.json'}: {unknown_name('scene', name, tuple(scenes))}")
     samples: dict[str, tuple[Any, str]] = {}
     for token, time, after in read_table(folder, "sample", ("token", "timestamp", "next")):
         if token in samples:
@@ -132,7 +132,7 @@ def _poses(folder: Path, wanted: Collection[str]) -> dict[str, FloatArray]:
 
 
 def _pose(folder: Path, token: str, translation: Any, rotation: Any) -> FloatArray:
-    with located(f"{folder / 'ego_pose.json'}: record {token}"):
+    with error_context(f"{folder / 'ego_pose.json'}: record {token}"):
         return rigid_transform(translation, rotation)
 
 

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from data_tools.datasets.nuscenes.tables import read_table, table_folder
+from data_tools.files.error_messages import unknown_name
 from data_tools.files.json_stream import JsonStream, open_json
-from data_tools.files.located import unknown
 from saga_fg.errors import InputError
 
 _MINI_VAL = {"scene-0103", "scene-0916"}
@@ -56,7 +56,7 @@ def split_scenes(dataroot: str | Path, version: str, split: str) -> tuple[str, .
         chosen = [name for name in scenes if name in own[split]]
     else:
         official = [name for name, kind in _VERSION_OF_SPLIT.items() if version.endswith(kind)]
-        raise InputError(f"{folder / 'splits.json'}: {unknown('split', split, (*official, *own))}")
+        raise InputError(f"{folder / 'splits.json'}: {unknown_name('split', split, (*official, *own))}")
     if not chosen:
         raise InputError(f"{folder / 'scene.json'}: expected scenes of split {split}, the table holds none of them")
     return tuple(chosen)

@@ -24,7 +24,7 @@ import numpy as np
 from data_tools.datasets.nuscenes.classes import TRACKING_CLASSES
 from data_tools.datasets.nuscenes.result_files import ResultMeta, read_result_file, result_entries
 from data_tools.files.atomic_files import atomic_file
-from data_tools.files.located import located
+from data_tools.files.error_messages import error_context
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, StrArray, upper_triangle
 from saga_fg.numerics.geometry import yaw_quaternion
@@ -73,7 +73,7 @@ def _write(path: str | Path, samples: Iterable[tuple[str, list[dict[str, Any]]]]
 
 def _samples(path: str, scene: Scene, moments: Sequence[Tracks]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Token and boxes of each sample of a scene."""
-    with located(f"{path}: scene {scene.name}"):
+    with error_context(f"{path}: scene {scene.name}"):
         if len(moments) != len(scene):
             raise InputError(f"expected tracks for {len(scene)} samples, got {len(moments)}")
         class_of: dict[int, str] = {}
