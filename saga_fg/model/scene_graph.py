@@ -81,7 +81,7 @@ class NonlinearEdges:
     target  (E,) rows of the influenced nodes in the graph
     source  (E,) rows of the influencing nodes
     rate    (E,) >= 0, 1/s
-    given   (E, ...) what the law takes besides the states
+    given   (E, ...) arguments of the law besides the states
     """
 
     law: AccelerationLaw
@@ -184,7 +184,7 @@ class SceneGraph:
         return sum(len(group) for group in self._groups)
 
     def without_edges(self) -> SceneGraph:
-        """The same nodes, moving on their own: the classical filter's graph."""
+        """The nodes without edges, as for independent filters."""
         return SceneGraph(self.nodes, self.types)
 
     def after(self, dt: float) -> SceneGraph:

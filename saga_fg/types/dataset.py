@@ -95,7 +95,7 @@ class Scene:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """The names of the sensors that speak in this scene, sorted."""
+        """The names of the sensors of this scene, sorted."""
         return tuple(sorted({frame.sensor for frame in self.frames}))
 
 

@@ -1,4 +1,4 @@
-"""What the vehicle measured of itself by the time of a frame: odometry, GPS, inertial samples, landmarks."""
+"""Ego measurements of a frame: odometry, GPS, inertial samples, landmarks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _TANGENT = {3: 3, 4: 6}  # dimension of the motions of so large a transform
 
 @dataclass(frozen=True, eq=False)
 class OdometryIncrement:
-    """How the vehicle has moved over the last `dt` s.
+    """Motion of the vehicle over the last `dt` s.
 
     before_T_now  where it is now in its frame of then, (3, 3) in the plane or (4, 4) in space
     covariance    (3, 3) of (x, y, heading), or (6, 6) of (rotation vector, translation), in the frame of now, m and
-                  rad; None: as the provider's settings say
+                  rad; None: by the provider's settings
     """
 
     before_T_now: FloatArray
@@ -46,7 +46,7 @@ class OdometryIncrement:
 
 @dataclass(frozen=True, eq=False)
 class GpsFix:
-    """A measured place, (2,) or (3,), world, m; covariance (2, 2) or (3, 3), None: as the provider's settings say."""
+    """A measured place, (2,) or (3,), world, m; covariance (2, 2) or (3, 3), None: by the provider's settings."""
 
     position: FloatArray
     covariance: FloatArray | None = None

@@ -1,4 +1,4 @@
-"""What a sensor says: `Detection`, a table of them (`Detections`), and a `Frame`, one message of one sensor."""
+"""Sensor messages: `Detection`, a table of them (`Detections`), and a `Frame`, one message of one sensor."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Detection:
 class Detections(Columns):
     """N detections as columns: `boxes`, their `score` (N,) and `range_rate` (N,). Iterating gives `Detection`s.
 
-    A range rate (m/s; NaN, as by default: not measured) is what a radar says of motion: the component of the velocity
+    A range rate (m/s; NaN, as by default: not measured) is measured by radars: the component of the velocity
     *over ground* along the horizontal line of sight from the sensor, positive when the object moves away. Where the
     radar gives it relative to itself, add the component of the sensor's own velocity along that line first.
     """
@@ -114,7 +114,7 @@ class Detections(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One message of one sensor: everything it detected at `timestamp`. An empty frame says "looked, saw nothing".
+    """One message of one sensor: everything it detected at `timestamp`. An empty frame means that it detected nothing.
 
     timestamp    s, any epoch, the same for all sensors of a scene
     sensor       the sensor's name, e.g. "lidar"
@@ -122,7 +122,7 @@ class Frame:
     world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world" and no range rate
                  was measured, or `ego` is there to estimate it from
     token        the dataset's own name of the record, "" if none
-    road_map     what is known of the road from now on, besides what earlier frames brought; None: nothing new
+    road_map     the road from now on, in addition to maps of earlier frames; None: nothing new
     ego          what the vehicle measured of itself, for factor providers (`saga_fg.providers`)
 
     Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose

@@ -1,4 +1,4 @@
-"""What a tracker says: the `Track`s of one moment, as a table (`Tracks`)."""
+"""Tracker output: the `Track`s of one moment, as a table (`Tracks`)."""
 
 from __future__ import annotations
 
