@@ -24,7 +24,7 @@ from pipelines.process import one_thread
 from pipelines.smoothing import SmoothConfig, load_smooth_config, smooth_known_objects
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.smoothing import Evidence, StateTable, attribute, gather_evidence
+from saga_fg.smoothing import Evidence, StateTable, assign_detections, gather_evidence
 from saga_fg.types.dataset import Scene
 
 NEAR = 2.0  # largest distance between a detection and its true object, m
@@ -70,23 +70,22 @@ def true_objects(scene: Scene, evidence: Evidence, names: Sequence[str]) -> IntA
     assert scene.ground_truth is not None
     number = {name: k for k, name in enumerate(names)}
     object_of = np.full(len(evidence), -1, dtype=np.int64)
-    for look, rows in zip(evidence.looks, evidence.rows_of_look(), strict=True):
-        time = evidence.times[look.moment]
+    for frame, rows in zip(evidence.frames, evidence.rows_of_frame(), strict=True):
+        time = evidence.times[frame.moment]
         k = int(np.argmin(np.abs(scene.timestamps - time)))
         truth = scene.ground_truth[k]
         moved = truth.boxes.position[:, :2] + truth.boxes.velocity * (time - scene.timestamps[k])
         P = np.tile(SPREAD**2 * np.eye(2), (len(truth), 1, 1))
-        objects, detections = attribute(
+        objects, detections = assign_detections(
             truth.boxes.label,
             moved - evidence.origin,
             P,
-            evidence.boxes.label[rows],
-            evidence.boxes.position[rows, :2],
-            evidence.R[rows, :2, :2],
+            evidence,
+            np.arange(rows.start, rows.stop),
             0.999,
             np.full(len(truth), NEAR),
         )
-        object_of[rows.start + detections] = [number[str(truth.id[row])] for row in objects]
+        object_of[detections] = [number[str(truth.id[row])] for row in objects]
     return object_of
 
 

@@ -23,7 +23,7 @@ from pipelines.cli.options import Verbose
 from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.process import one_thread, resident_memory
-from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
+from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
 from pipelines.tracking import Progress
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.smoothing import Labels
@@ -141,10 +141,10 @@ def _against_batch(folder: Path, settings: StreamingBenchSettings) -> tuple[floa
     config = load_smooth_config("file")
     dataset = read_detections(table)
     whole = smooth_scene(dataset.scene(dataset.scenes[0]), config).labels
-    chunks = StretchSettings(settings.compared / 4, StretchSettings().margin)
+    chunks = ChunkSettings(settings.compared / 4, ChunkSettings().margin)
     spools = folder / "spools"
     spools.mkdir()
-    (run,) = smooth_stream(read_scenes_in_parts(table, 1000), config, spools, stretches=chunks)
+    (run,) = smooth_stream(read_scenes_in_parts(table, 1000), config, spools, chunks=chunks)
     parts = [moment for _, moments in run.spool.labels() for moment in moments]
     found = [_apart(mine, theirs) for mine, theirs in zip(parts, whole, strict=True)]
     return max(apart for apart, _ in found), sum(alone for _, alone in found), sum(map(len, whole))

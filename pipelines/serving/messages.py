@@ -21,7 +21,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, Literal, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
@@ -33,8 +33,7 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Coordinates, Detections, Frame
 from saga_fg.types.track import Tracks
 
-Request = Literal["status", "subscribe", "reset"]
-REQUESTS: tuple[Request, ...] = ("status", "subscribe", "reset")
+REQUESTS = ("status", "subscribe", "reset")
 
 POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
 NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
@@ -53,13 +52,14 @@ class FrameMessage:
 
 
 @dataclass(frozen=True)
-class SensorReset:
-    """Request to forget the number of one sensor, whose next frame may have any."""
+class Request:
+    """One of `REQUESTS`; sensor: of a reset of the number of one sensor alone, whose next frame may have any."""
 
-    sensor: str
+    kind: str
+    sensor: str | None = None
 
 
-def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | SensorReset | Request:
+def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Request:
     """Read a line. Raises `InputError` naming the field and what was expected."""
     if len(line) > settings.max_message:
         raise InputError(f"message: expected at most {settings.max_message} bytes")
@@ -78,9 +78,9 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Senso
         raise InputError(f"type: expected frame, {', '.join(REQUESTS)}, got {_short(kind)}")
     if kind == "reset" and "sensor" in message:
         _known("", message, ("type", "sensor"))
-        return SensorReset(_name("", message, "sensor", ""))
+        return Request(kind, _name("", message, "sensor", ""))
     _known("", message, ("type",))
-    return cast(Request, kind)
+    return Request(kind)
 
 
 def tracks_message(tracks: Tracks) -> dict[str, Any]:

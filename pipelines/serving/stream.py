@@ -6,17 +6,17 @@ import logging
 import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+import numpy as np
+
 from pipelines.process import resident_memory
-from pipelines.serving.latency import Latencies
 from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.messages import (
     FrameMessage,
-    SensorReset,
     about,
     late_message,
     parse_message,
@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 Client = TypeVar("Client")
 Answer = dict[str, Any]
 
+LATENCIES = 10_000  # latest frames, whose latencies are kept
 COUNTED = (
     *("messages", "frames", "out_of_order", "late", "unconfirmed", "repeats", "refused", "jumps"),
     *("failures", "restarts"),
@@ -88,7 +89,7 @@ class StreamTracker(Generic[Client]):
     def __init__(self, new_tracker: Callable[[], StreamedTracker], settings: StreamSettings | None = None) -> None:
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
-        self.latencies = Latencies()
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)  # ms
         self.keeper: StateKeeper | None = None
         self.version = 0  # grows whenever there is something new to keep
         self._new_tracker = new_tracker
@@ -128,19 +129,16 @@ class StreamTracker(Generic[Client]):
             return self._flush()
 
     def status(self) -> Answer:
-        """Return the counts since the start, latencies of frames in ms, memory in MB."""
-        milliseconds = {
-            f"p{percent:g}": round(1e3 * self.latencies.percentile(percent), 3)
-            for percent in (50, 90, 99, 99.9)
-            if len(self.latencies)
-        }
+        """Return the counts since the start, latencies of the last frames in ms, memory in MB."""
+        percents = (50, 90, 99, 99.9)
+        latencies = np.percentile(self._latencies, percents).round(3).tolist() if self._latencies else ()
         kept = {} if self.keeper is None else {"durable_seq": dict(self._durable), "state": self.keeper.status()}
         return {
             "type": "status",
             "seconds": round(time.monotonic() - self._started, 3),
             **{name: self.counts[name] for name in COUNTED},
             "held": len(self._held),
-            "latency_ms": milliseconds,
+            "latency_ms": {f"p{percent:g}": ms for percent, ms in zip(percents, latencies, strict=False)},
             "memory_mb": round(resident_memory(), 1),
             "last_seq": dict(self._numbering.last),
             "taken": dict(self._numbering.taken),
@@ -175,21 +173,19 @@ class StreamTracker(Generic[Client]):
         if line is None:
             raise InputError(f"message: expected at most {self.settings.max_message} bytes")
         message = parse_message(line, self.settings)
-        if message == "status":
+        if isinstance(message, FrameMessage):
+            return self._take(_Held(message, client, received))
+        if message.kind == "status":
             return [(client, self.status())]
-        if message == "subscribe":
+        if message.kind == "subscribe":
             return [(client, {"type": "subscribe"})]
-        if message == "reset":
-            answers = self._flush()
+        answers = self._flush()  # held frames would bring numbers back
+        if message.sensor is None:
             self._begin_anew()
             return [*answers, (client, {"type": "reset"})]
-        if isinstance(message, SensorReset):
-            answers = self._flush()  # what is held would bring the number back
-            self._forget(message.sensor)
-            self.version += 1
-            return [*answers, (client, {"type": "reset", "sensor": message.sensor})]
-        assert isinstance(message, FrameMessage)
-        return self._take(_Held(message, client, received))
+        self._forget(message.sensor)
+        self.version += 1
+        return [*answers, (client, {"type": "reset", "sensor": message.sensor})]
 
     def _take(self, held: _Held[Client]) -> list[tuple[Client, Answer]]:
         message = held.message
@@ -229,7 +225,7 @@ class StreamTracker(Generic[Client]):
         except Exception as error:
             return held.client, self._failed(error) | self._about(held.message)
         self._failed_in_a_row = 0
-        self.latencies.add(time.monotonic() - held.received)
+        self._latencies.append(1e3 * (time.monotonic() - held.received))
         return held.client, answer
 
     def _tracked(self, message: FrameMessage) -> Answer:

@@ -1,17 +1,17 @@
-"""From recordings to labels: the online pass, the rounds of smoothing, the boxes."""
+"""From recordings to labels: the online pass, the passes of smoothing, the labels."""
 
+from pipelines.smoothing.chunks import ChunkSettings
 from pipelines.smoothing.config import SmoothConfig, load_smooth_config
 from pipelines.smoothing.output import write_labels, write_streamed_labels
-from pipelines.smoothing.rounds import smooth_known_objects
+from pipelines.smoothing.passes import smooth_known_objects
 from pipelines.smoothing.scene import SmoothedScene, smooth_dataset, smooth_scene
-from pipelines.smoothing.streamed import StreamedScene, smooth_stream
-from pipelines.smoothing.stretches import StretchSettings
+from pipelines.smoothing.streaming import StreamedScene, smooth_stream
 
 __all__ = [
+    "ChunkSettings",
     "SmoothConfig",
     "SmoothedScene",
     "StreamedScene",
-    "StretchSettings",
     "load_smooth_config",
     "smooth_dataset",
     "smooth_known_objects",

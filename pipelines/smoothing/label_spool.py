@@ -1,4 +1,4 @@
-"""Labels that wait on disk until all is known of their objects: an archive of arrays for each stretch."""
+"""Labels kept on disk until the attributes of their objects are final: an archive of arrays for each chunk."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.smoothing.assembly import LabelledStates
-from pipelines.smoothing.lifetimes import Lifetimes
+from pipelines.smoothing.labelling import LabelledStates
+from pipelines.smoothing.object_summaries import ObjectSummaries
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing import Labels, SmoothingSettings, quality_of
@@ -20,23 +20,23 @@ from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)
-class _Lasting:
-    """Columns of what lasts of all objects, by ascending id."""
+class _AttributeTable:
+    """Columns of the final attributes of all objects, by ascending id."""
 
     id: IntArray
     size: FloatArray
     score: FloatArray
-    backwards: FloatArray  # radians to turn by
+    turn: FloatArray  # of the headings, rad
 
 
 class LabelSpool:
-    """The labels of a recording, added stretch by stretch, and read back when it is over."""
+    """The labels of a recording, added chunk by chunk, and read back when it is over."""
 
     def __init__(self, folder: Path, name: str, settings: SmoothingSettings) -> None:
         folder.mkdir()
         self._folder, self._name, self._settings = folder, name, settings
-        self._stretches = 0
-        self._lasting: _Lasting | None = None
+        self._chunks = 0
+        self._attributes: _AttributeTable | None = None
 
     def add(
         self,
@@ -44,22 +44,22 @@ class LabelSpool:
         at: IntArray,
         labelled: LabelledStates,
         names: Mapping[int, int],
-        turned: Mapping[int, float],
+        signs: Mapping[int, float],
     ) -> None:
-        """The labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
+        """Add the labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
 
-        names: the lasting id of each object; turned: -1 where its directions are half a turn off those before
+        names: the final id of each object; signs: -1 where its headings are half a turn off those before, else 1
         """
         spans = [labelled.states.at(moment) for moment in at.tolist()]
         rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
         ids = labelled.states.id[rows].tolist()
         mean, P = labelled.states.mean[rows], labelled.states.covariance[rows]
         np.savez(
-            self._folder / f"{self._stretches:06d}.npz",
+            self._folder / f"{self._chunks:06d}.npz",
             time=wanted,
             bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
             id=np.array([names[id_] for id_ in ids], dtype=np.int64),
-            sign=np.array([turned[id_] for id_ in ids], dtype=np.float64),
+            sign=np.array([signs[id_] for id_ in ids], dtype=np.float64),
             label=labelled.label[rows],
             position=labelled.position[rows],
             yaw=labelled.headings.yaw[rows],
@@ -70,31 +70,33 @@ class LabelSpool:
             coasting=labelled.coasting[rows],
             source=labelled.source[rows],
         )
-        self._stretches += 1
+        self._chunks += 1
 
-    def finish(self, lifetimes: Lifetimes, prior_looks: float) -> None:
-        """What lasts of the objects, which are all over; prior_looks: see `Lifetimes.lasting`."""
-        ids = np.array(lifetimes.ids, dtype=np.int64)
-        found = [lifetimes.lasting(id_, prior_looks) for id_ in ids.tolist()]
-        self._lasting = _Lasting(
+    def finish(self, summaries: ObjectSummaries, prior: float) -> None:
+        """Take the final attributes of all objects; prior: see `ObjectSummaries.attributes`."""
+        ids = np.array(summaries.ids, dtype=np.int64)
+        found = [summaries.attributes(id_, prior) for id_ in ids.tolist()]
+        self._attributes = _AttributeTable(
             ids,
             np.array([each.size for each in found]).reshape(-1, 3),
             np.array([each.score for each in found]),
-            np.array([np.pi * each.backwards for each in found]),
+            np.array([np.pi * each.reversed for each in found]),
         )
 
     def labels(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
-        """The labels, stretch by stretch: a part of the scene without frames or poses, and one table a moment."""
-        assert self._lasting is not None, "the recording is not over"
-        for number in range(self._stretches):
+        """The labels, chunk by chunk: a part of the scene without frames or poses, and one table a moment."""
+        assert self._attributes is not None, "the recording is not over"
+        for number in range(self._chunks):
             with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as columns:
-                yield self._complete(dict(columns), self._lasting)
+                yield self._complete(dict(columns), self._attributes)
 
-    def _complete(self, column: Mapping[str, np.ndarray], lasting: _Lasting) -> tuple[Scene, tuple[Labels, ...]]:
-        at = np.searchsorted(lasting.id, column["id"])
-        score, P = lasting.score[at], column["position_covariance"]
-        yaw = wrap_angle(column["yaw"] + np.pi * (column["sign"] < 0) + lasting.backwards[at])
-        boxes = Boxes(column["label"], column["position"], lasting.size[at], yaw, column["velocity"])
+    def _complete(
+        self, column: Mapping[str, np.ndarray], attributes: _AttributeTable
+    ) -> tuple[Scene, tuple[Labels, ...]]:
+        at = np.searchsorted(attributes.id, column["id"])
+        score, P = attributes.score[at], column["position_covariance"]
+        yaw = wrap_angle(column["yaw"] + np.pi * (column["sign"] < 0) + attributes.turn[at])
+        boxes = Boxes(column["label"], column["position"], attributes.size[at], yaw, column["velocity"])
         quality = quality_of(score, P, self._settings.quality)
         times = column["time"]
         moments = []

@@ -20,7 +20,7 @@ from data_tools.datasets.label_table import write_label_table
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory
 from pipelines.smoothing.scene import SmoothedScene
-from pipelines.smoothing.streamed import StreamedScene
+from pipelines.smoothing.streaming import StreamedScene
 from saga_fg.smoothing import LabelCounts, Labels
 from saga_fg.types.dataset import Scene
 

@@ -18,6 +18,7 @@ from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.messages import solver_error
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
@@ -155,4 +156,4 @@ def _solved(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
             LinearisationPoint(dict(graph.variables), values, values), linearised(native, ours, values), found.converged
         )
     except FactorError as error:
-        raise graph.undetermined(error) from error
+        raise solver_error(graph.variables, graph.groups, error) from error

@@ -146,18 +146,19 @@ def _stacks(
         if len(measured) < len(places):
             component, active = np.searchsorted(measured, component), measured
         P, places = x.blocks[number][active], places[active]
+        H_own = H[members]
         c, s = places.shape
         slot = rank(component)  # of a measurement among those of its component
         most = int(slot.max()) + 1
         H_P, H_all, innovation = np.zeros((c, most, k, s)), np.zeros((c, most, k, s)), np.zeros((c, most, k))
         R_all = np.zeros((c, most, k, most, k))
-        H_P[component, slot] = H[members] @ P[component[:, None], at]
+        H_P[component, slot] = H_own @ P[component[:, None], at]
         if s % d == 0 and not (at[:, 0] % d).any():  # states of equal size: node by node
-            H_all.reshape(c, most, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H[members]
+            H_all.reshape(c, most, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H_own
         else:
-            H_all[component[:, None, None], slot[:, None, None], np.arange(k)[:, None], at[:, None, :]] = H[members]
+            H_all[component[:, None, None], slot[:, None, None], np.arange(k)[:, None], at[:, None, :]] = H_own
         R_all[component, slot, :, slot, :] = R[members]
-        expected = H[members] @ mean[places[component[:, None], at]][:, :, None]
+        expected = H_own @ mean[places[component[:, None], at]][:, :, None]
         innovation[component, slot] = z[members] - expected[:, :, 0]
         if len(component) < c * most:
             empty = np.ones((c, most), dtype=bool)

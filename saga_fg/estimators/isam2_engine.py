@@ -24,6 +24,7 @@ from factors import SingularSystemError, SolverSettings, marginal_moments
 from factors.marginal import Elimination
 from factors.singular import singular_system
 from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.messages import solver_error
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -125,7 +126,7 @@ class Engine:
             if not held.factors.linear:
                 nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
         if alone := graph.without_factors():
-            raise graph.undetermined(SingularSystemError("", tuple(alone)))
+            raise solver_error(graph.variables, graph.groups, SingularSystemError("", tuple(alone)))
         self.points.remove(leaving)
         self.points.add(new)
         self._update(graph, linear, rows, removed, new)
@@ -229,7 +230,7 @@ class Engine:
         for number in graph.groups:
             for factor in graph.linear(number, point):
                 linear.push_back(factor)
-        return graph.undetermined(singular_system(linear, error))
+        return solver_error(graph.variables, graph.groups, singular_system(linear, error))
 
 
 class Displacements:

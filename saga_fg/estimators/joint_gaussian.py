@@ -23,6 +23,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.layout import Layout
 from saga_fg.estimators.partition import Partition, zeros
+from saga_fg.graph.messages import solver_error, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
@@ -54,7 +55,7 @@ def joint_gaussian(
         try:
             P = _covariance(parts[name], mine, "cholesky" if wide else "qr")
         except FactorError as error:
-            raise graph.undetermined(error) from error
+            raise solver_error(graph.variables, graph.groups, error) from error
         blocks[partition.group[rows[0]]][partition.row[rows[0]]] = P
     base = graph.base
     mean = [
@@ -122,5 +123,5 @@ def replace_by_prior(
         try:
             prior = joint_prior_factor(keys, increments, x.joint(rows))
         except FactorError as error:
-            raise InputError(f"transition: {graph.with_names(str(error), keys)}") from error
+            raise InputError(f"transition: {with_names(graph.variables, str(error), keys)}") from error
         graph.replace_by_prior(leaving, prior)

@@ -34,6 +34,7 @@ from saga_fg.estimators.partition import Partition
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import node_kind
 from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.messages import solver_error
 from saga_fg.graph.providers import FactorProvider, GraphView, ask
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state
@@ -188,7 +189,9 @@ def _born(
     R, rest = triangle[:size, :size], triangle[size:, size:]
     lost = np.abs(np.diagonal(R)) <= _UNDETERMINED * np.linalg.norm(A[:, :size], axis=0)
     if lost.any():
-        raise graph.undetermined(SingularSystemError("", tuple(key for key in new if lost[span[key]].any())))
+        raise solver_error(
+            graph.variables, graph.groups, SingularSystemError("", tuple(key for key in new if lost[span[key]].any()))
+        )
     if others:
         left.append((others, rest))
     solved = np.linalg.solve(R, np.column_stack([triangle[:size, size:], np.eye(size)]))

@@ -26,6 +26,7 @@ import numpy as np
 from saga_fg.graph.errors import GraphError, ProviderError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.keys import Kind, key_of
+from saga_fg.graph.messages import with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, NewVariable
 from saga_fg.numerics.arrays import FloatArray
@@ -167,7 +168,7 @@ def ask(provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> N
         expected = isinstance(error, GraphError | ValueError)
         text = " ".join((str(error) if expected else repr(error)).split()).removeprefix(f"provider {name}: ")
         kind = GraphError if getattr(provider, "internal", False) else ProviderError
-        raise kind(f"provider {name}: {graph.with_names(text, graph.variables)[:500]}") from error
+        raise kind(f"provider {name}: {with_names(graph.variables, text, graph.variables)[:500]}") from error
 
 
 def _ask(name: str, provider: FactorProvider, graph: SceneFactorGraph, view: GraphView) -> None:

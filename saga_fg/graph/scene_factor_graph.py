@@ -23,11 +23,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, SingularSystemError, Solution, SolverSettings, marginal_factors, solve
+from factors import FactorError, Solution, SolverSettings, marginal_factors, solve
 from factors.marginal import Elimination
-from factors.validation import format_key
-from saga_fg.errors import InputError
-from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_checks import Factor, grouped
 from saga_fg.graph.factor_groups import (
     ActiveRows,
@@ -40,6 +38,7 @@ from saga_fg.graph.factor_groups import (
 )
 from saga_fg.graph.keys import Kind, described, key_of
 from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.messages import factor_error, solver_error
 from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state, variable_type
 from saga_fg.numerics.arrays import IntArray
 
@@ -236,7 +235,7 @@ class SceneFactorGraph:
         try:
             return held.factors.linearised(rows, point)
         except Exception as error:
-            raise GraphError(self._failed(held, rows, error)) from error
+            raise factor_error(self._variables, held, rows, error) from error
 
     def moved_to(self, values: gtsam.Values) -> None:
         """Put the variables where a back end has found them."""
@@ -256,7 +255,7 @@ class SceneFactorGraph:
         try:
             solution = solve(native, ours, self._values, settings)
         except FactorError as error:
-            raise self.undetermined(error) from error
+            raise solver_error(self._variables, self._groups, error) from error
         self.moved_to(solution.values)
         return solution
 
@@ -300,45 +299,6 @@ class SceneFactorGraph:
             for key in set(values.keys()) - self._variables.keys():
                 values.erase(key)
 
-    def undetermined(self, error: Exception) -> GraphError:
-        """The error of a solver, with the names of this graph's variables."""
-        if not isinstance(error, SingularSystemError) or not error.keys:
-            return GraphError(self.with_names(str(error), self._variables))
-        names = [str(self._variables[key]) if key in self._variables else described(key) for key in error.keys[:8]]
-        more = f" and {len(error.keys) - 8} more" if len(error.keys) > 8 else ""
-        first = error.keys[0]
-        its = f" (factors on {names[0]}: {self._kinds_on(first)})" if first in self._variables else ""
-        return UndeterminedError(
-            f"{', '.join(names)}{more}: not determined by the factors{its}; "
-            "expected a prior, or measurements of all components",
-            error.keys,
-        )
-
-    def with_names(self, text: str, keys: Iterable[int]) -> str:
-        """A text with keys in words in place of numbers and symbols."""
-        for key in keys:
-            if format_key(key) in text:
-                text = text.replace(format_key(key), str(self._variables[key]))
-        return text
-
-    def _kinds_on(self, key: int) -> str:
-        """Describe the factors on a variable."""
-        counts: dict[str, int] = {}
-        for number in self._touching[key]:
-            held = self._groups[number]
-            mine = sum(key in held.factors.rows[row] for row in held.rows.tolist())
-            if mine:
-                counts[held.factors.name] = counts.get(held.factors.name, 0) + mine
-        return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
-
-    def _failed(self, held: HeldGroup, rows: IntArray, error: Exception) -> str:
-        keys = dict.fromkeys(key for row in rows.tolist() for key in held.factors.rows[row])
-        named = [str(self._variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
-        expected = isinstance(error, FactorError | InputError)
-        text = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
-        where = f"{held.factors.name} on {', '.join(named)}: "
-        return f"provider {held.provider}: {where}{self.with_names(text, keys).removeprefix(where)[:500]}"
-
     def _hold(self, held: HeldGroup) -> int:
         number, self._count = self._count, self._count + 1
         self._groups[number] = held
@@ -360,7 +320,7 @@ class SceneFactorGraph:
         try:
             return _jacobians(marginal_factors(touched, keys, "qr"))
         except FactorError as error:
-            raise self.undetermined(error) from error
+            raise solver_error(self._variables, self._groups, error) from error
 
     def _choose(self, widest: int) -> None:
         """QR where what is left of marginalised variables is on few dimensions together, else Cholesky."""

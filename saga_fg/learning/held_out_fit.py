@@ -45,7 +45,7 @@ HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
 class Form(NamedTuple):
     """A way in which fitted interactions act: the weighting of edges, and whether the fitted noise is used."""
 
-    news: EdgeInformation | None
+    information_gain: EdgeInformation | None
     fitted_noise: bool
 
 
@@ -88,7 +88,11 @@ def fit_by_held_out(
         ratios = {form: _ratio(trials, group, form, own.position_noise) for form in forms}
         form = forms[best := min(ratios, key=lambda each: ratios[each])]
         if ratios[best] < 1:
-            rules += [replace(rule, news=form.news) for rule in fitted.rules if group.issuperset(rule.classes)]
+            rules += [
+                replace(rule, information_gain=form.information_gain)
+                for rule in fitted.rules
+                if group.issuperset(rule.classes)
+            ]
             if form.fitted_noise:
                 noise |= {label: q for label, q in fitted.acceleration_noise.items() if label in group}
     return replace(fitted, rules=tuple(rules), acceleration_noise=noise)
@@ -133,7 +137,7 @@ def _trial(
     gaps = sample_gaps(of, filtered, classes, settings).sampled(TRIED_GAPS, seed=2)
     errors = {INDEPENDENT: errors_alone(gaps)}
     for name, form in forms.items():
-        rules = [replace(rule, news=form.news) for rule in learned.rules]
+        rules = [replace(rule, information_gain=form.information_gain) for rule in learned.rules]
         noise = learned.acceleration_noise if form.fitted_noise else own.acceleration_noise
         joint = JointGaps(of, filtered, noise, own.position_noise, rules, learned.explained_noise)
         errors[name] = joint.errors(gaps, settings)

@@ -54,7 +54,7 @@ _SPEED = Following(
 )
 TEMPLATE: tuple[Rule, ...] = (
     _SPEED,
-    replace(_SPEED, rate=0.2, leaders="standing"),
+    replace(_SPEED, rate=0.2, leaders="stationary"),
     replace(_SPEED, interaction=SharedCourse(), rate=0.7),
     Neighbours(
         rate=1.0,

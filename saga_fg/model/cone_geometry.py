@@ -28,12 +28,12 @@ class ConeGeometry(Settings):
     """Range of cones that concern a vehicle, and the clearance to them."""
 
     clearance: Positive = setting(
-        1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m"
+        1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m; usual 1.5 to 2"
     )
     preview: Positive = setting(1.5, "time by which drivers look ahead along the line, s")
-    reach: Positive = setting(45.0, "cones further ahead do not belong to the line yet, m")
-    corridor: Positive = setting(6.0, "cones further aside than this do not concern a vehicle, m")
-    classes: tuple[str, ...] = setting(CONES, "classes that form a line")
+    reach: Positive = setting(45.0, "ignore cones further ahead, m")
+    corridor: Positive = setting(6.0, "ignore cones further aside, m")
+    classes: tuple[str, ...] = setting(CONES, "classes of objects that form a line")
 
 
 class ConesAhead(NamedTuple):

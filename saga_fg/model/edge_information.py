@@ -37,9 +37,12 @@ def weighted_by_gain(
 class EdgeInformation(Settings):
     """Weight edges by their information gain."""
 
-    spread: NonNegative = setting(0.5, "standard deviation of the difference between the velocities of a pair, m/s")
+    spread: NonNegative = setting(
+        0.5, "standard deviation of the difference between the velocities of a pair, m/s; higher: edges gain less"
+    )
     unseen_acceleration: NonNegative = setting(
-        0.0, "how much less sure a velocity is for every second in which nobody has seen its object, m/s^2"
+        0.0,
+        "growth of the velocity deviation of undetected objects, m/s^2; higher: edges out of them gain less",
     )
 
     def gains(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:

@@ -48,17 +48,17 @@ class EdgeNetwork(Settings):
     interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
         SharedVelocity, "interaction function of the edges"
     )
-    edge_weights: Matrix = setting((), "W_edge, h rows of one entry a feature; none: no edges")
+    edge_weights: Matrix = setting((), "W_edge, h rows of one entry a feature; []: no edges")
     edge_bias: tuple[float, ...] = setting((), "b_edge, h entries")
     node_weights: Matrix = setting((), "W_node, h rows of h entries")
     output_weights: tuple[float, ...] = setting((), "w_out, 2 h entries")
     output_bias: float = setting(-3.0, "b_out")
     max_rate: Annotated[float, Range(0, MAX_RATE, above=True)] = setting(3.0, "highest rate of an edge, 1/s")
     max_distance: Positive = setting(40.0, "no edge beyond this distance, m")
-    max_degree: NonNegativeInt = setting(4, "edges kept per influenced node, strongest first")
-    ahead_only: bool = setting(False, "whether only nodes ahead lead, along the heading of the one that is led")
-    news: EdgeInformation | None = information_setting()
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    max_degree: NonNegativeInt = setting(4, "largest number of edges into one object, the strongest")
+    ahead_only: bool = setting(False, "true: only objects ahead lead, along the heading of the follower")
+    information_gain: EdgeInformation | None = information_setting()
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,7 +91,7 @@ class EdgeNetwork(Settings):
         rate = edge_rates(weights, message, received[target], self.max_rate)
         if self.ahead_only:
             rate = np.where(features.ahead > 0, rate, 0.0)
-        rate = weighted_by_gain(rate, self.news, nodes, target, source)
+        rate = weighted_by_gain(rate, self.information_gain, nodes, target, source)
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
     def candidate_rates(self, weights: dict[str, Any], features: EdgeFeatures, able: Any, xp: Any = np) -> Any:

@@ -34,7 +34,7 @@ from saga_fg.settings import (
 )
 
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
-Leaders = Literal["any", "moving", "standing"]
+Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
 
@@ -57,25 +57,30 @@ class EdgeRule(Protocol):
 
 @dataclass(frozen=True)
 class Neighbours(Settings):
-    """Moving objects that are close and head the same way share something, by default their velocity."""
+    """Edges between moving objects that are close and head the same way; by default they share their velocity."""
 
     interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
         SharedVelocity, "interaction function of the edges"
     )
-    rate: NonNegative = setting(0.3, "strength of an edge at distance and heading difference zero, 1/s")
-    distance_scale: PositiveOrInf = setting(8.0, "sigma of the distance kernel, m")
-    heading_scale: PositiveOrInf = setting(0.4, "sigma of the heading kernel, rad")
-    speed_scale: PositiveOrInf = setting(3.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
-    max_distance: NonNegative = setting(20.0, "no edge beyond this distance, m")
-    min_speed: NonNegative = setting(1.0, "nodes slower than this neither pull nor are pulled, m/s")
-    max_degree: NonNegativeInt = setting(4, "edges kept per influenced node, strongest first")
-    news: EdgeInformation | None = information_setting()
-    parked: bool = setting(
-        False,
-        "couples objects never seen moving whose velocity is known to within speed_scale, and no others; the "
-        "speed of either is held against speed_scale as well",
+    rate: NonNegative = setting(
+        0.3,
+        "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6",
     )
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    distance_scale: PositiveOrInf = setting(8.0, "sigma of the kernel on the distance, m; .inf: no kernel")
+    heading_scale: PositiveOrInf = setting(
+        0.4, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
+    )
+    speed_scale: PositiveOrInf = setting(
+        3.0, "sigma of the kernel on the difference of velocities, m/s; .inf: no kernel"
+    )
+    max_distance: NonNegative = setting(20.0, "no edge beyond this distance, m")
+    min_speed: NonNegative = setting(1.0, "no edge to or from objects slower than this, m/s")
+    max_degree: NonNegativeInt = setting(4, "largest number of edges into one object, the strongest; higher: slower")
+    information_gain: EdgeInformation | None = information_setting()
+    parked: bool = setting(
+        False, "couple only objects that were never seen moving and whose velocity is known better than speed_scale"
+    )
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, before classes are considered."""
@@ -96,7 +101,9 @@ class Neighbours(Settings):
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
-        rate = weighted_by_gain(self.strength(features_of(nodes, target, source)), self.news, nodes, target, source)
+        rate = weighted_by_gain(
+            self.strength(features_of(nodes, target, source)), self.information_gain, nodes, target, source
+        )
         return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
 
 
@@ -107,23 +114,32 @@ class Following(Settings):
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
-    rate: NonNegative = setting(0.5, "strength of an edge at lateral offset and heading difference zero, 1/s")
-    max_gap: NonNegative = setting(40.0, "no leader further ahead than this, centre to centre, m")
-    gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m")
-    lateral_scale: PositiveOrInf = setting(1.2, "sigma of the kernel on the leader's lateral offset, m")
-    heading_scale: PositiveOrInf = setting(0.4, "sigma of the heading kernel, rad")
-    news: EdgeInformation | None = information_setting()
-    parked: bool = setting(False, "whether a vehicle that was never seen moving is led too")
-    apart: NonNegative = setting(
-        0.0, "leaders are ahead by at least this share of half of both lengths: nearer is itself, tracked twice"
+    rate: NonNegative = setting(
+        0.5,
+        "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1",
     )
-    leaders: Leaders = setting("any", "who leads: any, moving (who was seen moving), or standing (all others)")
+    max_gap: NonNegative = setting(40.0, "no edge from a leader further ahead than this, centre to centre, m")
+    gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m; .inf: no kernel")
+    lateral_scale: PositiveOrInf = setting(
+        1.2, "sigma of the kernel on the leader's lateral offset, m; about a third of a lane"
+    )
+    heading_scale: PositiveOrInf = setting(
+        0.4, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
+    )
+    information_gain: EdgeInformation | None = information_setting()
+    parked: bool = setting(False, "true: vehicles that were never seen moving follow, too")
+    min_separation: NonNegative = setting(
+        0.0, "ignore leaders nearer than this share of half of both lengths: they are duplicates; usual 0 to 0.8"
+    )
+    leaders: Leaders = setting(
+        "any", "which vehicles lead: any; moving: those once seen moving; stationary: all others"
+    )
     cones: ConeGeometry | None = settings_group(
-        lambda: None, "vehicles that cones push aside lead, and are led, where they will be then; null: where they are"
+        lambda: None, "predict where cones push leaders and followers aside; null: use their present positions"
     )
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
     towed: tuple[str, ...] = setting(
-        (), "those among them that lead and are not led: a trailer goes where its truck does"
+        (), "classes that lead but do not follow, such as trailers, which go where their truck goes"
     )
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
@@ -148,21 +164,23 @@ class Following(Settings):
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
         target, source = close_pairs(seen.position, able, self.max_gap)
         features = features_of(seen, target, source)
-        near = self.apart * (nodes.length[target] + nodes.length[source]) / 2
+        near = self.min_separation * (nodes.length[target] + nodes.length[source]) / 2
         led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
-        rate = weighted_by_gain(np.where(led, self.strength(features), 0.0), self.news, nodes, target, source)
+        rate = weighted_by_gain(
+            np.where(led, self.strength(features), 0.0), self.information_gain, nodes, target, source
+        )
         nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
         return Pairs(target[nearest], source[nearest], rate[nearest])
 
 
 @dataclass(frozen=True)
 class Repulsion(Settings):
-    """Pedestrians keep away from each other; with `sources: [wall]`, from the walls of the road map."""
+    """Edges between pedestrians that keep away from each other; `sources: [wall]`: from walls of the road map."""
 
-    interaction: SocialForce = settings_group(SocialForce, "how strongly")
-    rate: NonNegative = setting(1.0, "1/s; 1: with all of the force")
-    max_distance: NonNegative = setting(4.0, "nobody further away counts, m")
-    max_degree: NonNegativeInt = setting(4, "sources kept per object, the nearest first")
+    interaction: SocialForce = settings_group(SocialForce, "the repulsive force")
+    rate: NonNegative = setting(1.0, "factor on the force, 1/s; 1: all of it")
+    max_distance: NonNegative = setting(4.0, "no edge beyond this distance, m")
+    max_degree: NonNegativeInt = setting(4, "largest number of sources of one object, the nearest")
     classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
     sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
 

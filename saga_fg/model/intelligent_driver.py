@@ -4,14 +4,14 @@ r"""The Intelligent Driver Model as an interaction function: following a leader,
 
 is the acceleration at speed v with the gap s, bumper to bumper, to a leader of speed w (Treiber, Hennecke, Helbing
 2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line to stop at is a stationary leader. Vehicles do not
-reverse, so braking is at most -v / t_halt. An edge of rate 1 / tau acts with the full acceleration, linearised at the
+reverse, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with the full acceleration, linearised at the
 estimate (v', s', w'):
 
     dv_i/dt += rate tau u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
 
-A vehicle does not start behind a stationary one, f <= max(v, w) / tau: parked cars and queues stay at rest. A gap with
-`room` for another vehicle may hold an undetected one, so that a driver does not speed up into it: he approaches at most
-the speed of the leader, f <= (w - v) / tau, and before a line he keeps his speed at most, f <= 0.
+A vehicle does not start behind a stationary one, f <= max(v, w) / tau: parked cars and queues stay at rest. A gap of
+at least `hidden_vehicle_gap` may hold an undetected vehicle, so that a driver does not speed up into it: he approaches
+at most the speed of the leader, f <= (w - v) / tau, and before a line he keeps his speed at most, f <= 0.
 """
 
 from __future__ import annotations
@@ -50,15 +50,17 @@ class IntelligentDriver(Settings):
     """
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
-    free_speed: Positive = setting(15.0, "v_free: speed of a driver whom nobody hinders, m/s")
-    headway: Positive = setting(1.0, "T: time headway that drivers want to keep, s")
-    standstill_gap: NonNegative = setting(2.0, "s0: gap that drivers keep when they stand, bumper to bumper, m")
-    acceleration: Positive = setting(1.0, "a: highest acceleration, m/s^2")
-    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2")
-    hardest: Positive = setting(6.0, "no driver brakes harder, m/s^2")
-    halt_time: Positive = setting(0.4, "t_halt: time constant with which the last of the speed goes, s")
-    room: PositiveOrInf = setting(7.0, "a gap of this length may hold a vehicle that nobody sees, m; .inf: never")
-    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau accelerates as the driver does, s")
+    free_speed: Positive = setting(15.0, "v_free: desired speed on a free road, m/s; about the speed limit")
+    headway: Positive = setting(1.0, "T: desired time headway, s; usual 0.8 to 2; higher: larger gaps")
+    standstill_gap: NonNegative = setting(2.0, "s0: gap at rest, bumper to bumper, m; usual 1 to 3")
+    acceleration: Positive = setting(1.0, "a: maximum acceleration, m/s^2; usual 0.5 to 2")
+    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2; usual 1 to 3")
+    max_deceleration: Positive = setting(6.0, "limit of the deceleration, m/s^2")
+    stop_time: Positive = setting(0.4, "t_stop: time constant with which the last of the speed fades, s")
+    hidden_vehicle_gap: PositiveOrInf = setting(
+        7.0, "gap that may hold an undetected vehicle, into which nobody speeds up, m; .inf: there are none"
+    )
+    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau has the full acceleration of the law, s")
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """f (E,) without an undetected vehicle in the gap; v, w >= 0 m/s, s m."""
@@ -78,9 +80,9 @@ class IntelligentDriver(Settings):
             2 * a * share**2 / s,
             by_gap_wanted * np.where(closing, -v / root, 0.0),
         )
-        hardest = Linearised(none - self.hardest, none, none, none)
-        halt = Linearised(-v / self.halt_time, none - 1 / self.halt_time, none, none)
-        f = hardest.where(f.value < -self.hardest, f)
+        hardest = Linearised(none - self.max_deceleration, none, none, none)
+        halt = Linearised(-v / self.stop_time, none - 1 / self.stop_time, none, none)
+        f = hardest.where(f.value < -self.max_deceleration, f)
         f = halt.where(f.value < halt.value, f)
         rate = np.where(np.maximum(v, w) < f.value * self.time_constant, 1 / self.time_constant, 0.0)
         start = Linearised(rate * np.maximum(v, w), rate * (v >= w), none, rate * (v < w))
@@ -99,7 +101,7 @@ class IntelligentDriver(Settings):
     def _capped(self, v: FloatArray, s: FloatArray, w: FloatArray, highest: Linearised) -> Linearised:
         """f, but at most `highest` where the gap has room for another vehicle."""
         f = self.alone(v, s, w)
-        return highest.where((s >= self.room) & (highest.value < f.value), f)
+        return highest.where((s >= self.hidden_vehicle_gap) & (highest.value < f.value), f)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))

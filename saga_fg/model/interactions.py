@@ -92,7 +92,8 @@ class SharedVelocity:
 
     needs: ClassVar[Needs] = (VELOCITY, VELOCITY)
     along_heading: bool = setting(
-        False, "turn the neighbour's velocity by the difference of headings, so that a queue keeps its speed in a bend"
+        False,
+        "true: turn the neighbour's velocity by the difference of headings, for queues in bends",
     )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
@@ -108,13 +109,13 @@ class CarFollowing(Settings):
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     time_constant: PositiveOrInf = setting(
-        4.0, "tau: time over which a wrong gap is made good, s; .inf: only speeds are shared"
+        4.0, "tau: time constant with which a wrong gap closes, s; usual 1 to 10; .inf: share speeds only"
     )
-    headway: NonNegative = setting(0.0, "part of the desired gap that grows with the follower's speed, s")
+    headway: NonNegative = setting(0.0, "growth of the desired gap with the follower's speed, s; usual 0 to 2")
     gap: Literal["present", "standstill"] = setting(
-        "present", "desired gap: the one of the present estimate (formation), or standstill_gap + headway * speed"
+        "present", "desired gap: present: that of the present estimate; standstill: standstill_gap + headway * speed"
     )
-    standstill_gap: NonNegative = setting(2.0, "bumper to bumper, m; used with gap: standstill")
+    standstill_gap: NonNegative = setting(2.0, "gap at rest with gap: standstill, bumper to bumper, m; usual 1 to 3")
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))

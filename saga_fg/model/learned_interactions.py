@@ -27,12 +27,12 @@ class LearnedInteractions(Settings):
     Raises `InputError` for another format or version, and for rules that would make the dynamics, or a step, unstable.
     """
 
-    format: Literal["saga-fg interactions"] = setting("saga-fg interactions", "what this file is")
-    version: int = setting(VERSION, "of the format")
-    learned_from: str = setting("", "what it was learned from")
+    format: Literal["saga-fg interactions"] = setting("saga-fg interactions", "format of this file")
+    version: int = setting(VERSION, "version of the format")
+    learned_from: str = setting("", "data it was learned from")
     edges: tuple[Following | Neighbours | EdgeNetwork, ...] = settings_group(tuple, "edge rules of the scene graph")
     explained_noise: Annotated[float, Range(0, 10)] = setting(
-        0.0, "a node acted on at the total rate K moves with exp(-explained_noise K) of its own noise, s"
+        0.0, "process noise is scaled by exp(-explained_noise K) at the total rate K of interactions, s; usual 0 to 2"
     )
     acceleration_noise: Mapping[str, Positive] = settings_group(
         dict, "spectral density of the acceleration by class, m^2/s^3; default serves all others"

@@ -55,9 +55,9 @@ _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurem
 class Stationary(Settings):
     """Motion of an object at rest: its position drifts, its velocity decays."""
 
-    drift: NonNegative = setting(0.2, "how far the place drifts, standard deviation after one second, m")
+    drift: NonNegative = setting(0.2, "standard deviation of the drift of the position in one second, m")
     speed: Positive = setting(0.1, "standard deviation of a component of the velocity, m/s")
-    halt_time: Positive = setting(0.1, "time constant with which a velocity is forgotten, s")
+    stop_time: Positive = setting(0.1, "time constant with which the velocity fades, s")
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -65,11 +65,11 @@ class Stationary(Settings):
 
     @property
     def generator(self) -> FloatArray:
-        return np.diag([0.0, 0.0, -1.0, -1.0]) / self.halt_time
+        return np.diag([0.0, 0.0, -1.0, -1.0]) / self.stop_time
 
     @property
     def diffusion(self) -> FloatArray:
-        return np.diag([self.drift**2] * 2 + [2 * self.speed**2 / self.halt_time] * 2)
+        return np.diag([self.drift**2] * 2 + [2 * self.speed**2 / self.stop_time] * 2)
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,15 @@ class Mixture(Settings):
 
     motions: tuple[Stationary | ConstantVelocity | ConstantAcceleration | CoordinatedTurn | Bicycle, ...] = (
         settings_group(
-            lambda: (Stationary(), ConstantVelocity(), CoordinatedTurn()), "the modes, of which all have a velocity"
+            lambda: (Stationary(), ConstantVelocity(), CoordinatedTurn()),
+            "motion models of the modes; all have a velocity",
         )
     )
-    stay: Positive = setting(5.0, "mean time in a mode before it changes to one of the others, s")
-    unknown: Positive = setting(
-        0.3, "standard deviation of what a mode has no use for, such as a turn rate, unit of it"
+    dwell_time: Positive = setting(
+        5.0, "mean time in a mode before a change to another one, s; usual 2 to 10; higher: rarer changes"
+    )
+    unused_deviation: Positive = setting(
+        0.3, "standard deviation of a component while its mode does not use it, such as a turn rate, in its unit"
     )
 
     def __post_init__(self) -> None:
@@ -112,12 +115,12 @@ class Mixture(Settings):
 
     @property
     def initial_deviation(self) -> FloatArray:
-        return np.array([1.0] * 4 + [self.unknown] * (len(self.components) - 4))
+        return np.array([1.0] * 4 + [self.unused_deviation] * (len(self.components) - 4))
 
     def transition(self, dt: float) -> FloatArray:
         """Pi (M, M): probabilities of the modes (columns) dt seconds after those of the rows."""
         M = len(self.motions)
-        generator = (np.ones((M, M)) / (M - 1) - np.eye(M) * M / (M - 1)) / self.stay
+        generator = (np.ones((M, M)) / (M - 1) - np.eye(M) * M / (M - 1)) / self.dwell_time
         return np.asarray(scipy.linalg.expm(generator * dt))
 
 
@@ -255,7 +258,7 @@ def mode_dynamics(mixture: Mixture, mean: FloatArray, dt: float) -> ModeDynamics
         rest = np.setdiff1d(np.arange(d), at)
         alone = discretise(SceneGraph.of([0], node_type), dt)
         F[:, r, at[:, None], at], Q[:, r, at[:, None], at] = alone.F[0].values[0], alone.Q[0].values[0]
-        Q[:, r, rest, rest] = mixture.unknown**2
+        Q[:, r, rest, rest] = mixture.unused_deviation**2
         if node_type.flow is not None:
             x = mean[:, r, at]
             J = node_type.flow.flow_jacobian(x, dt)

@@ -58,7 +58,10 @@ def _planar(one_axis: ArrayLike) -> FloatArray:
 class ConstantVelocity(Settings):
     """White noise acceleration in the plane (Bar-Shalom, Li, Kirubarajan 2001, section 6.2.2)."""
 
-    acceleration_noise: NonNegative = setting(1.0, "spectral density of the acceleration, m^2/s^3")
+    acceleration_noise: NonNegative = setting(
+        1.0,
+        "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3; higher: follows detections faster",
+    )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -81,9 +84,11 @@ class ConstantAcceleration(Settings):
     Kirubarajan 2001, section 6.2.3; fading keeps a long prediction from running away.
     """
 
-    jerk_noise: NonNegative = setting(1.0, "spectral density of the jerk, m^2/s^5")
+    jerk_noise: NonNegative = setting(
+        1.0, "spectral density of the jerk, m^2/s^5; higher: follows changes of acceleration faster"
+    )
     fading_time: PositiveOrInf = setting(
-        float("inf"), "time constant with which the acceleration fades, s; .inf for never"
+        float("inf"), "time constant with which the acceleration fades, s; usual 1 to 10; .inf: never"
     )
 
     @property
@@ -103,8 +108,8 @@ class ConstantAcceleration(Settings):
 class RandomWalk(Settings):
     """Components that drift without a velocity; with drift 0 they stand still (a stop line, a pole)."""
 
-    names: tuple[str, ...] = setting(("x", "y"), "state components")
-    drift: NonNegative = setting(0.0, "spectral density of the drift, unit^2/s")
+    names: tuple[str, ...] = setting(("x", "y"), "components of the state")
+    drift: NonNegative = setting(0.0, "spectral density of the drift, unit^2/s; 0: never moves")
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ linearisation, and solvers do not converge.
 
     f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + hardest
     s* = s0 + S(v T + v (v - w) / (2 sqrt(a b))),    S(x) = log(1 + e^x) for max(0, x), s likewise, m
-    f  = -v / t_halt + h S((f0 + v / t_halt) / h)    for max(f0, -v / t_halt): vehicles do not reverse; h 0.05 m/s^2
+    f  = -v / t_stop + h S((f0 + v / t_stop) / h)    for max(f0, -v / t_stop): vehicles do not reverse; h 0.05 m/s^2
 
 An edge rule whose `interaction` is one of these makes `NonlinearEdges` of a scene graph: a filter linearises them at
 the start of the interval, smoothers wherever their estimates are. `interaction` gives the same law for factors by hand.
@@ -74,8 +74,12 @@ class SmoothDriver(Settings):
     """A vehicle follows its leader, the source: an intelligent driver whose law has no corners."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
-    driver: IntelligentDriver = settings_group(IntelligentDriver, "the driver; `room` plays no part")
-    length: Positive = setting(4.5, "of the gap that vehicles fill, between their centres, where boxes do not tell, m")
+    driver: IntelligentDriver = settings_group(
+        IntelligentDriver, "parameters of the driver; `hidden_vehicle_gap` is not used"
+    )
+    length: Positive = setting(
+        4.5, "part of the distance between centres that vehicles fill where no boxes are known, m"
+    )
 
     @property
     def time_constant(self) -> float:
@@ -108,9 +112,9 @@ class SocialForce(Settings):
     """A pedestrian keeps away from another, or from a wall: from the nearest point of the source's outline."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2")
-    falloff: Positive = setting(0.5, "B: distance over which it falls to a third, m")
-    reach: Positive = setting(0.6, "sum of two radii, m; from a wall, one")
+    strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2; higher: larger berth")
+    falloff: Positive = setting(0.5, "B: distance over which the force falls to a third, m")
+    reach: Positive = setting(0.6, "sum of the radii of both, m; for a wall, one radius")
 
     @property
     def time_constant(self) -> float:
@@ -159,15 +163,15 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
     gap = LEAST_GAP + np.logaddexp(0.0, s - LEAST_GAP)
     share = wanted / gap
     by_approach = 2 * a * share / gap * expit(approach)
-    G = a + driver.hardest
+    G = a + driver.max_deceleration
     g = a * (v / driver.free_speed) ** 4 + a * share**2
     slope = -((1 + (g / G) ** 4) ** -1.25)
-    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / driver.halt_time) / _HALT  # the halt
+    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / driver.stop_time) / _HALT  # the halt
     slope = slope * expit(above)
     by_speed = slope * (4 * a * v**3 / driver.free_speed**4 + by_approach * (driver.headway + (2 * v - w) / root))
     return Linearised(
-        np.asarray(_HALT * np.logaddexp(0.0, above) - v / driver.halt_time),
-        by_speed + (expit(above) - 1) / driver.halt_time,
+        np.asarray(_HALT * np.logaddexp(0.0, above) - v / driver.stop_time),
+        by_speed + (expit(above) - 1) / driver.stop_time,
         slope * (-2 * a * share**2 / gap * expit(s - LEAST_GAP)),
         slope * by_approach * -v / root,
     )

@@ -32,7 +32,7 @@ class RigidCoupling(Settings):
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     time_constant: PositiveOrInf = setting(
-        1.0, "tau: time over which a change of the offset is made good, s; .inf for never"
+        1.0, "tau: time constant with which a change of the offset is undone, s; .inf: share velocities only"
     )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
@@ -48,12 +48,16 @@ class Attached(Settings):
     """Every object of some classes is attached to the nearest of some others that touches it and moves as it does."""
 
     interaction: RigidCoupling = settings_group(RigidCoupling, "interaction function of the edges, which go both ways")
-    attached: tuple[str, ...] = setting(("trailer",), "classes of what is attached")
-    carriers: tuple[str, ...] = setting(("truck",), "classes of what it is attached to")
+    attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects")
+    carriers: tuple[str, ...] = setting(("truck",), "classes of the objects they are attached to")
     rate: NonNegative = setting(3.0, "strength of an edge, 1/s")
-    slack: NonNegative = setting(2.0, "largest distance between centres beyond half of both lengths, m")
-    heading_scale: PositiveOrInf = setting(0.5, "sigma of the kernel on the difference of headings, rad; .inf for none")
-    speed_scale: PositiveOrInf = setting(2.0, "sigma of the kernel on the difference of velocities, m/s; .inf for none")
+    max_gap: NonNegative = setting(2.0, "largest distance between centres beyond half of both lengths, m")
+    heading_scale: PositiveOrInf = setting(
+        0.5, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
+    )
+    speed_scale: PositiveOrInf = setting(
+        2.0, "sigma of the kernel on the difference of velocities, m/s; .inf: no kernel"
+    )
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         parts, carriers = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.attached, self.carriers))
@@ -63,7 +67,7 @@ class Attached(Settings):
         turn = wrap_angle(nodes.heading[parts, None] - nodes.heading[carriers])
         difference = _distance(nodes.velocity, parts, carriers)
         exponent = (turn / self.heading_scale) ** 2 + (difference / self.speed_scale) ** 2
-        rate = np.where(apart <= self.slack, self.rate * np.exp(-exponent / 2), 0.0)
+        rate = np.where(apart <= self.max_gap, self.rate * np.exp(-exponent / 2), 0.0)
         of_part, of_carrier = rate.argmax(axis=1), rate.argmax(axis=0)
         rows = np.arange(len(parts))
         mutual = (of_carrier[of_part] == rows) & (rate[rows, of_part] > 0)

@@ -36,9 +36,11 @@ _STRAIGHT = np.diag([1.0, 1.0, 0.0], k=2)  # dp/dt = v
 class CoordinatedTurn(Settings):
     """A turn of nearly constant rate and speed."""
 
-    acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3")
-    turn_noise: NonNegative = setting(0.05, "spectral density of the turn rate's random walk, rad^2/s^3")
-    turn_rate: Positive = setting(0.2, "standard deviation of the turn rate of a new object, rad/s")
+    acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3")
+    turn_noise: NonNegative = setting(
+        0.05, "spectral density of the random walk of the turn rate, rad^2/s^3; higher: turns are followed faster"
+    )
+    initial_turn_rate_deviation: Positive = setting(0.2, "standard deviation of the turn rate of a new object, rad/s")
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -55,7 +57,7 @@ class CoordinatedTurn(Settings):
     @property
     def initial_deviation(self) -> FloatArray:
         """(5,) of a new object, where nothing is measured."""
-        return np.array([1.0, 1.0, 1.0, 1.0, self.turn_rate])
+        return np.array([1.0, 1.0, 1.0, 1.0, self.initial_turn_rate_deviation])
 
     def flow(self, x: FloatArray, dt: float) -> FloatArray:
         """States (..., 5) after dt seconds; dt may be negative."""
@@ -70,12 +72,14 @@ class CoordinatedTurn(Settings):
 
 @dataclass(frozen=True)
 class Bicycle(Settings):
-    """The kinematic bicycle: a vehicle turns as it is steered, and not where it stands; to the left is positive."""
+    """The kinematic bicycle: a vehicle turns as it is steered, and only while it moves; left is positive."""
 
-    acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3")
-    steering_noise: NonNegative = setting(0.02, "spectral density of the steering angle's random walk, rad^2/s")
+    acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3")
+    steering_noise: NonNegative = setting(
+        0.02, "spectral density of the random walk of the steering angle, rad^2/s; higher: turns are followed faster"
+    )
     wheelbase: Positive = setting(2.8, "distance between the axles, m")
-    steering: Positive = setting(0.1, "standard deviation of the steering angle of a new object, rad")
+    initial_steering_deviation: Positive = setting(0.1, "standard deviation of the steering angle of a new object, rad")
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -92,7 +96,7 @@ class Bicycle(Settings):
     @property
     def initial_deviation(self) -> FloatArray:
         """(5,) of a new object, where nothing is measured."""
-        return np.array([1.0, 1.0, 1.0, 1.0, self.steering])
+        return np.array([1.0, 1.0, 1.0, 1.0, self.initial_steering_deviation])
 
     def flow(self, x: FloatArray, dt: float) -> FloatArray:
         """States (..., 5) after dt seconds; dt may be negative."""

@@ -19,18 +19,16 @@ from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, settin
 
 @dataclass(frozen=True)
 class Gps(Settings):
-    """Adds GPS fixes (`frame.ego.gps`) on the vehicle's pose, those that are near enough to where it is expected."""
+    """Adds GPS fixes (`frame.ego.gps`) on the vehicle's pose that pass the gate."""
 
-    deviation: Positive = setting(
-        1.0, "fixes that come without a covariance: standard deviation of a horizontal coordinate, m"
-    )
-    height_deviation: Positive = setting(2.0, "and of the height, m")
-    antenna: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "its place in the vehicle's frame, m")
-    gate: Fraction = setting(0.999, "share of true fixes that the chi-square gate lets through; 1: all")
+    deviation: Positive = setting(1.0, "standard deviation of a horizontal coordinate of fixes without a covariance, m")
+    height_deviation: Positive = setting(2.0, "standard deviation of the height of fixes without a covariance, m")
+    antenna: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "position of the antenna in the vehicle's frame, m")
+    gate: Fraction = setting(0.999, "gate probability: share of true fixes inside the chi-square gate; 1: use all")
     outlier_scale: PositiveOrInf = setting(
-        math.inf, "deviations from which the Cauchy loss gives a fix up; .inf: never"
+        math.inf, "residual from which the Cauchy loss discounts a fix, standard deviations; .inf: never"
     )
-    name: str = setting("gps", "what it is called in messages")
+    name: str = setting("gps", "name in messages")
 
     def __post_init__(self) -> None:
         super().__post_init__()

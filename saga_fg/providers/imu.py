@@ -28,20 +28,22 @@ from saga_fg.types.ego_measurements import ImuSamples
 class Imu(Settings):
     """Adds the vehicle's pose in space, velocity and biases at every epoch, and inertial samples (`frame.ego.imu`)."""
 
-    start: StartSettings = settings_group(lambda: StartSettings(planar=False), "the first pose, in space")
-    start_velocity: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "first velocity, world, m/s")
-    start_velocity_deviation: Positive = setting(10.0, "its standard deviation, m/s")
-    accelerometer_noise: Positive = setting(0.02, "of the accelerometer, m/s^2/sqrt(Hz)")
-    gyroscope_noise: Positive = setting(0.002, "of the gyroscope, rad/s/sqrt(Hz)")
-    integration_noise: Positive = setting(1e-4, "of integrating the position, m/s/sqrt(Hz)")
-    accelerometer_bias: Positive = setting(0.1, "standard deviation of the accelerometer's first bias, m/s^2")
-    gyroscope_bias: Positive = setting(0.01, "standard deviation of the gyroscope's first bias, rad/s")
-    accelerometer_drift: Positive = setting(1e-3, "random walk of the accelerometer's bias, m/s^2 after one second")
-    gyroscope_drift: Positive = setting(1e-4, "random walk of the gyroscope's bias, rad/s after one second")
-    unknown_acceleration: Positive = setting(3.0, "of the acceleration where there are no samples, m/s^2/sqrt(Hz)")
-    unknown_turn: Positive = setting(0.3, "of the rate of turn where there are no samples, rad/s/sqrt(Hz)")
-    gravity: NonNegative = setting(9.81, "m/s^2")
-    name: str = setting("imu", "what it is called in messages")
+    start: StartSettings = settings_group(lambda: StartSettings(planar=False), "first pose, in space")
+    start_velocity: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "first velocity in the world, m/s")
+    start_velocity_deviation: Positive = setting(10.0, "standard deviation of the first velocity, m/s")
+    accelerometer_noise: Positive = setting(0.02, "noise density of the accelerometer, m/s^2/sqrt(Hz)")
+    gyroscope_noise: Positive = setting(0.002, "noise density of the gyroscope, rad/s/sqrt(Hz)")
+    integration_noise: Positive = setting(1e-4, "noise density of integrating the position, m/s/sqrt(Hz)")
+    accelerometer_bias: Positive = setting(0.1, "standard deviation of the first bias of the accelerometer, m/s^2")
+    gyroscope_bias: Positive = setting(0.01, "standard deviation of the first bias of the gyroscope, rad/s")
+    accelerometer_drift: Positive = setting(1e-3, "random walk of the bias of the accelerometer in one second, m/s^2")
+    gyroscope_drift: Positive = setting(1e-4, "random walk of the bias of the gyroscope in one second, rad/s")
+    unknown_acceleration: Positive = setting(
+        3.0, "noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)"
+    )
+    unknown_turn: Positive = setting(0.3, "noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)")
+    gravity: NonNegative = setting(9.81, "gravity, m/s^2")
+    name: str = setting("imu", "name in messages")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,10 +27,10 @@ class Landmarks(Settings):
     """
 
     labels: tuple[str, ...] = setting(
-        (), "detections in the vehicle's frame with one of these labels are observations of a point, one point a label"
+        (), "labels of detections in the vehicle's frame that are observations of one point each"
     )
     deviation: Positive = setting(0.3, "standard deviation of such an observation, m")
-    name: str = setting("landmarks", "what it is called in messages")
+    name: str = setting("landmarks", "name in messages")
 
     def factors(self, view: GraphView) -> Additions:
         pose = view.now(EGO_POSE).get(0)

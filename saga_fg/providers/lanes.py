@@ -28,14 +28,16 @@ _LETS_GO = 3.0  # standard deviations
 
 @dataclass(frozen=True)
 class Lanes(Settings):
-    """Says of vehicles that go along a lane that they probably keep to it."""
+    """Attracts vehicles that drive along a lane to its centre line."""
 
-    lanes: tuple[Lane, ...] = settings_group(tuple, "in the world")
-    deviation: Positive = setting(0.5, "standard deviation of an offset that a second in the lane leaves, m")
-    map_deviation: Positive = setting(0.3, "standard deviation of where the map has a lane, m")
-    min_speed: NonNegative = setting(1.0, "slower objects have no course, m/s")
+    lanes: tuple[Lane, ...] = settings_group(tuple, "lanes in world coordinates")
+    deviation: Positive = setting(
+        0.5, "standard deviation of the offset left after one second in the lane, m; lower: stronger"
+    )
+    map_deviation: Positive = setting(0.3, "standard deviation of the lanes in the map, m")
+    min_speed: NonNegative = setting(1.0, "ignore vehicles slower than this, m/s")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that keep to lanes")
-    name: str = setting("lanes", "what it is called in messages")
+    name: str = setting("lanes", "name in messages")
 
     def factors(self, view: GraphView) -> Additions:
         if not self.lanes:

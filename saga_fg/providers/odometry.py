@@ -29,16 +29,18 @@ _SAME = 1e-4  # relative difference of two intervals that timestamps make
 
 @dataclass(frozen=True)
 class Odometry(Settings):
-    """Adds the vehicle's pose at every epoch, and what odometry (`frame.ego.odometry`) says of its motion."""
+    """Adds the vehicle's pose at every epoch, and the increments of odometry (`frame.ego.odometry`)."""
 
-    start: StartSettings = settings_group(StartSettings, "the first pose")
+    start: StartSettings = settings_group(StartSettings, "first pose")
     place_drift: Positive = setting(
-        0.1, "increments that come without a covariance: standard deviation of the place after one second, m"
+        0.1, "standard deviation of the position after one second, for increments without a covariance, m"
     )
-    heading_drift: Positive = setting(0.01, "the same of the heading, and of roll and pitch, rad")
+    heading_drift: Positive = setting(
+        0.01, "standard deviation of heading, roll and pitch after one second, likewise, rad"
+    )
     unknown_speed: Positive = setting(10.0, "standard deviation of the velocity where there is no increment, m/s")
-    unknown_turn: Positive = setting(0.3, "standard deviation of the rate of turn where there is no increment, rad/s")
-    name: str = setting("odometry", "what it is called in messages")
+    unknown_turn: Positive = setting(0.3, "standard deviation of the turn rate where there is no increment, rad/s")
+    name: str = setting("odometry", "name in messages")
 
     def predict(self, view: GraphView) -> Additions:
         before = view.before(EGO_POSE)

@@ -26,12 +26,12 @@ class StartSettings(Settings):
     """The vehicle's first pose."""
 
     place: tuple[float, float, float] | None = setting(
-        None, "x, y (m) and yaw (rad) in the world; null: the first frame's world_T_ego, else its GPS fix, yaw 0"
+        None, "x, y (m) and yaw (rad) in the world; null: world_T_ego of the first frame, else its GPS fix and yaw 0"
     )
-    deviation: Positive = setting(1.0, "standard deviation of the place, m")
-    heading_deviation: Positive = setting(0.1, "of the heading, rad")
-    tilt_deviation: Positive = setting(0.02, "of roll and pitch, rad; for poses in space")
-    planar: bool = setting(True, "a pose (x, y, heading), gtsam.Pose2; false: in space, gtsam.Pose3")
+    deviation: Positive = setting(1.0, "standard deviation of the position, m")
+    heading_deviation: Positive = setting(0.1, "standard deviation of the heading, rad")
+    tilt_deviation: Positive = setting(0.02, "standard deviation of roll and pitch of poses in space, rad")
+    planar: bool = setting(True, "true: poses (x, y, heading), gtsam.Pose2; false: poses in space, gtsam.Pose3")
 
     def __post_init__(self) -> None:
         super().__post_init__()

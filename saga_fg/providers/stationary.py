@@ -18,12 +18,12 @@ from saga_fg.settings import Positive, Settings, setting
 
 @dataclass(frozen=True)
 class Stationary(Settings):
-    """Says of objects of some classes that they probably stand."""
+    """Holds objects of some classes near velocity zero."""
 
-    classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of objects that stand")
-    deviation: Positive = setting(0.1, "standard deviation of a velocity that a second of standing leaves, m/s")
-    surely_moving: Positive = setting(4.0, "standard deviations from standing at which the loss gives an object up")
-    name: str = setting("stationary", "what it is called in messages")
+    classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of stationary objects")
+    deviation: Positive = setting(0.1, "standard deviation of the velocity left after one second, m/s; lower: stronger")
+    surely_moving: Positive = setting(4.0, "residual from which the loss lets a moving object go, standard deviations")
+    name: str = setting("stationary", "name in messages")
 
     def factors(self, view: GraphView) -> Additions:
         dims: dict[int, list[list[int]]] = {}

@@ -1,15 +1,27 @@
 """Offline smoothing: from tracks of a recording to labels, with past and future of every box."""
 
-from saga_fg.smoothing.attribution import attribute
-from saga_fg.smoothing.batch_states import Standing, no_edges, robust_weights, smooth_states
-from saga_fg.smoothing.claiming import claim_detections
+from saga_fg.smoothing.association import assign_detections, assign_free_detections, stitch_tracklets
+from saga_fg.smoothing.batch_states import no_edges, robust_weights, smooth_states
+from saga_fg.smoothing.boxes import (
+    Headings,
+    constant_sizes,
+    is_reversed,
+    size_weights,
+    smooth_headings,
+    weighted_medians,
+)
 from saga_fg.smoothing.edges import SmoothedEdges
-from saga_fg.smoothing.evidence import Evidence, Look, gather_evidence, measured_in_order
-from saga_fg.smoothing.headings import Headings, is_backwards, smooth_headings
-from saga_fg.smoothing.joining import join_tracklets
+from saga_fg.smoothing.evidence import (
+    Evidence,
+    EvidenceFrame,
+    evidence_scores,
+    frame_rate,
+    gather_evidence,
+    measured_in_order,
+    opportunities,
+)
 from saga_fg.smoothing.labels import LabelCounts, Labels, Quality, Source, quality_of
-from saga_fg.smoothing.random_walk import previous_rows, scalar_readings, smooth_walks
-from saga_fg.smoothing.scoring import evidence_scores, look_rate, looks_in_view
+from saga_fg.smoothing.random_walk import scalar_readings, smooth_walks
 from saga_fg.smoothing.settings import (
     JoiningSettings,
     OfflineClass,
@@ -17,40 +29,37 @@ from saga_fg.smoothing.settings import (
     SmoothingSettings,
     StationarySettings,
 )
-from saga_fg.smoothing.sizes import constant_sizes, size_weights, weighted_medians
-from saga_fg.smoothing.standing import standing_states
-from saga_fg.smoothing.states import Lives, StateTable, lives_of_evidence
+from saga_fg.smoothing.states import Lifespans, StateTable, lifespans_of
+from saga_fg.smoothing.stationarity import StationaryStates, stationary_states
 
 __all__ = [
     "Evidence",
+    "EvidenceFrame",
     "Headings",
     "JoiningSettings",
     "LabelCounts",
     "Labels",
-    "Lives",
-    "Look",
+    "Lifespans",
     "OfflineClass",
     "Quality",
     "QualitySettings",
     "SmoothedEdges",
     "SmoothingSettings",
     "Source",
-    "Standing",
     "StateTable",
     "StationarySettings",
-    "attribute",
-    "claim_detections",
+    "StationaryStates",
+    "assign_detections",
+    "assign_free_detections",
     "constant_sizes",
     "evidence_scores",
+    "frame_rate",
     "gather_evidence",
-    "is_backwards",
-    "join_tracklets",
-    "lives_of_evidence",
-    "look_rate",
-    "looks_in_view",
+    "is_reversed",
+    "lifespans_of",
     "measured_in_order",
     "no_edges",
-    "previous_rows",
+    "opportunities",
     "quality_of",
     "robust_weights",
     "scalar_readings",
@@ -58,6 +67,7 @@ __all__ = [
     "smooth_headings",
     "smooth_states",
     "smooth_walks",
-    "standing_states",
+    "stationary_states",
+    "stitch_tracklets",
     "weighted_medians",
 ]

@@ -1,21 +1,21 @@
-r"""The states of all objects at all moments of a recording, given everything that was measured of them.
+r"""States of all objects at all moments of a recording, given all of its detections.
 
-    prior         position unknown, velocity as at a birth                 first moment of a life
+    prior         position unknown, velocity as at a birth                 first moment of an object
     interaction   || x_i(k+1) - sum_j F_ij x_j(k) - b_i ||_{Q_i}            every interval, edges frozen
-    detection     rho( || z - H x_i(k) ||_R )                              every attributed detection
-    standing      || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object stands
+    detection     rho( || z - H x_i(k) ||_R )                              every assigned detection
+    stationary    || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object is stationary
 
 over one factor graph (`saga_fg.estimators.BatchSmoother`; long recordings in windows, by `WindowedSmoother`, which
 comes to the same within a millimetre and does not keep all matrices of an hour; with factors of users' own the running
 graph itself, `saga_fg.smoothing.graph_states`). The edges of an interval follow from
-given states at its start: those of an earlier, simpler round. Robust losses (`factors.robust`) are reached by
-reweighting between rounds.
+given states at its start: those of an earlier, simpler pass. Robust losses (`factors.robust`) are reached by
+reweighting between passes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,15 +26,16 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import VELOCITY
 from saga_fg.model.node import NodeType
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.graph_states import Epoch, states_in_graph
-from saga_fg.smoothing.settings import OfflineClass, StationarySettings
-from saga_fg.smoothing.states import Lives, StateTable
+from saga_fg.smoothing.settings import OfflineClass
+from saga_fg.smoothing.states import Lifespans, StateTable
+from saga_fg.smoothing.stationarity import StationaryStates
 from saga_fg.types.by_class import class_settings
 
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
-UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of a life, m
+UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of an object, m
 LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
 
 GraphOf = Callable[[int, IntArray, tuple[NodeType, ...]], SceneGraph]
@@ -46,91 +47,77 @@ def no_edges(moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGr
     return SceneGraph(ids, types)
 
 
-@dataclass(frozen=True, eq=False)
-class Standing:
-    """States (m,) of objects that stand: their moments in ascending order, and ids; settings of how firmly."""
-
-    settings: StationarySettings = field(default_factory=StationarySettings)
-    moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-    def at(self, moment: int, ids: IntArray) -> BoolArray:
-        """(n,) which of these objects stand at a moment."""
-        first, last = np.searchsorted(self.moment, [moment, moment + 1])
-        return np.isin(ids, self.id[first:last])
-
-
 def smooth_states(
     evidence: Evidence,
     object_of: IntArray,
-    lives: Lives,
+    lifespans: Lifespans,
     velocity_prior: FloatArray,
     classes: Mapping[str, OfflineClass],
     graph_of: GraphOf = no_edges,
     weight: FloatArray | None = None,
-    standing: Standing | None = None,
+    stationary: StationaryStates | None = None,
     providers: Sequence[FactorProvider] = (),
 ) -> StateTable:
-    """SmoothedState states of every object at every moment of its life.
+    """Smoothed states of every object at every moment of its life.
 
-    object_of (N,) the object of each detection, negative for none; velocity_prior (n, 2, 2) of the lives' velocities;
-    weight (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
+    object_of (N,) the object of each detection, negative for none; velocity_prior (n, 2, 2) covariance of the objects'
+    first velocities; weight (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
     providers   asked once a moment for factors of their own
     """
     parts = _epochs(
         evidence,
         object_of,
-        lives,
+        lifespans,
         velocity_prior,
-        _node_types(lives, classes),
+        _node_types(lifespans, classes),
         graph_of,
         np.ones(len(evidence)) if weight is None else weight,
-        standing or Standing(),
+        stationary or StationaryStates(),
     )
     epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
     states = _smoothed(epochs, WindowedSmoother() if long else BatchSmoother(likelihoods=False, order="time"))
     if not providers:
         return states
-    labels = dict(zip(lives.id.tolist(), lives.label.tolist(), strict=True))
+    labels = dict(zip(lifespans.id.tolist(), lifespans.label.tolist(), strict=True))
     return states_in_graph(list(epochs), states, evidence, labels, providers)
 
 
 def _epochs(
     evidence: Evidence,
     object_of: IntArray,
-    lives: Lives,
+    lifespans: Lifespans,
     velocity_prior: FloatArray,
     types: Sequence[NodeType],
     graph_of: GraphOf,
     weight: FloatArray,
-    standing: Standing,
+    stationary: StationaryStates,
 ) -> Iterator[Epoch]:
-    """Everything from the first moment of a life to the last one."""
-    start = _first_positions(evidence, object_of, lives)
+    """Everything from the first moment of an object to the last one."""
+    start = _first_positions(evidence, object_of, lifespans)
     present = np.empty(0, dtype=np.int64)
     bounds = np.searchsorted(evidence.moment, np.arange(len(evidence.times) + 1))
-    begin = int(lives.first.min(initial=len(evidence.times)))
-    for k in range(begin, int(lives.last.max(initial=-1)) + 1):
+    begin = int(lifespans.first.min(initial=len(evidence.times)))
+    for k in range(begin, int(lifespans.last.max(initial=-1)) + 1):
         transition = None
         if k > begin:
-            graph = graph_of(k - 1, lives.id[present], tuple(types[i] for i in present.tolist()))
-            still = standing.at(k - 1, graph.nodes) & standing.at(k, graph.nodes)
-            graph = replace(graph, diffusion_scale=np.where(still, standing.settings.noise, graph.diffusion_scale))
+            graph = graph_of(k - 1, lifespans.id[present], tuple(types[i] for i in present.tolist()))
+            still = stationary.at(k - 1, graph.nodes) & stationary.at(k, graph.nodes)
+            graph = replace(graph, diffusion_scale=np.where(still, stationary.settings.noise, graph.diffusion_scale))
             transition = discretise(graph, float(evidence.times[k] - evidence.times[k - 1]))
-        born = np.flatnonzero(lives.first == k)
+        born = np.flatnonzero(lifespans.first == k)
         P = np.zeros((len(born), 4, 4))
         P[:, :2, :2] = UNKNOWN_POSITION**2 * np.eye(2)
         P[:, 2:, 2:] = velocity_prior[born]
-        births = Births(lives.id[born], np.concatenate([start[born], np.zeros((len(born), 2))], axis=1), P)
+        births = Births(lifespans.id[born], np.concatenate([start[born], np.zeros((len(born), 2))], axis=1), P)
         present = np.concatenate([present, born])
         measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
-        pinned = lives.id[present][standing.at(k, lives.id[present])]
+        pinned = lifespans.id[present][stationary.at(k, lifespans.id[present])]
         if len(pinned):
-            H, R = types[0].selector(VELOCITY), standing.settings.velocity**2 * np.eye(2)
+            H, R = types[0].selector(VELOCITY), stationary.settings.velocity**2 * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
-        gone = lives.last[present] == k
-        yield Epoch(k, transition, births, measured, lives.id[present[gone]])
+        gone = lifespans.last[present] == k
+        yield Epoch(k, transition, births, measured, lifespans.id[present[gone]])
         present = present[~gone]
 
 
@@ -155,7 +142,7 @@ def _smoothed(epochs: Iterable[Epoch], smoother: BatchSmoother | WindowedSmoothe
 
 def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, loss: Robust) -> FloatArray:
     """(N,) weight of each detection at given states of its object, 1 where it has none: one step of iteratively
-    reweighted least squares, which over the rounds comes to the minimum of the robust loss."""
+    reweighted least squares, which over the passes comes to the minimum of the robust loss."""
     weight = np.ones(len(evidence))
     at = states.rows_of(evidence.moment, object_of)
     rows = np.flatnonzero(at >= 0)
@@ -180,19 +167,19 @@ def _measured(evidence: Evidence, object_of: IntArray, rows: slice, weight: Floa
     return measured
 
 
-def _node_types(lives: Lives, classes: Mapping[str, OfflineClass]) -> list[NodeType]:
+def _node_types(lifespans: Lifespans, classes: Mapping[str, OfflineClass]) -> list[NodeType]:
     """The node type of each object; classes that move alike share one."""
     types: dict[float, NodeType] = {}
     result = []
-    for label in lives.label.tolist():
+    for label in lifespans.label.tolist():
         motion = class_settings(classes, OfflineClass, label).motion
         result.append(types.setdefault(motion.acceleration_noise, NodeType("object", motion)))
     return result
 
 
-def _first_positions(evidence: Evidence, object_of: IntArray, lives: Lives) -> FloatArray:
+def _first_positions(evidence: Evidence, object_of: IntArray, lifespans: Lifespans) -> FloatArray:
     """(n, 2) where each object was first detected."""
-    position = np.zeros((len(lives), 2))
+    position = np.zeros((len(lifespans), 2))
     rows = np.flatnonzero(object_of >= 0)[::-1]
-    position[lives.rows_of(object_of[rows])] = evidence.boxes.position[rows, :2]
+    position[lifespans.rows_of(object_of[rows])] = evidence.boxes.position[rows, :2]
     return position

@@ -16,7 +16,7 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.node import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.smoothing.states import Lives, StateTable
+from saga_fg.smoothing.states import Lifespans, StateTable
 
 MOVING = 2.0  # speed that is no estimation error, m/s
 FACING = 1.0  # speed from which an object heads where it moves, m/s
@@ -26,12 +26,12 @@ FACING = 1.0  # speed from which an object heads where it moves, m/s
 class SmoothedEdges:
     """Graphs by edge rules at smoothed states; called with a moment, the ids of the objects there and their types.
 
-    yaw (n,) and length (n,) of the lives' objects: what a detector says, NaN where unknown
+    yaw (n,) and length (n,) of the lifespans' objects: what a detector says, NaN where unknown
     """
 
     rules: Sequence[EdgeRule]
     explained_noise: float
-    lives: Lives
+    lifespans: Lifespans
     states: StateTable
     yaw: FloatArray
     length: FloatArray
@@ -42,7 +42,7 @@ class SmoothedEdges:
         cls,
         rules: Sequence[EdgeRule],
         explained_noise: float,
-        lives: Lives,
+        lifespans: Lifespans,
         states: StateTable,
         yaw: FloatArray,
         length: FloatArray,
@@ -51,13 +51,13 @@ class SmoothedEdges:
         speed = np.hypot(*states.mean[:, 2:].T)
         sigma = np.sqrt(np.trace(states.covariance[:, 2:, 2:], axis1=1, axis2=2) / 2)
         moving = states.id[(speed > MOVING) & (speed > 3 * sigma)]
-        return cls(rules, explained_noise, lives, states, yaw, length, np.isin(lives.id, moving))
+        return cls(rules, explained_noise, lifespans, states, yaw, length, np.isin(lifespans.id, moving))
 
     def __call__(self, moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGraph:
         at = self.states.rows_of(np.full(len(ids), moment), ids)
-        rows, objects = np.flatnonzero(at >= 0), self.lives.rows_of(ids)
+        rows, objects = np.flatnonzero(at >= 0), self.lifespans.rows_of(ids)
         mean, P = self.states.mean[at[rows]], self.states.covariance[at[rows]]
-        label: StrArray = self.lives.label[objects[rows]]
+        label: StrArray = self.lifespans.label[objects[rows]]
         velocity = mean[:, 2:]
         course = np.arctan2(velocity[:, 1], velocity[:, 0])
         known = np.isfinite(self.yaw[objects[rows]]) & (np.hypot(*velocity.T) < FACING)

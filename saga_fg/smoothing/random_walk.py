@@ -1,9 +1,9 @@
-r"""Scalars that wander, one chain per object, smoothed side by side: heights and headings.
+r"""Scalar random walks, one an object, smoothed together: heights and headings.
 
     s(k+1) = s(k) + q,  q ~ N(0, drift^2 dt)        z = s + v,  v ~ N(0, sigma^2)
 
 Kalman filter forwards and Rauch-Tung-Striebel smoother backwards. With a `period` p only s modulo p is measured (the
-axis of a box says where it points up to half a turn, p = pi): the innovation is taken to [-p/2, p/2), and s runs on
+axis of a box is its heading up to half a turn, p = pi): the innovation is taken to [-p/2, p/2), and s runs on
 continuously over all turns.
 
 Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.6.
@@ -42,10 +42,10 @@ def smooth_walks(
 ) -> tuple[FloatArray, FloatArray]:
     """Means and variances (R,), NaN for objects without any reading.
 
-    growth (R,): what the variance grows by on the way to each row from the object's row before
+    growth (R,): of the variance from the object's row before to each row
     """
     mean, variance = np.full(len(states), np.nan), np.full(len(states), np.nan)
-    before = previous_rows(states)
+    before = states.previous
     moments = range(int(states.moment[0]), int(states.moment[-1]) + 1) if len(states) else range(0)
     by_moment = [_split(states, reading) for reading in readings]
     for k in moments:
@@ -67,15 +67,6 @@ def smooth_walks(
         mean[old] = np.where(unknown, mean[new], mean[old] + share * (mean[new] - mean[old]))
         variance[old] = spread + share**2 * variance[new]
     return mean, variance
-
-
-def previous_rows(states: StateTable) -> IntArray:
-    """(R,) the row of the same object at the moment before, -1 for its first."""
-    order = np.lexsort((states.moment, states.id))
-    before = np.full(len(states), -1, dtype=np.int64)
-    same = states.id[order[1:]] == states.id[order[:-1]]
-    before[order[1:][same]] = order[:-1][same]
-    return before
 
 
 def _split(states: StateTable, reading: ScalarReadings) -> dict[int, ScalarReadings]:

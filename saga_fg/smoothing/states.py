@@ -1,4 +1,4 @@
-"""Objects over the moments of a recording: when they live, and their smoothed states as one table."""
+"""Objects over the moments of a recording: their lifespans, and their smoothed states as one table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from saga_fg.numerics.columns import Columns
 
 
 @dataclass(frozen=True, eq=False)
-class Lives(Columns):
+class Lifespans(Columns):
     """n objects: id (n,) unique and ascending, label (n,) classes, first and last (n,) moments, both included."""
 
     id: IntArray
@@ -33,8 +33,8 @@ class Lives(Columns):
         return replace(self, first=np.minimum(first, self.first), last=np.maximum(last, self.last))
 
 
-def lives_of_evidence(object_of: IntArray, label: StrArray, moment: IntArray) -> Lives:
-    """The lives of all objects from their first to their last detection.
+def lifespans_of(object_of: IntArray, label: StrArray, moment: IntArray) -> Lifespans:
+    """The lifespans of all objects from their first to their last detection.
 
     object_of (N,) the object of each detection, negative for none; label (N,), moment (N,) of the detections
     """
@@ -46,7 +46,7 @@ def lives_of_evidence(object_of: IntArray, label: StrArray, moment: IntArray) ->
     np.maximum.at(last, index, moment[rows])
     example = np.zeros(len(ids), dtype=np.int64)
     example[index] = rows
-    return Lives(ids, label[example] if len(ids) else np.empty(0, dtype="<U1"), first, last)
+    return Lifespans(ids, label[example] if len(ids) else np.empty(0, dtype="<U1"), first, last)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +71,30 @@ class StateTable(Columns):
         order = np.lexsort((ids, moment))
         return cls(moment[order], ids[order], mean[order], P[order])
 
-    def within(self, lives: Lives) -> Self:
+    def within(self, lifespans: Lifespans) -> Self:
         """The states of some objects from their first to their last moment."""
-        row = np.minimum(lives.rows_of(self.id), max(len(lives) - 1, 0))
-        if len(lives) == 0:
+        row = np.minimum(lifespans.rows_of(self.id), max(len(lifespans) - 1, 0))
+        if len(lifespans) == 0:
             return self.select(np.empty(0, dtype=np.int64))
-        there = (lives.id[row] == self.id) & (lives.first[row] <= self.moment) & (self.moment <= lives.last[row])
+        there = (
+            (lifespans.id[row] == self.id)
+            & (lifespans.first[row] <= self.moment)
+            & (self.moment <= lifespans.last[row])
+        )
         return self.select(there)
+
+    @cached_property
+    def previous(self) -> IntArray:
+        """(R,) the row of the same object at the moment before, -1 for its first."""
+        order = np.lexsort((self.moment, self.id))
+        before = np.full(len(self), -1, dtype=np.int64)
+        same = self.id[order[1:]] == self.id[order[:-1]]
+        before[order[1:][same]] = order[:-1][same]
+        return before
+
+    def elapsed(self, times: FloatArray) -> FloatArray:
+        """(R,) s from the object's state before to each state, 0 for its first; times (K,) s, of all moments."""
+        return np.where(self.previous >= 0, times[self.moment] - times[self.moment[self.previous]], 0.0)
 
     @cached_property
     def _bounds(self) -> IntArray:

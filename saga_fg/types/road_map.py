@@ -25,8 +25,8 @@ ROADSIDE = (LIGHT, STOP_LINE, LANE, WALL)  # classes of the nodes that a map bri
 class TrafficLight:
     """A traffic light that can be seen, known by its name."""
 
-    name: str = required_setting("the light's own")
-    position: Point = required_setting("(x, y), m")
+    name: str = required_setting("its name")
+    position: Point = required_setting("(x, y) in the world, m")
 
     def __post_init__(self) -> None:
         _require_name(self.name)
@@ -37,9 +37,9 @@ class TrafficLight:
 class StopLine:
     """A line where a red light stops traffic; `left` and `right` are its ends as approaching drivers see them."""
 
-    name: str = required_setting("the line's own")
-    left: Point = required_setting("its left end (x, y), m")
-    right: Point = required_setting("its right end (x, y), m")
+    name: str = required_setting("its name")
+    left: Point = required_setting("left end (x, y), m")
+    right: Point = required_setting("right end (x, y), m")
     light: str = required_setting("name of the light that governs it")
 
     def __post_init__(self) -> None:
@@ -64,9 +64,9 @@ class StopLine:
 class Lane(Settings):
     """A lane: its centre line in the direction of travel."""
 
-    name: str = required_setting("the lane's own")
-    centre: tuple[Point, ...] = required_setting("points (x, y) of its centre line in the direction of travel, m")
-    width: Positive = setting(3.5, "width, m")
+    name: str = required_setting("its name")
+    centre: tuple[Point, ...] = required_setting("points (x, y) of the centre line in the direction of travel, m")
+    width: Positive = setting(3.5, "its width, m")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,7 +80,7 @@ class Lane(Settings):
 class Wall:
     """An obstacle to pedestrians: a house front, a fence."""
 
-    name: str = required_setting("the wall's own")
+    name: str = required_setting("its name")
     points: tuple[Point, ...] = required_setting("points (x, y) of its foot, m")
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class RoadMap(Settings):
     lights: tuple[TrafficLight, ...] = setting((), "traffic lights")
     stop_lines: tuple[StopLine, ...] = setting((), "stop lines, each with the name of its light")
     lanes: tuple[Lane, ...] = setting((), "lanes")
-    deviation: Positive = setting(0.2, "standard deviation of the places, every direction, m")
+    deviation: Positive = setting(0.2, "standard deviation of the positions in the map, m")
     walls: tuple[Wall, ...] = setting((), "walls, which pedestrians keep away from (edge rule repulsion)")
 
     def __post_init__(self) -> None:

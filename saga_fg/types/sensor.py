@@ -44,45 +44,55 @@ _LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
 
 @dataclass(frozen=True)
 class NoiseModel(Settings):
-    """Standard deviations of what a sensor measures of a class of objects."""
+    """Measurement noise of a sensor for one class: standard deviations."""
 
-    position: Positive = setting(0.3, "standard deviation of a position, every direction, m")
-    range_noise: NonNegative = setting(0.0, "standard deviation along the line of sight, m per m of range")
-    bearing_noise: NonNegative = setting(0.0, "standard deviation across the line of sight, m per m of range (rad)")
-    velocity: Positive = setting(1.0, "standard deviation of a velocity component where velocity is measured, m/s")
-    range_rate: Positive = setting(0.5, "standard deviation of a range rate where one is measured, m/s")
+    position: Positive = setting(
+        0.3, "standard deviation of a position in every direction, m; usual 0.05 to 0.5; higher: detections count less"
+    )
+    range_noise: NonNegative = setting(
+        0.0, "standard deviation along the line of sight per m of range; usual 0 to 0.04"
+    )
+    bearing_noise: NonNegative = setting(
+        0.0, "standard deviation across the line of sight per m of range, rad; usual 0 to 0.01"
+    )
+    velocity: Positive = setting(1.0, "standard deviation of a component of a measured velocity, m/s")
+    range_rate: Positive = setting(0.5, "standard deviation of a measured range rate, m/s")
     low_score_growth: NonNegative = setting(
-        0.0, "all deviations grow by the factor 1 + low_score_growth * (1 - probability)"
+        0.0, "growth of all deviations at low scores, by the factor 1 + growth * (1 - probability); usual 0 to 3"
     )
     reported_deviation_scale: Positive = setting(
-        1.0, "factor on the standard deviation that is told of a track's position"
+        1.0, "factor on the standard deviation reported for a position; higher: wider reported ellipses"
     )
     reported_low_score_growth: Annotated[float, Range(-0.99)] = setting(
-        0.0, "it grows by the factor 1 + reported_low_score_growth * (1 - probability); > -1"
+        0.0, "growth of the reported deviation at low scores, by 1 + growth * (1 - probability); above -1"
     )
-    position_bias: NonNegative = setting(0.0, "standard deviation of what all detections of an object err alike, m")
+    position_bias: NonNegative = setting(
+        0.0, "standard deviation of the error that all detections of one object share, m; added to reports only"
+    )
     position_bias_growth: NonNegative = setting(
-        0.0, "it grows by the factor 1 + position_bias_growth * (1 - probability)"
+        0.0, "growth of position_bias at low scores, by the factor 1 + growth * (1 - probability)"
     )
-    yaw: Positive = setting(0.2, "standard deviation of the heading, rad")
-    height: Positive = setting(0.2, "standard deviation of the centre's height, m")
+    yaw: Positive = setting(0.2, "standard deviation of a measured heading, rad")
+    height: Positive = setting(0.2, "standard deviation of the height of a centre, m")
 
 
 @dataclass(frozen=True)
 class ScoreCalibration(Settings):
-    """Conversion of the scores of a class to probabilities: linear in the logit."""
+    """Calibration of the scores of a class: a straight line on the logit (Platt scaling)."""
 
-    slope: NonNegative = setting(1.0, "change of the logit of the probability with the logit of the score")
-    offset: Finite = setting(0.0, "logit of the probability at a score of one half")
+    slope: NonNegative = setting(
+        1.0, "slope of the logit of the probability over the logit of the score; below 1: scores are overconfident"
+    )
+    offset: Finite = setting(0.0, "logit of the probability at a score of one half; lower: detections are trusted less")
 
 
 @dataclass(frozen=True)
 class FieldOfView(Settings):
     """The field of view of a sensor, in its own frame."""
 
-    min_azimuth: Finite = setting(-np.pi, "rad, from straight ahead, left positive")
-    max_azimuth: Finite = setting(np.pi, "rad")
-    max_range: PositiveOrInf = setting(80.0, "m")
+    min_azimuth: Finite = setting(-np.pi, "smallest azimuth, from straight ahead, left positive, rad")
+    max_azimuth: Finite = setting(np.pi, "largest azimuth, rad")
+    max_range: PositiveOrInf = setting(80.0, "largest range, m")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,10 +112,10 @@ class FieldOfView(Settings):
 class Extrinsics:
     """Pose of the sensor on the vehicle, ego_T_sensor, for detections given in sensor coordinates."""
 
-    x: float = setting(0.0, "m ahead")
-    y: float = setting(0.0, "m to the left")
-    z: float = setting(0.0, "m up")
-    yaw: float = setting(0.0, "rad")
+    x: float = setting(0.0, "position ahead, m")
+    y: float = setting(0.0, "position to the left, m")
+    z: float = setting(0.0, "position up, m")
+    yaw: float = setting(0.0, "heading, left positive, rad")
 
     @property
     def ego_T_sensor(self) -> FloatArray:
@@ -115,38 +125,39 @@ class Extrinsics:
 
 @dataclass(frozen=True)
 class Sensor(Settings):
-    """A sensor's model."""
+    """Model of a sensor and its detector."""
 
     noise: Mapping[str, NoiseModel] = settings_group(
-        lambda: {DEFAULT: NoiseModel()}, "by class; the entry named default serves all others"
+        lambda: {DEFAULT: NoiseModel()}, "measurement noise by class; the entry named default serves all others"
     )
-    use_velocity: bool = setting(True, "take in the velocity, or the range rate, where one was measured")
-    max_speed: PositiveOrInf = setting(
-        150.0, "velocities and range rates beyond this are errors and are not taken in, m/s"
+    use_velocity: bool = setting(True, "use velocities and range rates, where they are measured")
+    max_speed: PositiveOrInf = setting(150.0, "ignore measured velocities and range rates above this, m/s")
+    detection_probability: Fraction = setting(
+        0.9, "probability that a visible object in the field of view is detected; higher: misses count more"
     )
-    detection_probability: Fraction = setting(0.9, "chance that a visible object in the field of view is detected")
-    class_detection_probability: Mapping[str, Fraction] = settings_group(dict, "that chance by class, where it differs")
-    score: Literal["probability", "logit"] = setting("probability", "what the detector's score is")
+    class_detection_probability: Mapping[str, Fraction] = settings_group(
+        dict, "detection probability by class, where it differs"
+    )
+    score: Literal["probability", "logit"] = setting("probability", "meaning of the detector's scores")
     calibration: Mapping[str, ScoreCalibration] = settings_group(
-        lambda: {DEFAULT: ScoreCalibration()}, "of the scores, by class; the entry named default serves all others"
+        lambda: {DEFAULT: ScoreCalibration()},
+        "calibration of the scores by class; the entry named default serves all others",
     )
     class_accuracy: float = setting(
-        0.9, "chance that the class of a detection is the true one, else one of its group (tracker.class_groups)"
+        0.9, "probability that the class of a detection is right, else another of its group (tracker.class_groups)"
     )
     confusion: Mapping[str, Mapping[str, float]] = settings_group(
-        dict,
-        "by true class, how often objects are taken for each class, their own among them, as counts or shares; in "
-        "place of class_accuracy",
+        dict, "by true class, counts or shares of the classes it is detected as; used in place of class_accuracy"
     )
-    colour_accuracy: Fraction = setting(0.9, "chance that the colour reported of a traffic light is the true one")
+    colour_accuracy: Fraction = setting(0.9, "probability that the reported colour of a traffic light is right")
     clutter_area: PositiveOrInf | None = setting(
-        None, "area that false detections of a class spread over, m^2; null: the tracker's `association.clutter_area`"
+        None, "area over which false detections spread, m^2; null: that of `tracker.association`"
     )
     initiation: Literal["alone", "confirmed"] = setting(
-        "alone", "whether a track born of its detections counts at once, or when other evidence has confirmed it"
+        "alone", "new tracks count at once (alone), or after `confirming_detections` or another sensor (confirmed)"
     )
-    field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can see")
-    extrinsics: Extrinsics = settings_group(Extrinsics, "where it sits, for detections in sensor coordinates")
+    field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can detect")
+    extrinsics: Extrinsics = settings_group(Extrinsics, "pose on the vehicle, for detections in sensor coordinates")
     time_offset: Annotated[float, Range(-LATEST, LATEST)] = setting(
         0.0, "added to the sensor's timestamps to get the time of measurement, s"
     )

@@ -36,9 +36,9 @@ class SignalSettings(Settings):
     red_duration: Positive = setting(15.0, "mean duration of red, s")
     amber_duration: Positive = setting(3.0, "mean duration of amber, s")
     green_duration: Positive = setting(15.0, "mean duration of green, s")
-    max_distance: Positive = setting(4.0, "a reported light further from every known one than this is none of them, m")
+    max_distance: Positive = setting(4.0, "a reported light belongs to no known light further away than this, m")
     belief: Literal["mixed", "likeliest"] = setting(
-        "mixed", "stop lines act by the probability that they are closed, or wholly if that is above one half"
+        "mixed", "effect of a stop line: mixed: by the probability that it is closed; likeliest: all or nothing"
     )
 
     @cached_property

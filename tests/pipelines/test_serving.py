@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
-from pipelines.serving.latency import Latencies
-from pipelines.serving.messages import encode, parse_message
+from pipelines.serving.messages import FrameMessage, encode, parse_message
 from pipelines.serving.reordering import Reordering
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_of
@@ -51,7 +50,7 @@ def test_a_frame_is_read_with_all_its_fields():
         }
     )  # fmt: skip
     message = parse_message(line, SETTINGS)
-    assert not isinstance(message, str)
+    assert isinstance(message, FrameMessage)
     assert message.seq == 3
     read = message.frame
     assert (read.timestamp, read.sensor, read.coordinates) == (1.5, "radar", "ego")
@@ -200,15 +199,6 @@ def test_a_frame_from_another_time_does_not_wait_and_moves_no_clock():
     assert [buffer.push(t, k) for k, t in enumerate([5.0, 5.5, 100.0, 5.2, -50.0])] == [[], [], [0, 1, 2], [], [3, 4]]
     buffer.set_clock(100.0)
     assert [buffer.push(t, k) for k, t in enumerate([100.2, 5.0, 101.5])] == [[], [0, 1], []]
-
-
-@given(st.lists(st.floats(1e-5, 1e3), min_size=1, max_size=200), st.sampled_from([50.0, 90.0, 99.0]))
-def test_percentiles_are_right_to_two_percent(seconds, percent):
-    latencies = Latencies()
-    for s in seconds:
-        latencies.add(s)
-    exact = float(np.percentile(seconds, percent, method="inverted_cdf"))
-    assert latencies.percentile(percent) == pytest.approx(exact, rel=0.02)
 
 
 def test_a_pipe_is_served_to_its_end():

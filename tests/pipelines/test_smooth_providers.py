@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
 from data_tools.datasets.label_table import read_label_table
 from pipelines.cli import app
-from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream
+from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
 
 MODULE = """
 from functools import partial
@@ -83,12 +83,12 @@ def test_a_wall_of_the_configuration_moves_the_labels(walkers: Path) -> None:
     assert "provider broken: no wall is known" in run.output
 
 
-def test_in_stretches_and_from_python_it_is_the_same(walkers: Path) -> None:
+def test_in_chunks_and_from_python_it_is_the_same(walkers: Path) -> None:
     from walls_of_this_test import Wall
 
     config = load_smooth_config("file", configuration(walkers.parent, "Wall"))
     parts = read_scenes_in_parts(walkers, 20)
-    (run,) = smooth_stream(parts, config, walkers.parent, stretches=StretchSettings(length=5.0, margin=5.0))
+    (run,) = smooth_stream(parts, config, walkers.parent, chunks=ChunkSettings(length=5.0, margin=5.0))
     streamed = [moment.tracks for _, part in run.spool.labels() for moment in part]
     scene = read_detections(walkers).scene("drive")
     for whole in (smooth_scene(scene, config), smooth_scene(scene, load_smooth_config("file"), providers=[Wall()])):

@@ -12,10 +12,9 @@ from typer.testing import CliRunner
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
 from data_tools.datasets.label_table import read_label_table
 from pipelines.cli import app
-from pipelines.smoothing import StretchSettings, load_smooth_config, smooth_scene, smooth_stream
-from pipelines.smoothing.identities import Identities
-from pipelines.smoothing.lifetimes import Lifetimes
-from pipelines.smoothing.stretches import Backlog, TrackedFrame
+from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
+from pipelines.smoothing.chunks import Backlog, TrackedFrame
+from pipelines.smoothing.object_summaries import Identities, ObjectSummaries
 from saga_fg import Detections, Frame, InputError
 
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"
@@ -43,11 +42,11 @@ def write(path: Path, rows: list[str], header: str = HEADER) -> Path:
     return path
 
 
-def test_stretches_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
+def test_chunks_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
     path, config = write(tmp_path / "drive.csv", drive()), load_smooth_config("file")
     whole = smooth_scene(read_detections(path).scene("drive"), config)
     (run,) = smooth_stream(
-        read_scenes_in_parts(path, 60), config, tmp_path, stretches=StretchSettings(length=5.0, margin=6.0)
+        read_scenes_in_parts(path, 60), config, tmp_path, chunks=ChunkSettings(length=5.0, margin=6.0)
     )
     assert len(list(tmp_path.glob("000000/*.npz"))) == 3  # it was cut
     assert run.frames == whole.frames
@@ -70,14 +69,14 @@ def test_stretches_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pause", ["frames without detections", "no frames", "no frames for years"])
-def test_stretches_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
+def test_chunks_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
     later = 1e8 if pause == "no frames for years" else 100.0
     rows = [f"{t},car,5,5,4,2,1.5,0,0.8" for t in (*np.arange(0, 4, 0.5), *np.arange(later, later + 4, 0.5))]
     if pause == "frames without detections":
         rows[8:8] = [f"{t},,,,,,,," for t in np.arange(4, later, 0.5)]
     path = write(tmp_path / "yard.csv", rows)
     (run,) = smooth_stream(
-        read_scenes_in_parts(path, 5), load_smooth_config("file"), tmp_path, stretches=StretchSettings(5.0, 6.0)
+        read_scenes_in_parts(path, 5), load_smooth_config("file"), tmp_path, chunks=ChunkSettings(5.0, 6.0)
     )
     moments = [moment.tracks for _, part in run.spool.labels() for moment in part]
     seen = [len(tracks) for tracks in moments if tracks.timestamp < 4 or tracks.timestamp >= later]
@@ -119,7 +118,7 @@ def test_poses_are_given_in_all_parts_or_in_none(tmp_path: Path) -> None:
         list(read_scenes_in_parts(path, 1))
 
 
-def backlog(detections: int, seconds: int, settings: StretchSettings) -> Backlog:
+def backlog(detections: int, seconds: int, settings: ChunkSettings) -> Backlog:
     """A frame a second with so many detections each."""
     backlog, nothing = Backlog(settings), Frame(0.0, "lidar", Detections.empty())
     times = np.arange(float(seconds))
@@ -129,11 +128,11 @@ def backlog(detections: int, seconds: int, settings: StretchSettings) -> Backlog
 
 
 @pytest.mark.parametrize(("detections", "ends"), [(1, [20, 40]), (10, [9, 18, 27, 36]), (1000, [5, 10, 15])])
-def test_crowds_are_cut_into_shorter_stretches(detections: int, ends: list[int]) -> None:
-    settings = StretchSettings(length=20.0, margin=5.0, detections=100, shortest=5.0)
+def test_crowds_are_cut_into_shorter_chunks(detections: int, ends: list[int]) -> None:
+    settings = ChunkSettings(length=20.0, margin=5.0, detections=100, shortest=5.0)
     known = backlog(detections, 60, settings)
     spans = []
-    for begin, end in known.stretches(until=59.0):
+    for begin, end in known.chunks(until=59.0):
         frames, wanted = known.around(begin, end)
         assert [frame.time for frame in frames] == wanted.tolist()
         assert wanted[0] == max(0.0, begin - 5.0)
@@ -141,11 +140,11 @@ def test_crowds_are_cut_into_shorter_stretches(detections: int, ends: list[int])
         spans.append((begin, end))
     assert [end for _, end in spans][: len(ends)] == ends
     assert [begin for begin, _ in spans[1:]] == [end for _, end in spans[:-1]]
-    (last,) = list(known.stretches(until=np.inf))[-1:]
+    (last,) = list(known.chunks(until=np.inf))[-1:]
     assert last[1] == np.inf
 
 
-def test_an_object_keeps_its_name_from_stretch_to_stretch() -> None:
+def test_an_object_keeps_its_name_from_chunk_to_chunk() -> None:
     identities = Identities()
     track_of = np.array([1, 1, 2, 2, 3])
     times = np.array([0.0, 1.0, 2.0, 9.0, 9.5])
@@ -153,7 +152,7 @@ def test_an_object_keeps_its_name_from_stretch_to_stretch() -> None:
     names = identities.name(np.array([1, 3]), one_and_two, track_of, times, (0.0, 10.0))
     assert names == {1: 1, 3: 3}
     assert identities.joined == 1
-    late = slice(3, None)  # the next stretch sees the second tracklet alone
+    late = slice(3, None)  # the next chunk sees the second tracklet alone
     names = identities.name(np.array([2, 3]), track_of[late], track_of[late], times[late], (10.0, 20.0))
     assert names == {2: 1, 3: 3}
     other = np.array([-1, -1, 0, 0, 3])  # or takes it for the end of another, which begins at the edge of what it sees
@@ -172,20 +171,20 @@ def test_objects_that_were_one_have_names_of_their_own_when_they_part() -> None:
     assert apart == {2: 9, 9: 2}
 
 
-def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
-    lifetimes = Lifetimes()
+def test_what_lasts_of_an_object_is_gathered_over_its_chunks() -> None:
+    summaries = ObjectSummaries()
     for size, probability, looks in ((4.0, 0.5, 3), (4.2, 0.9, 2), (9.0, 0.1, 5)):
-        lifetimes.seen(7, np.array([probability]), np.array([[size, 2.0, np.nan]]), np.array([probability]))
-        lifetimes.seen(7, np.array([probability]), np.array([[size, 2.0, 1.5]]), np.array([probability]))
-        lifetimes.looked(7, looks)
-    lifetimes.given_out(7, lifetimes.turned(7, 0.1), yaw=0.1, path=-3.0, votes=3.0)
-    assert lifetimes.turned(7, 0.2) == 1
-    turned = lifetimes.turned(7, 0.1 - np.pi)  # the next stretch sees it the other way round
+        summaries.add_detections(7, np.array([probability]), np.array([[size, 2.0, np.nan]]), np.array([probability]))
+        summaries.add_detections(7, np.array([probability]), np.array([[size, 2.0, 1.5]]), np.array([probability]))
+        summaries.add_opportunities(7, looks)
+    summaries.add_headings(7, summaries.heading_sign(7, 0.1), yaw=0.1, path=-3.0, votes=3.0)
+    assert summaries.heading_sign(7, 0.2) == 1
+    turned = summaries.heading_sign(7, 0.1 - np.pi)  # the next chunk sees it the other way round
     assert turned == -1
-    lifetimes.given_out(7, turned, yaw=0.1 - np.pi, path=12.0, votes=1.0)
-    lifetimes.retire(np.array([7]))
-    lifetimes.retire(np.array([], dtype=np.int64))
-    size, score, backwards = lifetimes.lasting(7, prior_looks=2.0)
+    summaries.add_headings(7, turned, yaw=0.1 - np.pi, path=12.0, votes=1.0)
+    summaries.close(np.array([7]))
+    summaries.close(np.array([], dtype=np.int64))
+    size, score, backwards = summaries.attributes(7, prior=2.0)
     assert 4.0 < size[0] < 4.2  # the far guess of 9 m does not count for more than its weight
     assert size[1:] == pytest.approx([2.0, 1.5])
     assert score == pytest.approx(3.0 / 12)
@@ -195,8 +194,8 @@ def test_what_lasts_of_an_object_is_gathered_over_its_stretches() -> None:
 def test_many_values_are_kept_by_their_weights() -> None:
     rng = np.random.default_rng(0)
     sizes = rng.normal([4.5, 1.8, 1.5], 0.1, (20_000, 3))
-    lifetimes = Lifetimes()
+    summaries = ObjectSummaries()
     for part in np.split(sizes, 20):
-        lifetimes.seen(0, np.ones(1000), part, np.ones(1000))
-    lifetimes.retire(np.array([], dtype=np.int64))
-    np.testing.assert_allclose(lifetimes.lasting(0, 1.0).size, np.median(sizes, axis=0), atol=1e-3)
+        summaries.add_detections(0, np.ones(1000), part, np.ones(1000))
+    summaries.close(np.array([], dtype=np.int64))
+    np.testing.assert_allclose(summaries.attributes(0, 1.0).size, np.median(sizes, axis=0), atol=1e-3)

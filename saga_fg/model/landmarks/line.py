@@ -21,8 +21,8 @@ class LineLandmark(Settings):
     ends across the line, m.
     """
 
-    name: str = setting("road line", "what it is called in files")
-    density: Positive = setting(0.2, "landmarks per rad m")
+    name: str = setting("road line", "name in files")
+    density: Positive = setting(0.2, "expected density of landmarks, 1/(rad m); higher: new landmarks are begun sooner")
 
     @property
     def pose(self) -> SpatialPose:

@@ -18,8 +18,10 @@ from saga_fg.settings import Positive, Settings, setting
 class PlaneLandmark(Settings):
     """A plane, observed as (n, d) (4,) in the frame of the pose; its noise is that of two turns (rad) and d (m)."""
 
-    name: str = setting("plane", "what it is called in files")
-    density: Positive = setting(0.05, "landmarks per rad^2 m")
+    name: str = setting("plane", "name in files")
+    density: Positive = setting(
+        0.05, "expected density of landmarks, 1/(rad^2 m); higher: new landmarks are begun sooner"
+    )
 
     @property
     def pose(self) -> SpatialPose:

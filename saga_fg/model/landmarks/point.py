@@ -14,9 +14,11 @@ from saga_fg.settings import Positive, Settings, setting
 class PointLandmark(Settings):
     """A point, observed as its place (dim,) in the frame of the pose."""
 
-    dim: int = setting(2, "2 in the plane, 3 in space")
-    name: str = setting("point", "what it is called in files")
-    density: Positive = setting(0.02, "landmarks per m^2, or m^3")
+    dim: int = setting(2, "dimension: 2 in the plane, 3 in space")
+    name: str = setting("point", "name in files")
+    density: Positive = setting(
+        0.02, "expected density of landmarks, 1/m^2, or 1/m^3; higher: new landmarks are begun sooner"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,8 +13,8 @@ from saga_fg.settings import Positive, Settings, setting
 class PoleLandmark(Settings):
     """A pole, observed as a point (3,) on it in the frame of the pose; its noise is that ahead and to the left."""
 
-    name: str = setting("pole", "what it is called in files")
-    density: Positive = setting(0.02, "landmarks per m^2")
+    name: str = setting("pole", "name in files")
+    density: Positive = setting(0.02, "expected density of landmarks, 1/m^2; higher: new landmarks are begun sooner")
 
     @property
     def pose(self) -> SpatialPose:

@@ -53,9 +53,11 @@ class ConeLine:
     """Vehicles ahead of which cones form a line pass it on its free side."""
 
     cones: ConeGeometry = settings_group(ConeGeometry, "which cones concern a vehicle, and how it passes them")
-    rate: NonNegative = setting(3.0, "strength of the edges of a vehicle that has to be pushed, 1/s")
-    band: PositiveOrInf = setting(0.5, "sigma of the kernel on the distance from where the line is just cleared, m")
-    vehicles: tuple[str, ...] = setting(VEHICLES, "classes that are pushed")
+    rate: NonNegative = setting(3.0, "strength of an edge of a vehicle that has to move aside, 1/s")
+    clearance_scale: PositiveOrInf = setting(
+        0.5, "sigma of the kernel on the distance to where the line is just cleared, m"
+    )
+    vehicles: tuple[str, ...] = setting(VEHICLES, "classes that move aside")
 
     @property
     def interaction(self) -> PassCones:
@@ -77,7 +79,7 @@ class ConeLine:
         gap = np.maximum(line.ahead[rows, far] - line.ahead[rows, near], 1e-9)
         share = np.where(far > near, (distance[rows] - line.ahead[rows, near]) / gap, 0.0)
         demand = (1 - share) * line.demand[rows, near] + share * line.demand[rows, far]
-        rate = self.rate * np.exp(-((np.minimum(demand, 0.0) / self.band) ** 2) / 2)
+        rate = self.rate * np.exp(-((np.minimum(demand, 0.0) / self.clearance_scale) ** 2) / 2)
         apart = far > near
         return Pairs(
             vehicles[np.concatenate([rows, rows[apart]])],

@@ -38,9 +38,9 @@ class KeepLane(Settings):
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     offset_time: PositiveOrInf = setting(
-        3.0, "tau: time over which an offset from the centre is made good, s; .inf for never"
+        3.0, "tau: time constant with which an offset from the centre line fades, s; usual 2 to 5; .inf: never"
     )
-    lag: NonNegative = setting(0.5, "time that vehicles look ahead along the lane, s")
+    lag: NonNegative = setting(0.5, "time by which vehicles look ahead along the lane, s")
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         across, constant = np.zeros((len(target), 2, 2)), np.zeros((len(target), 2))
@@ -64,13 +64,13 @@ class InLane(Settings):
     """A vehicle that drives along a lane of the map, within its borders, keeps it."""
 
     interaction: KeepLane = settings_group(KeepLane, "interaction function of the edges")
-    rate: NonNegative = setting(2.0, "strength of an edge, 1/s")
-    drift_scale: PositiveOrInf = setting(
-        0.8, "sigma of the kernel on the speed across the lane, m/s: who leaves it is let go"
+    rate: NonNegative = setting(2.0, "strength of an edge, 1/s; higher: vehicles keep their lane more strictly")
+    lateral_speed_scale: PositiveOrInf = setting(
+        0.8, "sigma of the kernel on the speed across the lane, m/s; lower: vehicles that leave it are let go sooner"
     )
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
     cones: ConeGeometry | None = settings_group(
-        lambda: None, "who is pushed out of the lane by cones does not keep it; null: cones play no part"
+        lambda: None, "vehicles that these cones push out of the lane do not keep it; null: ignore cones"
     )
 
     def pairs(self, nodes: NodeTable) -> Pairs:
@@ -89,7 +89,7 @@ class InLane(Settings):
             mine = vehicles[inside]
             targets.append(mine)
             sources.append(np.full(len(mine), lane, dtype=np.int64))
-            rates.append(self.rate * np.exp(-((drift[inside] / self.drift_scale) ** 2) / 2))
+            rates.append(self.rate * np.exp(-((drift[inside] / self.lateral_speed_scale) ** 2) / 2))
         return Pairs(np.concatenate(targets), np.concatenate(sources), np.concatenate(rates))
 
 

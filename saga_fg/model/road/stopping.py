@@ -10,10 +10,10 @@ Linearised at the estimate (v0, g0):
 
 The rule: of the vehicles that come to a line, the first of each lane that can still stop, at
 
-    rate = rate  closed_j  ramp( v^2 / (2 g) from `noticed` to `firm` )
+    rate = rate  closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
 
-since drivers do not brake for a line far away; a vehicle that would have to brake harder than `hardest` goes on. Those
-behind follow by other interactions. A vehicle approaches a line along its lane of the map, or without lanes straight
+since drivers do not brake for a line far away; a vehicle that would have to brake harder than `max_deceleration` goes
+on. Those behind follow by other interactions. A vehicle approaches a line along its lane of the map, or without lanes straight
 along its heading. Alternatively the line is a stationary leader of the Intelligent Driver Model
 (`saga_fg.model.intelligent_driver`): the vehicle brakes later and harder, and a slow one creeps up to the line.
 """
@@ -82,7 +82,9 @@ class Stopping(Settings):
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
     time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
-    margin: NonNegative = setting(3.0, "way left between the front of a vehicle and the line's middle at the halt, m")
+    margin: NonNegative = setting(
+        3.0, "distance left between the front of a stopped vehicle and the line, m; usual 1 to 5"
+    )
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """g (E,), m, for ways (E,) from the centres to the line."""
@@ -100,7 +102,9 @@ class DriverStopping:
     """Coming to a line as to the end of a queue; the source is the line."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    driver: IntelligentDriver = settings_group(IntelligentDriver, "how he drives; his standstill gap is to the line")
+    driver: IntelligentDriver = settings_group(
+        IntelligentDriver, "parameters of the driver; its standstill gap is to the line"
+    )
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """Gap (E,), m, for ways (E,) from the centres to the line."""
@@ -118,7 +122,9 @@ class SmoothStopping:
     """Coming to a line as to the end of a queue, without corners in the law; the source is the line."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    driver: IntelligentDriver = settings_group(IntelligentDriver, "how he drives; `room` plays no part")
+    driver: IntelligentDriver = settings_group(
+        IntelligentDriver, "parameters of the driver; `hidden_vehicle_gap` is not used"
+    )
 
     @property
     def time_constant(self) -> float:
@@ -155,12 +161,14 @@ class RedLight(Settings):
     interaction: Stopping | DriverStopping | SmoothStopping = settings_group(
         Stopping, "interaction function of the edges"
     )
-    rate: NonNegative = setting(1.0, "strength of an edge of a vehicle that brakes for a line surely closed, 1/s")
-    max_distance: NonNegative = setting(100.0, "nobody brakes for a line further away, m")
-    noticed: NonNegative = setting(0.3, "needed deceleration from which drivers begin to react, m/s^2")
-    firm: Positive = setting(1.0, "needed deceleration from which they brake as much as is needed, m/s^2")
-    hardest: Positive = setting(4.5, "who would have to brake harder does not stop, m/s^2")
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that take part")
+    rate: NonNegative = setting(
+        1.0, "strength of an edge of a vehicle that brakes for a line that is surely closed, 1/s"
+    )
+    max_distance: NonNegative = setting(100.0, "no edge from a line further away, m")
+    reaction_deceleration: NonNegative = setting(0.3, "needed deceleration at which drivers begin to react, m/s^2")
+    full_deceleration: Positive = setting(1.0, "needed deceleration from which they brake fully, m/s^2")
+    max_deceleration: Positive = setting(4.5, "drivers who would have to brake harder do not stop, m/s^2")
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         lines = np.flatnonzero(nodes.label == STOP_LINE)
@@ -173,12 +181,17 @@ class RedLight(Settings):
         ways = approach(nodes, target, source)
         v = speed_along(nodes, target, ways.direction)
         front = ways.way - nodes.length[target] / 2  # of the vehicle, before the line
-        stops = np.flatnonzero(ways.comes & (front > 0) & (v**2 <= 2 * self.hardest * front))
+        stops = np.flatnonzero(ways.comes & (front > 0) & (v**2 <= 2 * self.max_deceleration * front))
         preceded = _in_one_lane(source[stops], ways.crossing[stops]) & (ways.way[stops] < ways.way[stops, None])
         first = stops[~preceded.any(axis=1)]
         target, source, v = target[first], source[first], v[first]
         g = self.interaction.gap(nodes, target, ways.way[first])
-        ramp = np.clip((v**2 / (2 * g) - self.noticed) / max(self.firm - self.noticed, 1e-9), 0.0, 1.0)
+        ramp = np.clip(
+            (v**2 / (2 * g) - self.reaction_deceleration)
+            / max(self.full_deceleration - self.reaction_deceleration, 1e-9),
+            0.0,
+            1.0,
+        )
         return Pairs(target, source, self.rate * nodes.closed[source] * ramp)
 
 

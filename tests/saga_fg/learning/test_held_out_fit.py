@@ -53,13 +53,13 @@ def test_what_raises_them_is_left_out_and_the_classical_filter_remains():
 def test_what_is_wrong_in_view_alone_acts_on_what_is_hidden():
     stiff = dataclasses.replace(FOLLOW, rate=4.0)
     (rule,) = fitted(teaches(stiff, explained_noise=3.0)).rules
-    assert rule.news == HIDDEN
+    assert rule.information_gain == HIDDEN
 
 
 def test_trackers_are_given_edges_that_leave_what_is_in_view_alone():
     recordings = [following_pairs(pairs=2, moments=45, seed=seed) for seed in (0, 1)]
     found = fit_by_held_out(recordings, ("car",), OWN, teaches(FOLLOW), SHORT, FORMS_OF_TRACKERS)
-    assert found.rules == (dataclasses.replace(FOLLOW, news=HIDDEN),)
+    assert found.rules == (dataclasses.replace(FOLLOW, information_gain=HIDDEN),)
     assert found.acceleration_noise == OWN.acceleration_noise
 
 

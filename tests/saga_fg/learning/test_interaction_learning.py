@@ -133,7 +133,7 @@ def test_edges_that_tell_the_hidden_alone_leave_those_in_view_to_their_measureme
     filtered, sample = gaps_of(trajectories)
 
     def errors(news):
-        rule = dataclasses.replace(FOLLOW, rate=RATE, news=news)
+        rule = dataclasses.replace(FOLLOW, rate=RATE, information_gain=news)
         return JointGaps(trajectories, filtered, {"default": 1.5}, 0.005, (rule,)).errors(sample, GapSettings())
 
     kf, hidden, nobody = (

@@ -78,13 +78,16 @@ def test_an_edge_counts_as_its_source_would_as_a_measurement_of_the_target(sprea
     plain = Neighbours()
     for s_i, s_j in ((0.1, 0.1), (9.0, 0.1), (0.1, 9.0)):
         known = replace(nodes, velocity_variance=np.array([s_i, s_j]))
-        rate, full = edges(replace(plain, news=EdgeInformation(spread)).pairs(known)), edges(plain.pairs(known))
+        rate, full = (
+            edges(replace(plain, information_gain=EdgeInformation(spread)).pairs(known)),
+            edges(plain.pairs(known)),
+        )
         assert rate[0][1] == pytest.approx(full[0][1] * s_i / (s_i + s_j + spread**2))
         assert rate[1][0] == pytest.approx(full[1][0] * s_j / (s_i + s_j + spread**2))
 
 
 def test_a_follower_listens_to_its_leader_once_nobody_sees_it():
-    rule, nodes = Following(news=EdgeInformation(1.0, unseen_acceleration=2.0)), table(*straight(2))
+    rule, nodes = Following(information_gain=EdgeInformation(1.0, unseen_acceleration=2.0)), table(*straight(2))
     known = replace(nodes, velocity_variance=np.full(2, 0.1))
     seen, hidden = (rule.pairs(replace(known, unseen=np.array([0.0, t]))).rate[0] for t in (0.0, 3.0))
     full = Following().pairs(known).rate[0]
@@ -96,7 +99,7 @@ def test_a_follower_listens_to_its_leader_once_nobody_sees_it():
 
 def test_of_two_certain_nodes_neither_learns():
     nodes = replace(table([[0.0, 0.0], [3.0, 0.0]], 0.0), velocity_variance=np.zeros(2))
-    assert Neighbours(news=EdgeInformation(0.0)).pairs(nodes).rate.tolist() == [0.0, 0.0]
+    assert Neighbours(information_gain=EdgeInformation(0.0)).pairs(nodes).rate.tolist() == [0.0, 0.0]
 
 
 # following
@@ -333,8 +336,8 @@ def test_who_leads_may_be_those_that_move_or_those_that_stand():
     nodes = replace(nodes, has_moved=np.array([True, False, True]))
     assert leaders(Following().pairs(nodes)) == {2: 1}
     assert leaders(Following(leaders="moving").pairs(nodes)) == {2: 0}
-    assert leaders(Following(leaders="standing").pairs(nodes)) == {2: 1}
-    with pytest.raises(InputError, match="leaders: expected one of any, moving, standing"):
+    assert leaders(Following(leaders="stationary").pairs(nodes)) == {2: 1}
+    with pytest.raises(InputError, match="leaders: expected one of any, moving, stationary"):
         Following(leaders="parked")
 
 

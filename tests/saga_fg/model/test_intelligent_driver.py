@@ -15,7 +15,9 @@ from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.road.stopping import DriverStopping, RedLight
 from saga_fg.model.stability import require_stable
 
-DRIVER = IntelligentDriver(free_speed=14.0, headway=1.2, acceleration=1.5, deceleration=2.0, room=math.inf)
+DRIVER = IntelligentDriver(
+    free_speed=14.0, headway=1.2, acceleration=1.5, deceleration=2.0, hidden_vehicle_gap=math.inf
+)
 speeds, gaps = st.floats(0, 16), st.floats(0.6, 80)
 
 
@@ -49,8 +51,8 @@ def test_in_equilibrium_nobody_accelerates(v):
 @given(v=speeds, s=gaps, w=speeds)
 def test_drivers_brake_within_limits_and_never_backwards(v, s, w):
     braking = -value(DRIVER.following, v, s, w)
-    assert braking <= DRIVER.hardest + 1e-9
-    assert braking <= v / DRIVER.halt_time + 1e-9
+    assert braking <= DRIVER.max_deceleration + 1e-9
+    assert braking <= v / DRIVER.stop_time + 1e-9
 
 
 def test_who_stands_behind_one_who_stands_stays():
@@ -62,17 +64,17 @@ def test_who_stands_behind_one_who_stands_stays():
 
 @given(v=speeds, w=speeds, s=st.floats(7, 80))
 def test_nobody_speeds_up_into_a_gap_with_room_for_another(v, w, s):
-    driver = IntelligentDriver(room=7.0)
+    driver = IntelligentDriver(hidden_vehicle_gap=7.0)
     assert value(driver.following, v, s, w) <= w - v + 1e-9
     assert value(driver.stopping, v, s) <= 0
     close = value(driver.following, v, 6.9, w)
-    assert close == value(IntelligentDriver(room=math.inf).following, v, 6.9, w)
+    assert close == value(IntelligentDriver(hidden_vehicle_gap=math.inf).following, v, 6.9, w)
 
 
 def test_a_queue_comes_to_a_halt_before_the_line():
     """Step by step along the graph, as in a prediction: all stand at last, in order, none beyond the line."""
     rules = [
-        RedLight(interaction=DriverStopping(driver=DRIVER), noticed=0.0, firm=1e-3),
+        RedLight(interaction=DriverStopping(driver=DRIVER), reaction_deceleration=0.0, full_deceleration=1e-3),
         Following(interaction=DRIVER, gap_scale=math.inf, max_gap=80.0, parked=True),
     ]
     nodes = queue()
@@ -92,7 +94,7 @@ def test_a_queue_comes_to_a_halt_before_the_line():
 
 def test_a_vehicle_tracked_twice_does_not_lead_itself():
     rows = [("car", 0, 0, 8, 0, 5), ("car", 2, 0, 8, 0, 5), ("car", 20, 0, 8, 0, 5)]
-    led = Following(interaction=DRIVER, apart=0.8).pairs(table(rows))
+    led = Following(interaction=DRIVER, min_separation=0.8).pairs(table(rows))
     assert dict(zip(led.target.tolist(), led.source.tolist(), strict=True)) == {0: 2, 1: 2}
 
 

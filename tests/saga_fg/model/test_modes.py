@@ -14,8 +14,8 @@ from saga_fg.model.modes import Mixture, ModeTable, Stationary, mode_dynamics
 from saga_fg.model.turning import CoordinatedTurn
 from tests.saga_fg.model.test_nonlinear_motion import BACK_ENDS
 
-LINEAR = Mixture((Stationary(), ConstantVelocity(2.0)), stay=3.0)
-TURNING = Mixture((Stationary(), ConstantVelocity(0.5), CoordinatedTurn(0.5, 0.05)), stay=3.0)
+LINEAR = Mixture((Stationary(), ConstantVelocity(2.0)), dwell_time=3.0)
+TURNING = Mixture((Stationary(), ConstantVelocity(0.5), CoordinatedTurn(0.5, 0.05)), dwell_time=3.0)
 H = np.eye(2, 5)
 
 
@@ -244,5 +244,5 @@ def test_late_measurements_split_the_interval_of_a_mixture():
 def test_settings_out_of_range_are_refused():
     with pytest.raises(InputError, match="at least two"):
         Mixture((Stationary(),))
-    with pytest.raises(InputError, match="stay"):
-        Mixture(stay=0.0)
+    with pytest.raises(InputError, match="dwell_time"):
+        Mixture(dwell_time=0.0)

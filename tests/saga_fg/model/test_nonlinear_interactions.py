@@ -14,7 +14,10 @@ def test_the_round_corners_are_close_to_the_model_away_from_them():
     driver = IntelligentDriver()
     v, s, w = np.array([8.0, 10.0, 6.0]), np.array([15.0, 30.0, 20.0]), np.array([8.0, 9.0, 6.5])
     np.testing.assert_allclose(smooth_acceleration(driver, v, s, w).value, driver.alone(v, s, w).value, atol=0.02)
-    assert smooth_acceleration(driver, np.array(15.0), np.array(0.1), np.array(0.0)).value > -driver.hardest - 0.01
+    assert (
+        smooth_acceleration(driver, np.array(15.0), np.array(0.1), np.array(0.0)).value
+        > -driver.max_deceleration - 0.01
+    )
 
 
 def test_nobody_drives_backwards_however_close_the_leader_stands():
@@ -67,7 +70,7 @@ PIECES = np.array([[-5.0, 0.0, 0.0, 1.0], [0.0, 1.0, 4.0, 0.0]])  # a wall with 
 GIVEN = {
     "driver": (SmoothDriver(), np.array(4.0)),
     "at a line": (SmoothStopping(), np.array([0.6, 0.8, -3.0])),
-    "standing": (SmoothDriver(IntelligentDriver(halt_time=0.3)), np.array(9.0)),
+    "standing": (SmoothDriver(IntelligentDriver(stop_time=0.3)), np.array(9.0)),
     "wall": (SocialForce(), PIECES),
 }
 

@@ -174,7 +174,7 @@ def test_the_way_to_a_line_is_along_the_lane():
     assert RedLight().pairs(with_line).target.tolist() == [0]
     at = feet(lane, nodes.position[:1])
     arc, speed = 50 * 1.2 - 1 - at.s[0], 8.0 * (at.direction[0] @ (np.cos(0.2), np.sin(0.2)))
-    rule = RedLight(firm=0.3)
+    rule = RedLight(full_deceleration=0.3)
     expected = -(speed**2) / (2 * (arc - 2 - rule.interaction.margin))
     assert pull(with_line, rule)[0] @ at.direction[0] == pytest.approx(expected, rel=1e-3)  # an arc of chords
 

@@ -11,12 +11,11 @@ from saga_fg.smoothing import (
     QualitySettings,
     StateTable,
     constant_sizes,
-    previous_rows,
     quality_of,
     scalar_readings,
     smooth_walks,
 )
-from saga_fg.smoothing.sizes import weighted_medians
+from saga_fg.smoothing.boxes import weighted_medians
 
 
 def chain(moments: int, objects: int = 1) -> StateTable:
@@ -79,7 +78,7 @@ def test_readings_modulo_half_a_turn_ignore_flips() -> None:
 
 def test_objects_do_not_mix_and_rows_may_repeat() -> None:
     states = chain(2, objects=2)
-    assert previous_rows(states).tolist() == [-1, -1, 0, 1]
+    assert states.previous.tolist() == [-1, -1, 0, 1]
     readings = scalar_readings(np.array([0, 0, 3]), np.array([1.0, 3.0, 9.0]), np.ones(3))
     mean, _ = smooth_walks(states, np.zeros(4), readings)
     assert mean.tolist() == [2.0, 9.0, 2.0, 9.0]

@@ -12,20 +12,20 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
     JoiningSettings,
-    Lives,
+    Lifespans,
     OfflineClass,
     SmoothedEdges,
     StateTable,
     StationarySettings,
-    claim_detections,
+    assign_free_detections,
     evidence_scores,
+    frame_rate,
     gather_evidence,
-    join_tracklets,
-    lives_of_evidence,
-    look_rate,
+    lifespans_of,
     smooth_headings,
     smooth_states,
-    standing_states,
+    stationary_states,
+    stitch_tracklets,
 )
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
@@ -59,12 +59,14 @@ def line(first: int, last: int, start: tuple[float, float], velocity: tuple[floa
 
 def joined(paths: dict[int, FloatArray], settings: JoiningSettings | None = None) -> dict[int, int]:
     evidence, numbers = gathered(paths)
-    lives = lives_of_evidence(numbers, evidence.boxes.label, evidence.moment)
-    prior = np.tile(25.0 * np.eye(2), (len(lives), 1, 1))
+    lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
+    prior = np.tile(25.0 * np.eye(2), (len(lifespans), 1, 1))
     settings = settings or JoiningSettings()
-    longer = lives.reaching(evidence.times, 1.0, settings.max_gap)
+    longer = lifespans.reaching(evidence.times, 1.0, settings.max_gap)
     states = smooth_states(evidence, numbers, longer, prior, CLASSES)
-    return dict(zip(lives.id.tolist(), join_tracklets(lives, states, prior, evidence, settings).tolist(), strict=True))
+    return dict(
+        zip(lifespans.id.tolist(), stitch_tracklets(lifespans, states, prior, evidence, settings).tolist(), strict=True)
+    )
 
 
 def test_tracklets_of_one_motion_are_one_object_over_several_gaps() -> None:
@@ -90,11 +92,11 @@ def test_what_moves_otherwise_or_comes_too_late_is_new() -> None:
 def test_an_object_claims_detections_before_its_birth_but_not_those_of_others() -> None:
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (5, 0)), 1: line(0, 19, (0, 20), (5, 0))})
     tracked = np.where(evidence.moment < 2, -1, numbers)
-    lives = lives_of_evidence(tracked, evidence.boxes.label, evidence.moment)
+    lifespans = lifespans_of(tracked, evidence.boxes.label, evidence.moment)
     prior = np.tile(25.0 * np.eye(2), (2, 1, 1))
-    states = smooth_states(evidence, tracked, lives.reaching(evidence.times, 1.5, 0.0), prior, CLASSES)
-    assert claim_detections(evidence, tracked, lives, states, 0.99, 3.0).tolist() == numbers.tolist()
-    assert claim_detections(evidence, tracked, lives, states, 0.0, 3.0).tolist() == tracked.tolist()
+    states = smooth_states(evidence, tracked, lifespans.reaching(evidence.times, 1.5, 0.0), prior, CLASSES)
+    assert assign_free_detections(evidence, tracked, lifespans, states, 0.99, 3.0).tolist() == numbers.tolist()
+    assert assign_free_detections(evidence, tracked, lifespans, states, 0.0, 3.0).tolist() == tracked.tolist()
 
 
 def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
@@ -103,31 +105,31 @@ def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
     waits = np.where(TIMES[:, None] < 4, [[0.0, 20.0]], [[0.0, 20.0]] + 4.0 * (TIMES[:, None] - 4) * [[1.0, 0.0]])
     paths = {0: noise, 1: waits + noise, 2: line(0, 19, (0, 40), (0.3, 0)) + noise}
     evidence, numbers = gathered(paths)
-    lives = lives_of_evidence(numbers, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, numbers, lives, np.tile(25.0 * np.eye(2), (3, 1, 1)), CLASSES)
-    standing = standing_states(states, lives, evidence, numbers, StationarySettings(), CLASSES)
+    lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
+    states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (3, 1, 1)), CLASSES)
+    standing = stationary_states(states, lifespans, evidence, numbers, StationarySettings(), CLASSES)
     assert sorted(standing.moment[standing.id == 0].tolist()) == list(range(20))
     assert set(standing.moment[standing.id == 1].tolist()) <= set(range(9))
     assert (standing.id == 1).sum() >= 5
     assert (standing.id == 2).sum() == 0
 
 
-def test_a_score_is_the_mean_over_all_looks_and_those_of_the_prior() -> None:
+def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior() -> None:
     evidence, numbers = gathered({0: line(0, 9, (0, 0), (1, 0)), 1: line(5, 5, (0, 9), (0, 0))}, score=0.8)
-    lives = lives_of_evidence(numbers, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, numbers, lives, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
-    assert look_rate(evidence) == pytest.approx(2.0)
-    score = evidence_scores(evidence, numbers, lives, states, prior_time=1.0)
+    lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
+    states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
+    assert frame_rate(evidence) == pytest.approx(2.0)
+    score = evidence_scores(evidence, numbers, lifespans, states, prior_time=1.0)
     assert score.tolist() == pytest.approx([8.0 / 12.0, 0.8 / 3.0])
 
 
 def test_the_front_is_where_an_object_drives_else_what_most_detections_say() -> None:
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (-5, 0)), 1: line(0, 19, (0, 20), (0, 0))})
-    lives = lives_of_evidence(numbers, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, numbers, lives, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
+    lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
+    states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
     rows = np.arange(len(evidence))
     at = states.rows_of(evidence.moment, numbers)
-    found = smooth_headings(states, lives, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0))
+    found = smooth_headings(states, lifespans, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0))
     yaw, variance = found.yaw, found.variance
     assert np.allclose(np.cos(yaw[states.id == 0]), -1.0, atol=0.01)  # the detector says 0, the motion pi
     assert np.allclose(yaw[states.id == 1], 0.0, atol=1e-6)
@@ -135,11 +137,13 @@ def test_the_front_is_where_an_object_drives_else_what_most_detections_say() -> 
 
 
 def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own() -> None:
-    lives = Lives(np.array([1, 2, 5]), np.array(["car"] * 3), np.zeros(3, dtype=np.int64), np.ones(3, dtype=np.int64))
+    lifespans = Lifespans(
+        np.array([1, 2, 5]), np.array(["car"] * 3), np.zeros(3, dtype=np.int64), np.ones(3, dtype=np.int64)
+    )
     mean = np.array([[0.0, 0.0, 10.0, 0.0], [20.0, 0.0, 10.0, 0.0]])
     states = StateTable.of_moments([(0, np.array([1, 2]), mean, np.tile(0.01 * np.eye(4), (2, 1, 1)))])
     rules = (Following(interaction=SharedVelocity()),)
-    edges = SmoothedEdges.of(rules, 0.0, lives, states, np.zeros(3), np.full(3, 4.5))
+    edges = SmoothedEdges.of(rules, 0.0, lifespans, states, np.zeros(3), np.full(3, 4.5))
     graph = edges(0, np.array([5, 2, 1]), (NodeType("object", CLASSES["default"].motion),) * 3)
     assert sorted(graph.nodes.tolist()) == [1, 2, 5]
     (group,) = graph.edges

@@ -14,11 +14,11 @@ from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.smoothing import (
     SmoothedEdges,
-    Standing,
     StateTable,
     StationarySettings,
+    StationaryStates,
     gather_evidence,
-    lives_of_evidence,
+    lifespans_of,
     smooth_states,
 )
 from saga_fg.tracking import ClassSettings
@@ -83,15 +83,15 @@ def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
     near = {"default": ClassSettings(nms_distance=0.0)}
     evidence = gather_evidence(frames, np.array([1.7e9 + 7.25]), SENSORS, near)
     object_of = np.array(owner)
-    lives = lives_of_evidence(object_of, evidence.boxes.label, evidence.moment)
-    V, n = np.tile(25 * np.eye(2), (4, 1, 1)), len(lives)
-    alone = smooth_states(evidence, object_of, lives, V, CLASSES)
+    lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
+    V, n = np.tile(25 * np.eye(2), (4, 1, 1)), len(lifespans)
+    alone = smooth_states(evidence, object_of, lifespans, V, CLASSES)
     rules = (Neighbours(min_speed=0.2, classes=("pedestrian",)),)
-    edges = SmoothedEdges.of(rules, 0.0, lives, alone, np.full(n, np.nan), np.full(n, 0.5))
+    edges = SmoothedEdges.of(rules, 0.0, lifespans, alone, np.full(n, np.nan), np.full(n, 0.5))
     moments = np.arange(len(evidence.times))
-    stands = Standing(StationarySettings(), moments, np.full(len(moments), 2))
+    stands = StationaryStates(StationarySettings(), moments, np.full(len(moments), 2))
     weight = np.where(object_of == 1, 0.5, 1.0)
-    return smooth_states(evidence, object_of, lives, V, CLASSES, edges, weight, stands, providers)
+    return smooth_states(evidence, object_of, lifespans, V, CLASSES, edges, weight, stands, providers)
 
 
 def test_the_graph_is_the_problem_that_is_solved_without_providers() -> None:

@@ -1,4 +1,4 @@
-"""Lives, state tables and the batch over a recording."""
+"""Lifespans, state tables and the batch over a recording."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from saga_fg.model.node import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.smoothing import (
     Evidence,
-    Lives,
+    Lifespans,
     OfflineClass,
-    Standing,
     StateTable,
     StationarySettings,
+    StationaryStates,
     batch_states,
     gather_evidence,
-    lives_of_evidence,
+    lifespans_of,
     robust_weights,
     smooth_states,
 )
@@ -49,9 +49,9 @@ def test_an_object_alone_is_smoothed_as_by_the_textbook() -> None:
     times = np.cumsum(rng.uniform(0.1, 0.9, 12))
     path = np.stack([3.0 * times, np.sin(times)], axis=-1) + rng.normal(0, SIGMA, (12, 2))
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
-    lives = lives_of_evidence(np.zeros(12, dtype=np.int64), evidence.boxes.label, evidence.moment)
+    lifespans = lifespans_of(np.zeros(12, dtype=np.int64), evidence.boxes.label, evidence.moment)
     V = 25 * np.eye(2)
-    states = smooth_states(evidence, np.zeros(12, dtype=np.int64), lives, V[None], CLASSES)
+    states = smooth_states(evidence, np.zeros(12, dtype=np.int64), lifespans, V[None], CLASSES)
 
     prior = Gaussian(
         np.concatenate([evidence.boxes.position[0, :2], [0, 0]]),
@@ -79,27 +79,27 @@ def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypat
     evidence = evidence_of(times.tolist(), np.stack([path, path + 5], axis=1).tolist())
     owner = np.tile([0, 1], 260)
     owner[100:110] = -1  # both are hidden for a while
-    lives = lives_of_evidence(owner, evidence.boxes.label, evidence.moment)
+    lifespans = lifespans_of(owner, evidence.boxes.label, evidence.moment)
     V = np.tile(25 * np.eye(2), (2, 1, 1))
     windows = []
     final = WindowedSmoother.final
     monkeypatch.setattr(WindowedSmoother, "final", lambda self: windows.append(out := final(self)) or out)
-    in_windows = smooth_states(evidence, owner, lives, V, CLASSES)
+    in_windows = smooth_states(evidence, owner, lifespans, V, CLASSES)
     assert sum(map(len, windows)) > 200
     monkeypatch.setattr(batch_states, "LONG_RECORDING", 1000.0)
-    at_once = smooth_states(evidence, owner, lives, V, CLASSES)
+    at_once = smooth_states(evidence, owner, lifespans, V, CLASSES)
     assert (in_windows.id == at_once.id).all()
     assert np.allclose(in_windows.mean, at_once.mean, rtol=0, atol=1e-3)
     assert np.allclose(in_windows.covariance, at_once.covariance, rtol=0, atol=1e-6)
 
 
-def test_lives_reach_from_first_to_last_detection_and_further_where_wanted() -> None:
-    lives = lives_of_evidence(np.array([4, -1, 2, 4]), np.array(["car", "bus", "bus", "car"]), np.array([1, 1, 2, 3]))
-    assert lives.id.tolist() == [2, 4]
-    assert lives.label.tolist() == ["bus", "car"]
-    assert (lives.first.tolist(), lives.last.tolist()) == ([2, 1], [2, 3])
+def test_lifespans_reach_from_first_to_last_detection_and_further_where_wanted() -> None:
+    lifespans = lifespans_of(np.array([4, -1, 2, 4]), np.array(["car", "bus", "bus", "car"]), np.array([1, 1, 2, 3]))
+    assert lifespans.id.tolist() == [2, 4]
+    assert lifespans.label.tolist() == ["bus", "car"]
+    assert (lifespans.first.tolist(), lifespans.last.tolist()) == ([2, 1], [2, 3])
     times = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
-    longer = lives.reaching(times, back=0.5, ahead=10.0)
+    longer = lifespans.reaching(times, back=0.5, ahead=10.0)
     assert (longer.first.tolist(), longer.last.tolist()) == ([1, 0], [4, 4])
 
 
@@ -111,8 +111,8 @@ def test_states_are_found_by_object_and_moment() -> None:
     assert table.id.tolist() == [1, 3, 3]
     assert table.rows_of(np.array([2, 3, 3, 2]), np.array([3, 3, 1, -1])).tolist() == [1, 2, -1, -1]
     assert [table.at(k) for k in (2, 3, 9)] == [slice(0, 2), slice(2, 3), slice(3, 3)]
-    lives = Lives(np.array([3]), np.array(["car"]), np.array([3]), np.array([5]))
-    assert table.within(lives).moment.tolist() == [3]
+    lifespans = Lifespans(np.array([3]), np.array(["car"]), np.array([3]), np.array([5]))
+    assert table.within(lifespans).moment.tolist() == [3]
 
 
 def test_a_pinned_object_stays_where_it_is() -> None:
@@ -121,9 +121,9 @@ def test_a_pinned_object_stays_where_it_is() -> None:
     path = np.array([10.0, 5.0]) + rng.normal(0, SIGMA, (20, 2))
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     mine = np.zeros(20, dtype=np.int64)
-    lives = lives_of_evidence(mine, evidence.boxes.label, evidence.moment)
-    stands = Standing(StationarySettings(), np.arange(20), mine)
-    states = smooth_states(evidence, mine, lives, 25 * np.eye(2)[None], CLASSES, standing=stands)
+    lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
+    stands = StationaryStates(StationarySettings(), np.arange(20), mine)
+    states = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
     assert np.ptp(states.mean[:, :2], axis=0).max() < 0.1 * SIGMA
     assert np.allclose(states.mean[:, :2] + evidence.origin, path.mean(axis=0), atol=0.1 * SIGMA)
 
@@ -134,10 +134,10 @@ def test_an_outlier_counts_little_after_reweighting() -> None:
     path[5] = [4.0, 0.0]
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     mine = np.zeros(11, dtype=np.int64)
-    lives = lives_of_evidence(mine, evidence.boxes.label, evidence.moment)
-    plain = smooth_states(evidence, mine, lives, 25 * np.eye(2)[None], CLASSES)
+    lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
+    plain = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES)
     weight = robust_weights(evidence, mine, plain, Robust("cauchy", 2.0))
-    robust = smooth_states(evidence, mine, lives, 25 * np.eye(2)[None], CLASSES, weight=weight)
+    robust = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, weight=weight)
     middle = [abs(s.mean[5, 0] + evidence.origin[0]) for s in (plain, robust)]
     assert weight.argmin() == 5
     assert middle[1] < 0.5 * middle[0]

@@ -67,7 +67,7 @@ def test_what_time_does_does_not_depend_on_how_often_one_looks(s, dt, share):
     assert at_once.probability.item() == pytest.approx(0.3 / 0.5), "the balance of departing and halting"
 
 
-def test_one_that_has_just_halted_is_where_the_joint_filter_has_it():
+def test_one_that_has_just_stoped_is_where_the_joint_filter_has_it():
     stationarity = Stationarity.initiated(kinematics(), np.array([0.0]))
     stationarity.predict(0.1, kinematics(position=(30.0, 4.0)), replace(ON, drift=0.0))
     assert stationarity.position[0] == pytest.approx([30.0, 4.0])

@@ -6,20 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.smoothing.rounds import SmoothedObjects
+from pipelines.smoothing.passes import SmoothedObjects
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.smoothing import (
     Evidence,
     Headings,
     LabelCounts,
     Labels,
-    Lives,
+    Lifespans,
     OfflineClass,
     SmoothingSettings,
     StateTable,
     constant_sizes,
-    lives_of_evidence,
-    previous_rows,
+    lifespans_of,
     quality_of,
     scalar_readings,
     smooth_headings,
@@ -34,7 +33,7 @@ HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, 
 
 @dataclass(frozen=True, eq=False)
 class LabelledStates:
-    """All that labels say of R states: position (R, 3) in the world, size (R, 3), headings, position_covariance
+    """Attributes of the labels of R states: position (R, 3) in the world, size (R, 3), headings, position_covariance
     (R, 2, 2), coasting (R,) s, label, score, source and quality (R,)."""
 
     states: StateTable
@@ -77,22 +76,22 @@ def label_states(
     evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
 ) -> LabelledStates:
     """Labels of all states of a recording; the times `wanted` (M,), s, are those that count as observed or not."""
-    lives, states = objects.lives, objects.states
-    owner = lives.rows_of(states.id)
+    lifespans, states = objects.lifespans, objects.states
+    owner = lifespans.rows_of(states.id)
     rows = np.flatnonzero(objects.object_of >= 0)
-    holder = lives.rows_of(objects.object_of[rows])
+    holder = lifespans.rows_of(objects.object_of[rows])
     at = states.rows_of(evidence.moment[rows], objects.object_of[rows])
     boxes, p = evidence.boxes, evidence.probability[rows]
-    size = constant_sizes(holder, len(lives), boxes.size[rows], p, evidence.distance[rows])
-    duration = _since_before(states, evidence.times)
+    size = constant_sizes(holder, len(lifespans), boxes.size[rows], p, evidence.distance[rows])
+    duration = states.elapsed(evidence.times)
     heights = scalar_readings(at, boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
     z, _ = smooth_walks(states, HEIGHT_DRIFT**2 * duration, heights)
-    label = lives.label[owner]
+    label = lifespans.label[owner]
     yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "position_bias")
     turning = yaw_drift**2 * duration
-    turning = np.where(_stands(objects), 1e-6, turning)
-    (moving,) = class_values(settings.classes, OfflineClass, lives.label, "motion_heading")
-    headings = smooth_headings(states, lives, evidence, rows, at, turning, moving)
+    turning = np.where(_is_stationary(objects), 1e-6, turning)
+    (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "motion_heading")
+    headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
     position = np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1)
@@ -109,19 +108,19 @@ def count_labels(
     return LabelCounts(
         **source_counts(np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])),
         dropped=dropped_boxes(evidence, objects, wanted),
-        objects=len(objects.lives),
+        objects=len(objects.lifespans),
         dropped_objects=sum(map(len, objects.dropped)),
         joined=objects.joined,
     )
 
 
 def source_counts(source: StrArray) -> dict[str, int]:
-    """How many of some boxes were observed, filled and extended."""
+    """Numbers of boxes that were observed, filled and extended."""
     return {kind: int((source == kind).sum()) for kind in ("observed", "filled", "extended")}
 
 
 def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> int:
-    """How many boxes at the times `wanted` (M,), s, went with the objects that were dropped."""
+    """Number of boxes of dropped objects at the times `wanted` (M,), s."""
     at = np.searchsorted(evidence.times, wanted)
     return sum(
         int((np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)).sum())
@@ -129,18 +128,12 @@ def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArr
     )
 
 
-def _stands(objects: SmoothedObjects) -> BoolArray:
-    """(R,) whether each state is one of a standing object."""
-    stands = np.zeros(len(objects.states), dtype=np.bool_)
-    at = objects.states.rows_of(objects.standing.moment, objects.standing.id)
-    stands[at[at >= 0]] = True
-    return stands
-
-
-def _since_before(states: StateTable, times: FloatArray) -> FloatArray:
-    """(R,) s from the object's state before to each state, 0 for its first."""
-    before = previous_rows(states)
-    return np.asarray(np.where(before >= 0, times[states.moment] - times[states.moment[before]], 0.0))
+def _is_stationary(objects: SmoothedObjects) -> BoolArray:
+    """(R,) which states are stationary."""
+    stationary = np.zeros(len(objects.states), dtype=np.bool_)
+    at = objects.states.rows_of(objects.stationary.moment, objects.stationary.id)
+    stationary[at[at >= 0]] = True
+    return stationary
 
 
 def _time_to_detection(states: StateTable, times: FloatArray, object_of: IntArray, seen: FloatArray) -> FloatArray:
@@ -163,7 +156,7 @@ def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -
     observed = np.zeros(len(states), dtype=np.bool_)
     hit = states.rows_of(nearest, objects.object_of[rows])
     observed[hit[hit >= 0]] = True
-    online: Lives = lives_of_evidence(
+    online: Lifespans = lifespans_of(
         np.where(objects.track_of >= 0, objects.object_of, -1), evidence.boxes.label, evidence.moment
     )
     row = online.rows_of(states.id)

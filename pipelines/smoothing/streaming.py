@@ -1,15 +1,14 @@
 """A recording smoothed as it is read, in memory that does not grow with its length.
 
-    frames -> tracker, frame by frame -> stretches, smoothed one by one with margins -> labels, on disk
+    frames -> tracker, frame by frame -> chunks, smoothed one by one with margins -> labels, on disk
 
-The tracker sees the recording once, from one end to the other. All rounds of smoothing (`pipelines.smoothing.rounds`)
-are made anew for every stretch (`pipelines.smoothing.stretches`). What is said of an object as a whole (size, score,
-front) is gathered over the stretches and put in at the end (`pipelines.smoothing.lifetimes`), when the labels are read
-back from disk; who it is, is kept from one to the next (`pipelines.smoothing.identities`). Memory is that of a stretch
-with its margins, and a few numbers for every object that ever was.
+The tracker sees the recording once, from one end to the other. All passes of smoothing (`pipelines.smoothing.passes`)
+are made anew for every chunk (`pipelines.smoothing.chunks`). Size, score, front and identity of objects are gathered
+over the chunks (`pipelines.smoothing.object_summaries`) and put in at the end, when the labels are read back from disk.
+Memory is that of a chunk with its margins, and a few numbers for every object that ever was.
 
-A recording no longer than a stretch and a margin is one stretch: exactly what `smooth_scene` makes of it. Where it is
-longer, stands are those that a stretch with its margins sees, and weak objects are dropped by their score in it.
+A recording no longer than a chunk and a margin is one chunk, with exactly the labels of `smooth_scene`. Where it is
+longer, stationary and weak objects are judged by a chunk with its margins.
 """
 
 from __future__ import annotations
@@ -25,22 +24,20 @@ import numpy as np
 
 from pipelines.config import Method
 from pipelines.process import one_thread
-from pipelines.smoothing.assembly import LabelledStates, dropped_boxes, label_states, source_counts
+from pipelines.smoothing.chunks import Backlog, ChunkSettings, TrackedFrame
 from pipelines.smoothing.config import SmoothConfig
-from pipelines.smoothing.identities import Identities
 from pipelines.smoothing.label_spool import LabelSpool
-from pipelines.smoothing.lifetimes import Lifetimes
-from pipelines.smoothing.online import track_evidence
-from pipelines.smoothing.rounds import SmoothedObjects, smooth_objects
-from pipelines.smoothing.stretches import Backlog, StretchSettings, TrackedFrame
+from pipelines.smoothing.labelling import LabelledStates, dropped_boxes, label_states, source_counts
+from pipelines.smoothing.object_summaries import Identities, ObjectSummaries
+from pipelines.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
     gather_evidence,
-    looks_in_view,
     measured_in_order,
+    opportunities,
     size_weights,
 )
 from saga_fg.types.dataset import Scene
@@ -64,7 +61,7 @@ def smooth_stream(
     config: SmoothConfig,
     folder: Path,
     method: Method = "saga",
-    stretches: StretchSettings | None = None,
+    chunks: ChunkSettings | None = None,
     progress: Progress | None = None,
 ) -> Iterator[StreamedScene]:
     """Smooth recordings that come in parts: successive scenes of the same name, each beginning after the one before.
@@ -74,12 +71,12 @@ def smooth_stream(
     """
     for number, (name, scene) in enumerate(groupby(parts, key=lambda part: part.name)):
         spool = LabelSpool(folder / f"{number:06d}", name, config.smoothing)
-        run = _Run(name, config, method, stretches or StretchSettings(), spool)
+        run = _Run(name, config, method, chunks or ChunkSettings(), spool)
         yield run.over(scene, progress)
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretch:
+class _Chunk:
     """The span [begin, end), s, smoothed with its margins."""
 
     begin: float
@@ -90,40 +87,40 @@ class _Stretch:
 
     @cached_property
     def inside(self) -> BoolArray:
-        """(K,) which moments of the evidence are in the stretch itself."""
+        """(K,) which moments of the evidence are in the chunk itself."""
         return (self.evidence.times >= self.begin) & (self.evidence.times < self.end)
 
 
 @dataclass
 class _Sums:
-    """What is counted while a recording goes by."""
+    """Counts while a recording streams by."""
 
     counts: LabelCounts = field(default_factory=LabelCounts)
-    looks: int = 0
-    first_look: float = np.inf
-    last_look: float = -np.inf
+    frames: int = 0
+    first: float = np.inf
+    last: float = -np.inf
 
     @property
     def rate(self) -> float:
-        """Looks a second."""
-        return (self.looks - 1) / (self.last_look - self.first_look) if self.last_look > self.first_look else 1.0
+        """Frames per second."""
+        return (self.frames - 1) / (self.last - self.first) if self.last > self.first else 1.0
 
 
 class _Run:
     """One recording."""
 
     def __init__(
-        self, name: str, config: SmoothConfig, method: Method, stretches: StretchSettings, spool: LabelSpool
+        self, name: str, config: SmoothConfig, method: Method, chunks: ChunkSettings, spool: LabelSpool
     ) -> None:
-        self._name, self._config, self._stretches, self._spool = name, config, stretches, spool
+        self._name, self._config, self._chunks, self._spool = name, config, chunks, spool
         self._tracking = config.tracking.of_method(method)
         self._tracker: OnlineTracker = self._tracking.new_tracker(method)
         offsets = [0.0, *(sensor.time_offset for sensor in config.sensors.values())]
         self._early = min(offsets)  # a frame's measurement may be this much before its timestamp
         self._coming: list[Frame] = []
-        self._backlog = Backlog(stretches)
+        self._backlog = Backlog(chunks)
         self._identities = Identities()
-        self._lifetimes = Lifetimes()
+        self._summaries = ObjectSummaries()
         self._sums = _Sums()
 
     def over(self, parts: Iterable[Scene], progress: Progress | None) -> StreamedScene:
@@ -144,9 +141,9 @@ class _Run:
         with one_thread():
             self._track(np.inf)
             self._smooth(np.inf)
-            self._lifetimes.retire(np.empty(0, dtype=np.int64))
-        self._spool.finish(self._lifetimes, self._config.smoothing.prior_time * self._sums.rate)
-        counts = replace(self._sums.counts, objects=len(self._lifetimes.ids), joined=self._identities.joined)
+            self._summaries.close(np.empty(0, dtype=np.int64))
+        self._spool.finish(self._summaries, self._config.smoothing.prior_time * self._sums.rate)
+        counts = replace(self._sums.counts, objects=len(self._summaries.ids), joined=self._identities.joined)
         return StreamedScene(self._name, counts, frames, cpu + time.perf_counter() - begin, self._spool)
 
     def _track(self, until: float) -> None:
@@ -160,12 +157,12 @@ class _Run:
         frames = [frame for _, frame in ready]
         evidence = gather_evidence(frames, np.empty(0), sensors, classes)
         track_of = track_evidence(self._name, frames, self._tracker, evidence, sensors, classes)
-        rows = evidence.rows_of_look()
+        rows = evidence.rows_of_frame()
         self._backlog.extend([TrackedFrame(at, f, track_of[mine]) for (at, f), mine in zip(ready, rows, strict=True)])
 
     def _smooth(self, until: float) -> None:
-        """All stretches that are complete, with their margins, before a time; infinite: all that is left."""
-        for begin, end in self._backlog.stretches(until):
+        """All chunks that are complete, with their margins, before a time; infinite: all that is left."""
+        for begin, end in self._backlog.chunks(until):
             tracked, wanted = self._backlog.around(begin, end)
             frames = [each.frame for each in tracked]
             evidence = gather_evidence(frames, wanted, self._config.sensors, self._tracking.tracker.classes)
@@ -174,55 +171,56 @@ class _Run:
                 objects = smooth_objects(evidence, track_of, self._config.smoothing, self._tracking.tracker)
                 labelled = label_states(evidence, objects, wanted, self._config.smoothing)
                 mine = wanted[(wanted >= begin) & (wanted < end)]
-                self._take_in(_Stretch(begin, end, evidence, objects, labelled), mine)
+                self._add(_Chunk(begin, end, evidence, objects, labelled), mine)
 
-    def _take_in(self, stretch: _Stretch, wanted: FloatArray) -> None:
-        """Gather what a stretch says of its objects, and give out its labels at the times `wanted`, s."""
-        evidence, objects, states = stretch.evidence, stretch.objects, stretch.labelled.states
-        here = np.unique(states.id[stretch.inside[states.moment]])
-        times, span = evidence.times[evidence.moment], (stretch.begin, stretch.end)
+    def _add(self, chunk: _Chunk, wanted: FloatArray) -> None:
+        """Add a chunk to the summaries of its objects, and write its labels at the times `wanted`, s."""
+        evidence, objects, states = chunk.evidence, chunk.objects, chunk.labelled.states
+        here = np.unique(states.id[chunk.inside[states.moment]])
+        times, span = evidence.times[evidence.moment], (chunk.begin, chunk.end)
         names = self._identities.name(here, objects.object_of, objects.track_of, times, span)
-        self._gather(stretch, names)
-        self._give_out(stretch, names, wanted)
-        self._lifetimes.retire(np.array(list(names.values()), dtype=np.int64))
-        self._identities.forget(stretch.begin - 2 * (self._stretches.length + self._stretches.margin))
+        self._gather(chunk, names)
+        self._write(chunk, names, wanted)
+        self._summaries.close(np.array(list(names.values()), dtype=np.int64))
+        self._identities.forget(chunk.begin - 2 * (self._chunks.length + self._chunks.margin))
 
-    def _gather(self, stretch: _Stretch, names: Mapping[int, int]) -> None:
-        """Sum up what the stretch says of its objects as wholes."""
-        evidence, objects, inside = stretch.evidence, stretch.objects, stretch.inside
+    def _gather(self, chunk: _Chunk, names: Mapping[int, int]) -> None:
+        """Add the chunk's evidence on whole objects."""
+        evidence, objects, inside = chunk.evidence, chunk.objects, chunk.inside
         rows = np.flatnonzero((objects.object_of >= 0) & inside[evidence.moment])
         weight = size_weights(evidence.probability, evidence.distance)
         for id_, mine in _by_id(objects.object_of, rows):
             if id_ in names:
                 seen = evidence.boxes.size[mine]
-                self._lifetimes.seen(names[id_], evidence.probability[mine], seen, weight[mine])
-        looks = tuple(look for look in evidence.looks if inside[look.moment])
-        count = looks_in_view(replace(evidence, looks=looks), objects.lives, stretch.labelled.states)
-        for id_, looked in zip(objects.lives.id.tolist(), count.tolist(), strict=True):
+                self._summaries.add_detections(names[id_], evidence.probability[mine], seen, weight[mine])
+        frames = tuple(frame for frame in evidence.frames if inside[frame.moment])
+        count = opportunities(replace(evidence, frames=frames), objects.lifespans, chunk.labelled.states)
+        for id_, looked in zip(objects.lifespans.id.tolist(), count.tolist(), strict=True):
             if id_ in names:
-                self._lifetimes.looked(names[id_], looked)
-        times = evidence.times[[look.moment for look in looks]].tolist()
+                self._summaries.add_opportunities(names[id_], looked)
+        times = evidence.times[[frame.moment for frame in frames]].tolist()
         sums = self._sums
-        sums.looks += len(looks)
-        sums.first_look, sums.last_look = min([sums.first_look, *times]), max([sums.last_look, *times])
+        sums.frames += len(frames)
+        sums.first, sums.last = min([sums.first, *times]), max([sums.last, *times])
 
-    def _give_out(self, stretch: _Stretch, names: Mapping[int, int], wanted: FloatArray) -> None:
-        """Spool the labels of the moments `wanted`, s, and remember which way they look."""
-        evidence, objects, labelled = stretch.evidence, stretch.objects, stretch.labelled
+    def _write(self, chunk: _Chunk, names: Mapping[int, int], wanted: FloatArray) -> None:
+        """Spool the labels of the moments `wanted`, s, and add their headings to the summaries."""
+        evidence, objects, labelled = chunk.evidence, chunk.objects, chunk.labelled
         states, headings = labelled.states, labelled.headings
         at = np.searchsorted(evidence.times, wanted)
         emitted = np.flatnonzero(np.isin(states.moment, at))
         if len(at):
             before = int(at[0]) - 1
-            turned = {
-                id_: self._turned(labelled, names[id_], id_, before) for id_ in np.unique(states.id[emitted]).tolist()
+            signs = {
+                id_: self._heading_sign(labelled, names[id_], id_, before)
+                for id_ in np.unique(states.id[emitted]).tolist()
             }
             inside = np.flatnonzero((states.moment > before) & (states.moment <= at[-1]))
             for id_, rows in _by_id(states.id, inside):
-                if id_ in turned:
+                if id_ in signs:
                     path, votes = float(headings.path[rows].sum()), float(headings.votes[rows].sum())
-                    self._lifetimes.given_out(names[id_], turned[id_], float(headings.yaw[rows[-1]]), path, votes)
-            self._spool.add(wanted, at, labelled, names, turned)
+                    self._summaries.add_headings(names[id_], signs[id_], float(headings.yaw[rows[-1]]), path, votes)
+            self._spool.add(wanted, at, labelled, names, signs)
         begun = [(at[:1] <= gone.first) & (gone.first <= at[-1:]) for gone in objects.dropped]
         new = LabelCounts(
             **source_counts(labelled.source[emitted]),
@@ -231,9 +229,9 @@ class _Run:
         )
         self._sums.counts = LabelCounts.sum([self._sums.counts, new])
 
-    def _turned(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:
+    def _heading_sign(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:
         row = labelled.states.rows_of(np.array([before]), np.array([id_]))[0] if before >= 0 else -1
-        return self._lifetimes.turned(name, float(labelled.headings.yaw[row]) if row >= 0 else np.nan)
+        return self._summaries.heading_sign(name, float(labelled.headings.yaw[row]) if row >= 0 else np.nan)
 
 
 def _by_id(id_: IntArray, rows: IntArray) -> Iterator[tuple[int, IntArray]]:

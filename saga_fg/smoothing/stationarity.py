@@ -1,39 +1,53 @@
-r"""Objects that stand still, recognised from smoothed states and what was measured of them.
+r"""Stationary objects, recognised from smoothed states and their detections.
 
-A run of moments is a stand if the smoothed speed stays below the class's `stand_speed` for at least `min_time`, and the
+A run of moments is a halt if the smoothed speed stays below the class's `stand_speed` for at least `min_time`, and the
 positions measured meanwhile do not drift: with the weighted regression
 
     z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2
 
-the drift |u*| T over its duration T is below the class's `stand_drift`. A parked vehicle stands in all its life.
+the drift |u*| T over its duration T is below the class's `stand_drift`. A parked vehicle is stationary all its life.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from saga_fg.numerics.arrays import IntArray
-from saga_fg.smoothing.batch_states import Standing
+from saga_fg.numerics.arrays import BoolArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.settings import OfflineClass, StationarySettings
-from saga_fg.smoothing.states import Lives, StateTable
+from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.types.by_class import class_values
 
 
-def standing_states(
+@dataclass(frozen=True, eq=False)
+class StationaryStates:
+    """States (m,) of stationary objects: moments in ascending order, and ids; settings of how firmly they are held."""
+
+    settings: StationarySettings = field(default_factory=StationarySettings)
+    moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def at(self, moment: int, ids: IntArray) -> BoolArray:
+        """(n,) which of these objects are stationary at a moment."""
+        first, last = np.searchsorted(self.moment, [moment, moment + 1])
+        return np.isin(ids, self.id[first:last])
+
+
+def stationary_states(
     states: StateTable,
-    lives: Lives,
+    lifespans: Lifespans,
     evidence: Evidence,
     object_of: IntArray,
     settings: StationarySettings,
     classes: Mapping[str, OfflineClass],
-) -> Standing:
-    """The states in which objects stand."""
+) -> StationaryStates:
+    """The states in which objects are stationary."""
     order = np.lexsort((states.moment, states.id))
     ids, moments = states.id[order], states.moment[order]
-    label = lives.label[lives.rows_of(ids)]
+    label = lifespans.label[lifespans.rows_of(ids)]
     stand_speed, max_drift = class_values(classes, OfflineClass, label, "stand_speed", "stand_drift")
     slow = np.hypot(*states.mean[order, 2:].T) <= stand_speed
     begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
@@ -52,11 +66,11 @@ def standing_states(
             kept.append(np.arange(a, b + 1))
     chosen = np.concatenate([np.empty(0, dtype=np.int64), *kept])
     chosen = chosen[np.argsort(moments[chosen], kind="stable")]
-    return Standing(settings, moments[chosen], ids[chosen])
+    return StationaryStates(settings, moments[chosen], ids[chosen])
 
 
 def _drift(evidence: Evidence, rows: IntArray) -> float:
-    """How far the measured positions of some detections of an object drift from the first to the last, m."""
+    """Drift of the measured positions of an object from its first to its last detection, m."""
     t = evidence.times[evidence.moment[rows]]
     w = 2 / np.trace(evidence.R[rows, :2, :2], axis1=1, axis2=2)
     dt = t - np.average(t, weights=w)

@@ -1,9 +1,9 @@
-"""Where a recording is cut that is smoothed as it goes by: into stretches, which follow each other without a gap.
+"""Chunks of a recording that is smoothed as it is read; they follow each other without a gap.
 
-    [a, b) is smoothed within [a - margin, b + margin]        b = a + length, earlier where more than enough is seen
+    [a, b) is smoothed within [a - margin, b + margin]        b = a + length, earlier where there are enough detections
 
-What is given out are the moments of the stretch alone; beyond the margins nothing can be felt. Memory and work follow
-the detections that a stretch holds with its margins, so that crowds are cut into shorter ones.
+Labels are written for the moments of the chunk alone; beyond the margins measurements have no influence on it. Memory
+and work follow the detections in a chunk and its margins, so that crowds are cut into shorter ones.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True)
-class StretchSettings(Settings):
+class ChunkSettings(Settings):
     """How a long recording is cut."""
 
-    length: Positive = setting(30.0, "of a stretch, s")
+    length: Positive = setting(30.0, "of a chunk, s")
     margin: Positive = setting(7.0, "that is smoothed with it at either end, s")
-    detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "a stretch that has so many is long enough")
+    detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "a chunk that has so many is long enough")
     shortest: NonNegative = setting(5.0, "and is cut then, though not shorter than this, s")
 
 
@@ -39,13 +39,13 @@ class TrackedFrame:
 
 
 class Backlog:
-    """What of a recording is still needed: tracked frames in order of time, and moments at which boxes are wanted."""
+    """The part of a recording still needed: tracked frames in order of time, and moments at which boxes are wanted."""
 
-    def __init__(self, settings: StretchSettings) -> None:
+    def __init__(self, settings: ChunkSettings) -> None:
         self._settings = settings
         self._frames: list[TrackedFrame] = []
         self._moments = np.empty(0)
-        self._begin: float | None = None  # of the next stretch
+        self._begin: float | None = None  # of the next chunk
 
     def extend(self, frames: list[TrackedFrame]) -> None:
         """Take in frames that were tracked."""
@@ -60,10 +60,10 @@ class Backlog:
         """Time of the newest frame, s; -inf before the first."""
         return self._frames[-1].time if self._frames else -np.inf
 
-    def stretches(self, until: float) -> Iterator[tuple[float, float]]:
+    def chunks(self, until: float) -> Iterator[tuple[float, float]]:
         """The spans [begin, end), s, that are complete, with their margins, before a time; infinite: all that is left.
 
-        What a stretch and those after it do not need is forgotten when the next one is asked for.
+        Frames that later chunks do not need are forgotten when the next chunk is asked for.
         """
         length, margin = self._settings.length, self._settings.margin
         if self._begin is None:
@@ -81,16 +81,16 @@ class Backlog:
             self._frames = [tracked for tracked in self._frames if tracked.time >= end - margin]
             self._moments = self._moments[self._moments >= end - margin]
             pause = self._oldest(end) - margin - end
-            self._begin = end + max(0.0, pause // length) * length  # past stretches of nothing
+            self._begin = end + max(0.0, pause // length) * length  # past empty chunks
 
     def around(self, begin: float, end: float) -> tuple[list[TrackedFrame], FloatArray]:
-        """The frames of a stretch with its margins, and the times (m,), s, that are wanted."""
+        """The frames of a chunk with its margins, and the times (m,), s, that are wanted."""
         first, last = begin - self._settings.margin, end + self._settings.margin
         wanted = self._moments[(self._moments >= first) & (self._moments < last)]
         return [tracked for tracked in self._frames if first <= tracked.time < last], wanted
 
     def _end(self, begin: float) -> float:
-        """Where a stretch ends: after its length, or where it has enough."""
+        """End of a chunk: after its length, or once it has enough detections."""
         settings, count = self._settings, 0
         for tracked in self._frames:
             if tracked.time >= begin:
@@ -100,5 +100,5 @@ class Backlog:
         return begin + settings.length
 
     def _oldest(self, otherwise: float) -> float:
-        """Time of the first thing that is left, s."""
+        """Time of the first frame or moment that is left, s."""
         return min([*self._moments[:1].tolist(), *(tracked.time for tracked in self._frames[:1])], default=otherwise)

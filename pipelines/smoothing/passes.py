@@ -1,0 +1,221 @@
+"""The passes over a recording, online and smoothing; each uses the results of the one before.
+
+0. the tracker, frame by frame: which detections its tracks rest on;
+1. tracklets without edges, reaching beyond both ends; those with next to no evidence are dropped;
+2. the others with the edges that follow from pass 1: ends and beginnings that meet become one object;
+3. the stitched objects, with edges: free detections are assigned, objects with too little evidence dropped, and
+   stationary ones recognised;
+4. the remaining ones, from first to last detection, with edges, robust losses, stationary states held, and factors of
+   users' own: the final states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.tracking import OnlineTracker, Progress
+from saga_fg.graph import FactorProvider
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.smoothing import (
+    Evidence,
+    Lifespans,
+    SmoothedEdges,
+    SmoothingSettings,
+    StateTable,
+    StationaryStates,
+    assign_detections,
+    assign_free_detections,
+    constant_sizes,
+    evidence_scores,
+    lifespans_of,
+    measured_in_order,
+    no_edges,
+    robust_weights,
+    smooth_states,
+    stationary_states,
+    stitch_tracklets,
+)
+from saga_fg.tracking import TrackerSettings
+from saga_fg.tracking.provider_names import new_provider
+from saga_fg.tracking.settings import ClassSettings
+from saga_fg.types.by_class import class_values
+from saga_fg.types.frame import Frame
+from saga_fg.types.sensor import Sensor
+
+TRACKLET_SHARE = 0.5  # share of an object's least score that a tracklet needs to become part of one
+MAX_FREE_DISTANCE = 3.0  # between a state and a free detection assigned to it, m
+UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
+
+
+def track_evidence(
+    name: str,
+    frames: Sequence[Frame],
+    tracker: OnlineTracker,
+    evidence: Evidence,
+    sensors: Mapping[str, Sensor],
+    classes: Mapping[str, ClassSettings],
+    progress: Progress | None = None,
+) -> IntArray:
+    """(N,) the track of each detection, -1 for none: the likeliest of the reported tracks that its frame updated.
+
+    evidence: that of these frames, or of the next ones of a recording; `name` of the recording, for `progress`
+    """
+    track_of = np.full(len(evidence), -1, dtype=np.int64)
+    ordered = measured_in_order(frames, sensors)
+    for count, ((_, frame), rows) in enumerate(zip(ordered, evidence.rows_of_frame(), strict=True)):
+        tracks = tracker.step(frame)
+        updated = tracks.select(tracks.coasting == 0)
+        boxes = updated.boxes
+        objects, detections = assign_detections(
+            boxes.label,
+            boxes.position[:, :2] - evidence.origin,
+            updated.position_covariance,
+            evidence,
+            np.arange(rows.start, rows.stop),
+            UPDATED_GATE,
+            class_values(classes, ClassSettings, boxes.label, "max_distance")[0],
+        )
+        track_of[detections] = updated.id[objects]
+        if progress is not None:
+            progress(name, count + 1, len(ordered))
+    return track_of
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedObjects:
+    """Result of the passes.
+
+    lifespans      the objects kept
+    object_of  (N,) the object of each detection, -1 for none or one that was dropped
+    track_of   (N,) the online track of each detection, -1 for none or one that did not take part
+    states     of the objects at all moments of their lifespans
+    score      (n,) of the lifespans
+    stationary the states in which an object is stationary
+    joined     number of tracklets stitched to another
+    dropped    the lifespans of the tracklets and objects dropped
+    """
+
+    lifespans: Lifespans
+    object_of: IntArray
+    track_of: IntArray
+    states: StateTable
+    score: FloatArray
+    stationary: StationaryStates
+    joined: int
+    dropped: tuple[Lifespans, Lifespans]
+
+
+def smooth_objects(
+    evidence: Evidence,
+    track_of: IntArray,
+    settings: SmoothingSettings,
+    tracker: TrackerSettings,
+    providers: Sequence[FactorProvider] = (),
+) -> SmoothedObjects:
+    """All passes. track_of (N,): the online track of each detection, -1 for none; providers: in place of those of the
+    settings, asked from the first moment on every time the final states are solved for.
+    """
+    passes = _Passes(evidence, settings, tracker, providers)
+    label, moment = evidence.boxes.label, evidence.moment
+    everything = lifespans_of(track_of, label, moment)
+    ahead = max(settings.extension, settings.joining.max_gap)
+    states = passes.alone(everything, track_of, ahead)
+    score = evidence_scores(evidence, track_of, everything, states.within(everything), settings.prior_time)
+    weak = everything.select(score < TRACKLET_SHARE * settings.min_score)
+    tracklets = everything.select(score >= TRACKLET_SHARE * settings.min_score)
+    track_of = np.where(np.isin(track_of, tracklets.id), track_of, -1)
+    states = passes.coupled(tracklets, track_of, ahead, states.select(np.isin(states.id, tracklets.id)))
+    first = stitch_tracklets(tracklets, states, passes.velocity_prior(tracklets), evidence, settings.joining)
+    object_of = track_of.copy()
+    tracked = np.flatnonzero(track_of >= 0)
+    object_of[tracked] = first[tracklets.rows_of(track_of[tracked])]
+
+    joined = lifespans_of(object_of, label, moment)
+    states = passes.alone(joined, object_of, settings.extension)
+    states = passes.coupled(joined, object_of, settings.extension, states)
+    object_of = assign_free_detections(evidence, object_of, joined, states, settings.claim, MAX_FREE_DISTANCE)
+    lifespans = lifespans_of(object_of, label, moment)
+    within = states.within(lifespans)
+    score = evidence_scores(evidence, object_of, lifespans, within, settings.prior_time)
+    kept = score >= settings.min_score
+    object_of = np.where(np.isin(object_of, lifespans.id[kept]), object_of, -1)
+    stationary = stationary_states(within, lifespans, evidence, object_of, settings.stationary, settings.classes)
+    final = passes.final(lifespans.select(kept), object_of, states, stationary)
+    return SmoothedObjects(
+        lifespans.select(kept),
+        object_of,
+        track_of,
+        final,
+        score[kept],
+        stationary,
+        len(tracklets) - len(joined),
+        (weak, lifespans.select(~kept)),
+    )
+
+
+def smooth_known_objects(
+    evidence: Evidence, object_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
+) -> StateTable:
+    """States by the last pass alone, without stationary states; object_of (N,): true object of each detection, -1 for
+    none."""
+    passes = _Passes(evidence, settings, tracker, ())
+    lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
+    states = smooth_states(evidence, object_of, lifespans, passes.velocity_prior(lifespans), settings.classes)
+    return passes.final(lifespans, object_of, states, StationaryStates(settings.stationary))
+
+
+@dataclass(frozen=True, eq=False)
+class _Passes:
+    """Inputs of all passes."""
+
+    evidence: Evidence
+    settings: SmoothingSettings
+    tracker: TrackerSettings
+    providers: Sequence[FactorProvider]
+
+    def velocity_prior(self, lifespans: Lifespans) -> FloatArray:
+        """(n, 2, 2) covariance of the velocity of a new object."""
+        (speed,) = class_values(self.tracker.classes, ClassSettings, lifespans.label, "initial_speed_deviation")
+        return np.asarray(speed[:, None, None] ** 2 * np.eye(2))
+
+    def alone(self, lifespans: Lifespans, object_of: IntArray, ahead: float) -> StateTable:
+        """States without edges of objects that reach beyond their detections, by `ahead` s at their ends."""
+        longer = lifespans.reaching(self.evidence.times, self.settings.extension, ahead)
+        return smooth_states(self.evidence, object_of, longer, self.velocity_prior(longer), self.settings.classes)
+
+    def coupled(self, lifespans: Lifespans, object_of: IntArray, ahead: float, states: StateTable) -> StateTable:
+        """The same states with the edges that follow from given ones."""
+        if not self.tracker.edges:
+            return states
+        longer = lifespans.reaching(self.evidence.times, self.settings.extension, ahead)
+        edges = self._edges(longer, object_of, states)
+        prior, classes = self.velocity_prior(longer), self.settings.classes
+        return smooth_states(self.evidence, object_of, longer, prior, classes, edges)
+
+    def final(
+        self, lifespans: Lifespans, object_of: IntArray, states: StateTable, stationary: StationaryStates
+    ) -> StateTable:
+        """States with everything, from first to last detection; edges at first from `states` of an earlier pass."""
+        for _ in range(self.settings.reweightings + 1 if self.settings.robust else 1):
+            edges = self._edges(lifespans, object_of, states.within(lifespans)) if self.tracker.edges else no_edges
+            loss = self.settings.robust
+            weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)
+            prior, classes = self.velocity_prior(lifespans), self.settings.classes
+            asked = self.providers or [new_provider(name) for name in self.settings.providers]
+            states = smooth_states(
+                self.evidence, object_of, lifespans, prior, classes, edges, weight, stationary, asked
+            )
+        return states
+
+    def _edges(self, lifespans: Lifespans, object_of: IntArray, states: StateTable) -> SmoothedEdges:
+        rows = np.flatnonzero(object_of >= 0)
+        rows = rows[np.isin(object_of[rows], lifespans.id)]
+        owner, boxes, p = lifespans.rows_of(object_of[rows]), self.evidence.boxes, self.evidence.probability[rows]
+        size = constant_sizes(owner, len(lifespans), boxes.size[rows], p, self.evidence.distance[rows])
+        yaw = np.full(len(lifespans), np.nan)
+        known = np.isfinite(boxes.yaw[rows])
+        yaw[owner[known]] = boxes.yaw[rows[known]]
+        return SmoothedEdges.of(self.tracker.edges, self.tracker.explained_noise, lifespans, states, yaw, size[:, 0])

@@ -1,0 +1,125 @@
+r"""Sizes and headings of boxes: one size an object, and headings without flips.
+
+A rigid object has one size; a detector measures it well from near and guesses it from far. Length, width and height are
+each the weighted median of the measured ones, with weight probability / (1 + (distance / FAR)^2): half the weight may
+be wrong without harm.
+
+A detector's heading is often off by half a turn, but its axis is good; where an object moves, so is the direction of
+its velocity. Both are smoothed modulo pi, then one decision an object says which end is the front: the direction of
+motion, each metre a vote,
+
+    sum_k |v_k| dt cos(course_k - axis_k)
+
+where that comes to at least `TELLING_PATH`, else that of most detections, weighted by probability. A vehicle that backs
+out of a bay and drives away is right in the longer part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.smoothing.evidence import Evidence
+from saga_fg.smoothing.random_walk import ScalarReadings, scalar_readings, smooth_walks
+from saga_fg.smoothing.states import Lifespans, StateTable
+
+FAR = 20.0  # distance at which a detection's size counts half, m
+TELLING_PATH = 10.0  # m
+CLEAR = 3.0  # standard deviations by which a motion is no estimation error
+COURSE_NOISE = 0.1  # standard deviation between heading and direction of motion, rad
+
+
+def constant_sizes(
+    owner: IntArray, count: int, size: FloatArray, probability: FloatArray, distance: FloatArray
+) -> FloatArray:
+    """(count, 3) length, width, height of each object, NaN where none was measured.
+
+    owner (m,): row of the object of each detection; size (m, 3), NaN for unmeasured; probability (m,); distance (m,)
+    from the sensor, m, NaN for unknown
+    """
+    weight = size_weights(probability, distance)
+    known = np.isfinite(size).all(axis=1)
+    columns = [weighted_medians(owner[known], count, column[known], weight[known]) for column in size.T]
+    return np.stack(columns, axis=-1)
+
+
+def size_weights(probability: FloatArray, distance: FloatArray) -> FloatArray:
+    """(m,) the weight of detections' sizes; distance (m,) from the sensor, m, NaN for unknown."""
+    return np.asarray(probability / (1 + (np.nan_to_num(distance) / FAR) ** 2))
+
+
+def weighted_medians(owner: IntArray, count: int, value: FloatArray, weight: FloatArray) -> FloatArray:
+    """(count,) the weighted median of the values (m,) of each owner, NaN for one that has none.
+
+    Between the two values around half the weight it is interpolated, so that of equal weights it is the usual median.
+    """
+    order = np.lexsort((value, owner))
+    owner, value, weight = owner[order], value[order], weight[order]
+    total = np.bincount(owner, weight, minlength=count)
+    before = np.concatenate([[0.0], np.cumsum(total)])[:-1]
+    share = (np.cumsum(weight) - weight / 2 - before[owner]) / total[owner]  # of the owner's weight up to a value
+    result = np.full(count, np.nan)
+    first = np.searchsorted(owner, np.arange(count))
+    last = np.searchsorted(owner, np.arange(count), side="right") - 1
+    there = np.flatnonzero(last >= first)
+    key = owner + np.clip(share, 0.0, 1.0) * 0.999
+    upper = np.clip(np.searchsorted(key, there + 0.5 * 0.999), first[there], last[there])
+    lower = np.maximum(upper - 1, first[there])
+    gap = share[upper] - share[lower]
+    part = np.where(gap > 0, (0.5 - share[lower]) / np.where(gap > 0, gap, 1.0), 1.0)
+    result[there] = value[lower] + np.clip(part, 0.0, 1.0) * (value[upper] - value[lower])
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Headings:
+    """Headings of R states: yaw (R,), rad, NaN where unknown; variance (R,), rad^2; and evidence that yaw is not half a
+    turn off: path (R,), m moved along it since the state before, and votes (R,) of the detections at each."""
+
+    yaw: FloatArray
+    variance: FloatArray
+    path: FloatArray
+    votes: FloatArray
+
+
+def smooth_headings(
+    states: StateTable,
+    lifespans: Lifespans,
+    evidence: Evidence,
+    detection: IntArray,
+    row: IntArray,
+    growth: FloatArray,
+    moving: FloatArray,
+) -> Headings:
+    """Heading of every state.
+
+    detection (m,) and row (m,): detections and the states they belong to; growth (R,): see `smooth_walks`; moving (n,):
+    speed from which the motion of an object tells its heading, m/s
+    """
+    owner = lifespans.rows_of(states.id)
+    speed = np.hypot(*states.mean[:, 2:].T)
+    course = np.arctan2(states.mean[:, 3], states.mean[:, 2])
+    across = np.stack([-np.sin(course), np.cos(course)], axis=-1)
+    variance_across = np.einsum("ri,rij,rj->r", across, states.covariance[:, 2:, 2:], across)
+    course_variance = variance_across / np.maximum(speed, 1e-9) ** 2 + COURSE_NOISE**2
+    telling = np.flatnonzero((speed >= moving[owner]) & (speed > CLEAR * np.sqrt(variance_across)))
+    readings = [ScalarReadings(telling, course[telling], course_variance[telling])]
+    yaw, known = evidence.boxes.yaw[detection], np.isfinite(evidence.boxes.yaw[detection])
+    mine = detection[known]
+    readings += scalar_readings(row[known], yaw[known], evidence.yaw_noise[mine] ** 2)
+    axis, variance = smooth_walks(states, growth, readings, period=np.pi)
+    path = np.zeros(len(states))
+    path[telling] = (speed * states.elapsed(evidence.times) * np.cos(course - np.nan_to_num(axis)))[telling]
+    seen = evidence.probability[detection] * np.cos(np.where(known, yaw - axis[row], np.pi / 2))
+    votes = np.bincount(row, np.nan_to_num(seen), minlength=len(states))
+    reversed_ = is_reversed(*(np.bincount(owner, w, len(lifespans)).astype(np.float64) for w in (path, votes)))
+    sign = np.where(reversed_, -1.0, 1.0)[owner]
+    return Headings(wrap_angle(axis + np.pi * (sign < 0)), variance, sign * path, sign * votes)
+
+
+def is_reversed(path: FloatArray, votes: FloatArray) -> BoolArray:
+    """(n,) which objects face the other way, of the sums (n,) over their states."""
+    return np.where(np.abs(path) >= TELLING_PATH, path, votes) < 0
