@@ -13,8 +13,8 @@ The rule: of the vehicles that come to a line, the first of each lane that can s
     rate = rate  closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
 
 since drivers do not brake for a line far away; a vehicle that would have to brake harder than `max_deceleration` goes
-on. Those behind follow by other interactions. A vehicle approaches a line along its lane of the map, or without lanes straight
-along its heading. Alternatively the line is a stationary leader of the Intelligent Driver Model
+on. Those behind follow by other interactions. A vehicle approaches a line along its lane of the map, or without lanes
+straight along its heading. Alternatively the line is a stationary leader of the Intelligent Driver Model
 (`saga_fg.model.intelligent_driver`): the vehicle brakes later and harder, and a slow one creeps up to the line.
 """
 
