@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.central_differences import central_differences
+from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.kitti.calibration import Calibration, read_calibration
 from data_tools.datasets.kitti.detections import detection_files, read_kitti_detections
 from data_tools.datasets.kitti.labels import read_kitti_labels
