@@ -24,7 +24,7 @@ from saga_fg.types.by_class import DEFAULT
 
 @dataclass(frozen=True)
 class LaneSettings(Settings):
-    """Attraction of vehicles to the centre lines of mapped lanes."""
+    """Attraction of vehicles to the centre lines of the map's lanes."""
 
     offset_deviation: Positive = setting(
         0.3, "standard deviation of the offset from the centre line, m; lower: stronger attraction"
@@ -42,7 +42,7 @@ class LaneSettings(Settings):
 
 @dataclass(frozen=True)
 class JointSettings(Settings):
-    """Joint estimation of the ego path, landmarks and objects."""
+    """Noise of the odometry, stationarity of objects, and effort of the joint estimation."""
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "errors of the odometry")
     start_noise: Positive = setting(1e-3, "standard deviation of the first pose, m and rad")
