@@ -19,7 +19,7 @@ def central_differences(
     """Velocities (N, 2), m/s, of annotations with instance names (N,), times (N,) in s, positions (N, 2) in m.
 
     The annotations come in any order. `reach` is r above. Unknown (NaN) for an object annotated once, and where more
-    than `longest_gap` s per annotation lie between the two that are subtracted.
+    than `longest_gap` s per annotation lie between the two annotations.
     """
     n = len(instance)
     velocity = np.full((n, 2), np.nan)
@@ -36,6 +36,6 @@ def central_differences(
     t, p = time[order], position[order]
     elapsed = t[after] - t[before]
     known = (elapsed > 0) & (elapsed <= longest_gap * (after - before))
-    with np.errstate(over="ignore"):  # positions beyond all numbers are for others to refuse
+    with np.errstate(over="ignore"):  # infinite positions are refused elsewhere
         velocity[order[known]] = (p[after] - p[before])[known] / elapsed[known, None]
     return velocity

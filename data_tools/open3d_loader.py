@@ -1,7 +1,7 @@
-"""Open3D, imported on first use only: it takes half a second and more memory than all the rest.
+"""Open3D, imported on first use, because the import takes half a second and much memory.
 
 On Linux its extension links `libusb-1.0.so.0` (for depth cameras), which neither its wheel nor a slim system carries.
-The package `libusb-package` does; a library once loaded with global symbols satisfies the later link by its name.
+The package `libusb-package` carries it; once loaded with global symbols, it satisfies the later link by its name.
 """
 
 from __future__ import annotations
@@ -30,6 +30,6 @@ def _preload_libusb() -> None:
     try:
         path = importlib.import_module("libusb_package").get_library_path()
     except ImportError:
-        return  # a system that has libusb of its own does without
+        return  # the system may have its own libusb
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)

@@ -7,7 +7,6 @@ Linear families give native `gtsam.JacobianFactor`s, which no solver needs Pytho
 
 from factors.absolute import attitude_factor, position_factor
 from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
-from factors.calibrated_range import calibrated_range_factors
 from factors.camera import Camera, PixelBearing
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
@@ -30,8 +29,8 @@ from factors.odometry import ERROR_DIM, odometry_factors
 from factors.on_plane import on_plane_factor
 from factors.plane import OrientedPlane, plane, plane_factor
 from factors.polar import Bearing, Radar, Range, RangeBearing, RangeRate
-from factors.polar_landmarks import bearing_range_factor, range_factor
 from factors.prior import joint_prior_factor, prior_factor, prior_factors
+from factors.ranges import bearing_range_factor, calibrated_range_factors, range_factor
 from factors.relative import (
     point_factors,
     relative_detection_factors,

@@ -6,9 +6,18 @@ Linearised at a point, with J_k = dr/dx_k, W R W^T = 1 and the weight w of the r
 
     || sqrt(w) ( sum_k W J_k delta_k + W r ) ||^2,
 
-a native Jacobian factor on the increments delta. `factors.solver.solve` uses that; `as_custom_factor` gives the same
-thing as a `gtsam.CustomFactor` for anybody's own graph, where GTSAM calls back into Python at each linearisation and
-copies all Values every time. Many factors of one shape are better kept together: `factors.stacked`.
+a native Jacobian factor on the increments delta, which `factors.solver.solve` uses. Many factors of one shape are
+better kept together: `factors.stacked`.
+
+For GTSAM graphs of one's own a factor is a guarded `gtsam.CustomFactor`, whose callback copies all Values at each
+linearisation. GTSAM trusts it: an unset Jacobian or one of a wrong shape crashes the interpreter, NaN spoils the
+solution. The guard hands over nothing unchecked; whatever goes wrong in a user's function becomes a `FactorError`:
+
+* `as_custom_factor` lets it travel through GTSAM's C++ to the caller. Right for batch optimisers: the values they were
+  given are untouched, and starting again is all there is to do.
+* `as_tolerant_custom_factor` lets the solver finish. An exception within `ISAM2.update` leaves that object unusable. So
+  the factor calls `on_failure` and stands in with its last good linearisation, extrapolated:
+  r(x) = r(x0) + J (x - x0), as if iSAM2 had not relinearised it.
 """
 
 from __future__ import annotations
@@ -21,7 +30,6 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.custom import custom_factor, tolerant_custom_factor
 from factors.differences import central_differences, wrap_angles
 from factors.errors import FactorError
 from factors.gaussian import native_factor
@@ -143,17 +151,55 @@ class ResidualFactor:
         return gaussian if self.robust is None else self.robust.model(gaussian)
 
     def as_custom_factor(self) -> gtsam.CustomFactor:
-        """Return the same factor for a GTSAM graph; see `factors.custom.custom_factor`."""
-        return custom_factor(self)
+        """Return the factor for a GTSAM graph; a failure in its functions leaves the solver as a `FactorError`."""
+
+        def evaluate(this: gtsam.CustomFactor, values: gtsam.Values, H: gtsam.JacobianVector | None) -> FloatArray:
+            try:
+                states = self.states(values)
+                if H is not None:
+                    _hand_over(self.jacobians_at(states), H)
+                return self.residual_at(states)
+            finally:
+                del this, values, H  # lent for the call only: in the traceback of an exception they would dangle
+
+        return gtsam.CustomFactor(self.noise_model(), list(self.keys), evaluate)
 
     def as_tolerant_custom_factor(
         self, start: gtsam.Values, on_failure: Callable[[FactorError], None]
     ) -> gtsam.CustomFactor:
-        """Return the same factor for iSAM2, which an exception would ruin; see `tolerant_custom_factor`."""
-        return tolerant_custom_factor(self, start, on_failure)
+        """Return the factor for iSAM2; a failure in its functions goes to `on_failure`, and the solver goes on.
+
+        start: values at which the factor is sound; raises `FactorError` when it is not. on_failure must not raise; a
+        list's `append` will do: look into the list after every update.
+        """
+        good = self.states(start)
+        residual, jacobians = self.residual_at(good), self.jacobians_at(good)
+
+        def evaluate(this: gtsam.CustomFactor, values: gtsam.Values, H: gtsam.JacobianVector | None) -> FloatArray:
+            nonlocal good, residual, jacobians
+            states = self.states(values)
+            try:
+                if H is None:
+                    return self.residual_at(states)
+                good, residual, jacobians = states, self.residual_at(states), self.jacobians_at(states)
+            except FactorError as error:
+                on_failure(error.with_traceback(None))  # whose frames would keep `this` and H, lent for the call only
+            if H is not None:
+                _hand_over(jacobians, H)
+            moved = residual.copy()
+            for jacobian, variable, state, now in zip(jacobians, self.variables, good, states, strict=True):
+                moved += jacobian @ variable.local(state, now)
+            return moved
+
+        return gtsam.CustomFactor(self.noise_model(), list(self.keys), evaluate)
 
     def _called(self, function: Callable[..., Any], states: Sequence[Any]) -> Any:
         try:
             return function(*states)
         except Exception as error:
             raise FactorError(f"{self}: {error if isinstance(error, FactorError) else repr(error)}") from error
+
+
+def _hand_over(jacobians: Sequence[FloatArray], H: gtsam.JacobianVector) -> None:
+    for k, jacobian in enumerate(jacobians):
+        H[k] = jacobian

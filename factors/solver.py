@@ -26,7 +26,6 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from factors.custom import check_jacobians, custom_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import check_dimensions, native_factor
 from factors.marginal import marginal_moments
@@ -169,6 +168,27 @@ def check_variables(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Lineari
     check_dimensions(  # GTSAM's own factors check their variables themselves, wrapped linear ones do not
         (factor.factor() for factor in factors_of_graph if isinstance(factor, gtsam.LinearContainerFactor)), dims
     )
+
+
+def custom_factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
+    """The factors of a graph that call back to Python, ours or not."""
+    factors = (graph.at(i) for i in range(graph.size()) if graph.exists(i))
+    return [factor for factor in factors if isinstance(factor, gtsam.CustomFactor)]
+
+
+def check_jacobians(factors: Iterable[gtsam.CustomFactor], values: gtsam.Values) -> None:
+    """Raise `FactorError` for a factor whose Jacobians at `values` would crash GTSAM: unset or of a wrong shape."""
+    dims: dict[int, int] = {}
+    for factor in factors:
+        keys, dims = factor.keys(), dims or values.dims()
+        H = gtsam.JacobianVector([np.empty((0, 0)) for _ in keys])
+        rows = len(factor.unwhitenedError(values, H))
+        for key, jacobian in zip(keys, H, strict=True):
+            shape = (rows, dims[key])
+            if jacobian.shape != shape or not np.isfinite(jacobian).all():
+                where = f"CustomFactor of {format_keys(keys)}: Jacobian by {format_keys([key])}"
+                got = f"shape {jacobian.shape}" if jacobian.size else "none"
+                raise FactorError(f"{where}: expected finite numbers of shape {shape} in H, got {got}")
 
 
 @dataclass(frozen=True)

@@ -244,7 +244,7 @@ def _group_table(group: tuple[str, Mapping[str, CommonBoxes]]) -> FigureTable:
 def _errors(same: CommonBoxes) -> tuple[str, ...]:
     position = {name: same.sample(name, "position").rmse for name in SYSTEMS}
     heading = (cell(float(np.degrees(same.sample(name, "heading").rmse)), 1) for name in SYSTEMS)
-    ratios = (position["labels"] / position[name] if len(same) else float("nan") for name in ("online", "detections"))
+    ratios = (position["labels"] / (position[name] or np.nan) for name in ("online", "detections"))
     size = (cell(same.sample(name, "size").rmse) for name in SYSTEMS)
     velocity = (cell(same.sample(name, "velocity").rmse) for name in ("online", "labels"))
     return (*map(cell, position.values()), *map(cell, ratios), *heading, *size, *velocity)

@@ -29,7 +29,7 @@ class StageClock:
         self._mark = now
 
 
-class Innovations:
+class InnovationRecorder:
     """Squared distances of tracks and the detections they took, in sigmas (NIS, 2 degrees of freedom), by class."""
 
     def __init__(self) -> None:

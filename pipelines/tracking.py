@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pipelines.process import one_thread
+from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
@@ -80,4 +81,12 @@ def track_dataset(
 ) -> Iterator[TrackedScene]:
     """Track some scenes (default: all), each with a tracker of its own, one at a time as they are asked for."""
     for name in dataset.scenes if scenes is None else scenes:
-        yield track_scene(dataset.scene(name), new_tracker(), progress)
+        yield track_scene(scene_with_frames(dataset, name), new_tracker(), progress)
+
+
+def scene_with_frames(dataset: Dataset, name: str) -> Scene:
+    """Read a scene. Raises `InputError` for one without any frame of detections."""
+    scene = dataset.scene(name)
+    if not scene.frames:
+        raise InputError(f"scene {name}: expected frames of detections, there are none")
+    return scene

@@ -18,6 +18,8 @@ from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Detections, Frame
 
+SENSOR = "annotations"
+
 
 @dataclass(frozen=True, kw_only=True)
 class AnnotatedSource(DatasetSource):
@@ -68,13 +70,19 @@ class DetectedScenes:
 def detected(scene: Scene) -> list[Frame]:
     """A frame for each moment, of sensor "annotations": its visible boxes, of score 1, without ids and velocities.
 
-    Raises `InputError` for a scene without ground truth.
+    Where moments are missing, since nothing is annotated, there are empty frames at the pace of the others. Raises
+    `InputError` for a scene without ground truth.
     """
     if scene.ground_truth is None:
         raise InputError(f"scene {scene.name}: expected ground truth to take detections from")
-    frames = []
+    frames: list[Frame] = []
+    period = float(np.median(np.diff(scene.timestamps))) if len(scene) > 1 else np.inf
     for time, pose, truth in zip(scene.timestamps.tolist(), scene.world_T_ego, scene.ground_truth, strict=True):
+        if frames:
+            last = frames[-1]
+            missing = np.arange(1, round((time - last.timestamp) / period)) * period + last.timestamp
+            frames += [Frame(at, SENSOR, Detections.empty(), last.world_T_ego) for at in missing.tolist()]
         boxes = truth.boxes.select(truth.visible)
         unknown = replace(boxes, velocity=np.full((len(boxes), 2), np.nan))
-        frames.append(Frame(time, "annotations", Detections(unknown, np.ones(len(boxes))), pose))
+        frames.append(Frame(time, SENSOR, Detections(unknown, np.ones(len(boxes))), pose))
     return frames

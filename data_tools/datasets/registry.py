@@ -29,7 +29,7 @@ BUILT_IN = {
 
 def dataset_names() -> tuple[str, ...]:
     """The names of all datasets, those that come along first."""
-    return (*BUILT_IN, *(name for name in _external() if name not in BUILT_IN))
+    return (*BUILT_IN, *(name for name in external_datasets() if name not in BUILT_IN))
 
 
 def dataset_source(name: str) -> type[DatasetSource]:
@@ -40,9 +40,9 @@ def dataset_source(name: str) -> type[DatasetSource]:
     """
     if ":" in name:
         return _loaded(name, f"dataset {name}")
-    if name in BUILT_IN and name not in _external():
+    if name in BUILT_IN and name not in external_datasets():
         return _loaded(BUILT_IN[name], f"dataset {name}")
-    found = _external().get(name, ())
+    found = external_datasets().get(name, ())
     if not found:
         raise InputError(unknown_name("dataset", name, dataset_names()))
     packages = [entry.dist.name if entry.dist is not None else entry.value for entry in found]
@@ -53,7 +53,7 @@ def dataset_source(name: str) -> type[DatasetSource]:
 
 
 @cache
-def _external() -> dict[str, tuple[EntryPoint, ...]]:
+def external_datasets() -> dict[str, tuple[EntryPoint, ...]]:
     """The entry points of installed packages, by name."""
     found: dict[str, tuple[EntryPoint, ...]] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, entry.value)):

@@ -1,4 +1,4 @@
-"""Output that is there whole or not at all.
+"""Atomic output: a file appears complete or not at all.
 
 A file is written under a temporary name in its own folder and moved over its final name with `os.replace` (atomic on
 POSIX and Windows) only when everything went well; any exception, KeyboardInterrupt included, removes the temporary one
@@ -27,7 +27,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     """Open `path` for writing bytes; it appears, or is replaced, when the block ends without an exception.
 
-    The temporary file is opened at once, so a folder one cannot write to is noticed before any work is done.
+    The temporary file is opened at once, so that a folder which is not writable is an error before any work is done.
     Raises `InputError` if the folder is missing or not writable, if `path` is not a regular file, or the disk full.
     """
     final, temporary, file = _opened(path)
@@ -84,9 +84,9 @@ def check_writable_folder(path: str | Path) -> None:
 
 
 def remove_leftovers(folder: str | Path, of: str | None = None) -> None:
-    """Remove the temporary files of this module that killed processes have left in a folder; nobody may be writing.
+    """Remove the temporary files that killed processes have left in a folder, while no process writes to it.
 
-    of: the name of the file or folder they were to become, None for any.
+    of: the final name of the file or folder, None for any.
     """
     for path in Path(folder).glob(".*.tmp"):
         leftover = LEFTOVER.fullmatch(path.name)
@@ -96,7 +96,7 @@ def remove_leftovers(folder: str | Path, of: str | None = None) -> None:
 
 
 def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:
-    """The file to write, its temporary stand-in, and that opened."""
+    """The file to write, its temporary file, and that file opened."""
     final = _final(path)
     if final.exists() and not final.is_file():
         kind = "a folder" if final.is_dir() else "no regular file"
@@ -110,14 +110,14 @@ def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:
 
 
 def _opened_folder(path: str | Path) -> tuple[Path, Path]:
-    """The folder to write, and its temporary stand-in, which is empty."""
+    """The folder to write, and its empty temporary folder."""
     final = _final(path)
     if final.exists() and not final.is_dir():
         raise InputError(f"{path}: expected the name of a folder to write to, this is a file")
     temporary = _temporary(final)
     try:
         temporary.mkdir()
-        if final.exists():  # writable as well? (the temporary folder lies beside it)
+        if final.exists():  # is it writable too? the temporary folder lies beside it
             probe = _temporary(final / "probe")
             probe.touch()
             probe.unlink()
@@ -129,11 +129,11 @@ def _opened_folder(path: str | Path) -> tuple[Path, Path]:
 
 
 def _final(path: str | Path) -> Path:
-    """`path` with links followed (so that they survive), in an existing folder."""
+    """`path` in an existing folder, with links followed, which keeps them."""
     try:
         final = Path(path).expanduser().resolve()
         with suppress(FileNotFoundError, NotADirectoryError):
-            final.stat()  # asks the system, which may not like the name
+            final.stat()  # raises for names that the system refuses
         if final.parent.is_dir():
             return final
         reason = "is not a folder" if final.parent.exists() else "does not exist"

@@ -1,6 +1,6 @@
-"""Opening files that others made: regular files alone.
+"""Opening input files, which must be regular files.
 
-A device may have no end, and a pipe without a writer never begins: both are refused before a byte is read.
+A device may be endless, and a pipe without a writer blocks: both are refused before a byte is read.
 """
 
 from __future__ import annotations

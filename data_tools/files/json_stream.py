@@ -1,8 +1,8 @@
 """Reading large JSON files one value at a time.
 
-`json.load` of the tables of a full nuScenes download holds several gigabytes at once; here the outermost array or
-object is walked and only its current entry is in memory. Entries are decoded by the standard library's C scanner, so
-the bare words NaN and Infinity are read as it reads them.
+`json.load` of the tables of a full nuScenes download needs several gigabytes; here only the current entry of the
+outermost array or object is in memory. Entries are decoded by the C scanner of the standard library, which accepts the
+words NaN and Infinity in result files (ijson, equally fast, refuses them).
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from data_tools.files.input_files import open_text
 from saga_fg.errors import InputError
 
 _SPACE = " \t\n\r"
-_DIGITS = 19  # of a number that is read as a whole one; longer ones are floats, which may be infinite
-_decoder = json.JSONDecoder(parse_int=lambda text: int(text) if len(text) <= _DIGITS else float(text))
+_DIGITS = 19  # longer integers are read as floats, which may be infinite
+_decoder = json.JSONDecoder(parse_int=lambda text: int(text) if len(text.lstrip("-")) <= _DIGITS else float(text))
 
 
 class JsonStream:
-    """A position in a JSON text that is read piece by piece. Every fault is an `InputError` with file and position."""
+    """A position in a JSON text that is read piece by piece. Every error is an `InputError` with file and position."""
 
     def __init__(self, file: TextIO, name: str, piece: int = 1 << 20) -> None:
         self._file, self._name, self._piece = file, name, piece
         self._text, self._at, self._before, self._ended = "", 0, 0, False
 
     def peek(self) -> str:
-        """The next character that is not a space, "" at the end of the text."""
+        """The next character that is no white space; "" at the end of the text."""
         while True:
             while self._at < len(self._text) and self._text[self._at] in _SPACE:
                 self._at += 1
@@ -89,12 +89,12 @@ class JsonStream:
         self.take("}")
 
     def end(self) -> None:
-        """Check that nothing follows."""
+        """Check that the text ends here."""
         if self.peek():
             raise self._fault("expected the end of the file")
 
     def _more(self) -> bool:
-        """Read on, at least doubling what is at hand; False at the end of the text."""
+        """Read the next piece, at least doubling the buffer; False at the end of the text."""
         if self._ended:
             return False
         rest = self._text[self._at :]

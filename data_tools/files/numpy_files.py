@@ -1,4 +1,4 @@
-"""NumPy's files from outside: plain arrays only, never pickled objects."""
+"""Reading NumPy files: plain arrays only, never pickled objects."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def load_archive(file: BinaryIO, wanted: Collection[str] | None = None) -> tuple
 
 
 def _first_line(error: Exception) -> str:
-    """What an exception says, without the rest of a long message."""
+    """The first line of the message of an exception."""
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
@@ -41,7 +41,7 @@ def _loaded(file: BinaryIO, wanted: Collection[str] | None) -> NDArray[Any] | tu
         return names, {name: _as_doubles(loaded[name]) for name in (names if wanted is None else names & set(wanted))}
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # a broken file ends in whatever the parts of NumPy's reader happen to raise
+    except Exception as error:  # NumPy's reader raises many types for broken files
         reason = _first_line(error)
         if "pickle" in reason:  # NumPy would advise to trust the file
             raise InputError("expected NumPy's format, with plain arrays and no pickled objects") from error
@@ -49,6 +49,6 @@ def _loaded(file: BinaryIO, wanted: Collection[str] | None) -> NDArray[Any] | tu
 
 
 def _as_doubles(array: NDArray[Any]) -> NDArray[Any]:
-    """Floats of whatever width as doubles; a signalling NaN becomes a quiet one without a warning."""
+    """Floats of any width as doubles; a signalling NaN becomes a quiet one without a warning."""
     with np.errstate(invalid="ignore"):
         return array.astype(np.float64, copy=False) if array.dtype.kind == "f" else array

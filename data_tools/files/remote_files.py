@@ -1,7 +1,7 @@
-"""Files by path or by URL: s3://bucket/a.csv, gs://..., https://..., and whatever else fsspec can open.
+"""Files by path or by URL: s3://bucket/a.csv, gs://..., https://..., and others that fsspec opens.
 
-Local paths need nothing. URLs need the extra `[remote]` (https://filesystem-spec.readthedocs.io) and the package that
-fsspec asks for, such as s3fs; credentials are those that package finds by itself.
+URLs need the extra `[remote]` (https://filesystem-spec.readthedocs.io) and the package of their protocol, such as s3fs,
+which finds credentials itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from saga_fg.errors import InputError, MissingExtraError
 
 
 def is_url(location: str) -> bool:
-    """Whether it is a URL rather than a path."""
+    """True for a URL, False for a path."""
     return "://" in location
 
 
@@ -31,7 +31,7 @@ def name_of(location: str) -> str:
 
 @contextmanager
 def local_copy(location: str) -> Iterator[Path]:
-    """A local file with the content of `location`, under its name: itself, or a copy for the length of the block.
+    """A local file with the content of `location`, under its name: itself, or a temporary copy.
 
     An `InputError` that is raised in the block, about the copy, names `location` instead.
 
@@ -53,9 +53,9 @@ def local_copy(location: str) -> Iterator[Path]:
 
 @contextmanager
 def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
-    """A local folder with the files below `location` that match: itself, or a copy for the length of the block.
+    """A local folder with the files below `location` that match: itself, or a temporary copy.
 
-    patterns: paths relative to `location`, with `*` for names; what is not there is left out. An `InputError` that is
+    patterns: paths relative to `location`, with `*` for names; missing files are left out. An `InputError` that is
     raised in the block, about a file of the copy, names `location` instead.
 
     Raises `InputError` where files cannot be read, `MissingExtraError` for a URL without the packages it takes.
@@ -66,7 +66,7 @@ def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
     file_system, remote = _file_system(location)
     remote = remote.rstrip("/")
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary).resolve()  # the system's folder for such may be a link
+        folder = Path(temporary).resolve()  # the system's temporary folder may be a link
         try:
             for found in (name for pattern in patterns for name in sorted(file_system.glob(f"{remote}/{pattern}"))):
                 path = folder / PurePosixPath(found).relative_to(remote)
@@ -83,17 +83,18 @@ def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
 
 
 def expanded(locations: Sequence[str]) -> list[str]:
-    """Paths and URLs, with patterns such as `*.csv` replaced by the sorted files they stand for, each file once.
+    """Paths and URLs, with patterns such as `*.csv` replaced by the sorted matching files, each file once.
 
-    A name ending in .txt is that of a list with one path, URL or pattern a line; relative paths start from here.
-    Paths come back as absolute ones.
+    A file ending in .txt is a list with one path, URL or pattern a line. Relative paths start from the working
+    directory; returned paths are absolute.
+
     Raises `InputError` for a pattern or list without files, and for a list that is in itself.
     """
     return _expanded(locations, ())
 
 
 def _expanded(locations: Sequence[str], lists: tuple[str, ...]) -> list[str]:
-    """lists: those whose lines are being expanded."""
+    """Expand `locations`; `lists` are the lists that contain them."""
     found: list[str] = []
     for location in locations:
         if location in lists:
@@ -116,7 +117,7 @@ def _expanded(locations: Sequence[str], lists: tuple[str, ...]) -> list[str]:
 
 @contextmanager
 def _called(copy: Path, location: str) -> Iterator[None]:
-    """In any `InputError` of the block, put the place a copy is of where the copy is named."""
+    """Replace the name of a copy by its `location` in every `InputError` of the block."""
     try:
         yield
     except InputError as error:
@@ -124,7 +125,7 @@ def _called(copy: Path, location: str) -> Iterator[None]:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and what it calls the file."""
+    """The file system of a URL, and the name of the file in it."""
     fsspec = _fsspec(url)
     try:
         file_system, name = fsspec.core.url_to_fs(url)

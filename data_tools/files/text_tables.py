@@ -12,7 +12,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 
 LONGEST = 100  # characters of a value
-LARGEST = 1e15  # number, whose square is far from overflow
+LARGEST = 1e15  # largest number; its square does not overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class TextTable:
     def of(cls, path: Path, rows: list[list[str]], line: list[int], columns: int = 0) -> TextTable:
         """A table of rows; `columns` is how many there are where there is no row. Raises `InputError` for long values.
 
-        NumPy stores all texts of an array as wide as the widest.
+        NumPy stores all texts of an array with the width of the longest.
         """
         for number, row in zip(line, rows, strict=True):
             longest = max(row, key=len, default="")

@@ -1,7 +1,7 @@
-"""The headers of PCD and PLY files, checked against what follows them.
+"""Validation of PCD and PLY files before Open3D reads them.
 
-A header that promises what is not there makes a C++ reader read or allocate beyond all bounds. So before a file goes
-to Open3D, every number in its header is checked, and that the points it speaks of are there.
+A wrong header makes a C++ reader read or allocate out of bounds. Therefore every number in the header is checked, and
+that the file contains the announced points.
 
 Sources: https://pointclouds.org/documentation/tutorials/pcd_file_format.html and
 http://paulbourke.net/dataformats/ply.

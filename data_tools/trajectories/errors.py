@@ -1,4 +1,4 @@
-"""How far is a trajectory from the true one? Absolute and relative errors.
+"""Absolute and relative errors of a trajectory (ATE and RPE).
 
 With P_k the true and Q_k the estimated world_T_ego, Q already aligned with P:
 
@@ -6,9 +6,9 @@ With P_k the true and Q_k the estimated world_T_ego, Q already aligned with P:
     relative, over d m of path    E_i = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j),      j(i) = the first pose with s_j - s_i >= d
 
 s being the true path's length. The relative error of a start i has a translation || trans E_i || in m and a rotation
-|| log rot E_i || in rad; the places of i run through all poses from which d more metres are driven. It does not depend
-on the alignment. Sources: Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012 (ATE, RPE);
-Geiger et al., Are we ready for autonomous driving?, CVPR 2012 (relative errors by length of path).
+|| log rot E_i || in rad; i runs through all poses with d more metres of path ahead. It does not depend on the
+alignment. Sources: Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012 (ATE, RPE); Geiger et
+al., Are we ready for autonomous driving?, CVPR 2012 (relative errors by length of path).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_tools.trajectories.alignment import Alignment, aligned
 from data_tools.trajectories.trajectory import Trajectory, matched
@@ -26,16 +27,16 @@ from saga_fg.numerics.geometry import inverse_transform
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Figures of one trajectory against the true one.
+    """Errors of one trajectory.
 
-    poses                  compared, each with the truth's pose of its time
+    poses                  number of compared poses
     path_length            of the truth, m
     ate                    root mean square of the absolute errors, m
     end_error              absolute error of the last pose, m
     relative_distance      d, m
-    pieces                 stretches of d m that were compared; 0 for a path shorter than that
-    relative_translation   mean over the stretches, m per d m; NaN without any
-    relative_rotation      mean over the stretches, rad per d m; NaN without any
+    pieces                 number of compared sections of d m; 0 for a shorter path
+    relative_translation   mean over the sections, m per d m; NaN without sections
+    relative_rotation      mean over the sections, rad per d m; NaN without sections
     """
 
     poses: int
@@ -54,7 +55,7 @@ def absolute_errors(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
 
 def relative_errors(estimate: Trajectory, truth: Trajectory, distance: float = 10.0) -> tuple[FloatArray, FloatArray]:
-    """Translation (s,) in m and rotation (s,) in rad of the relative error over each stretch of `distance` m.
+    """Translation (s,) in m and rotation (s,) in rad of the relative error over each section of `distance` m.
 
     Raises `InputError` for trajectories of different lengths and a distance that is not positive.
     """
@@ -72,17 +73,8 @@ def relative_errors(estimate: Trajectory, truth: Trajectory, distance: float = 1
 
 
 def rotation_angle(rotation: FloatArray) -> FloatArray:
-    """Angles (...) in [0, pi], rad, by which rotation matrices (..., 3, 3) turn."""
-    axis = np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    trace = np.trace(rotation, axis1=-2, axis2=-1)
-    return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1))
+    """Angles (...) in [0, pi], rad, of rotation matrices (..., 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).magnitude()).reshape(rotation.shape[:-2])
 
 
 def trajectory_errors(
@@ -92,7 +84,7 @@ def trajectory_errors(
     distance: float = 10.0,
     tolerance: float = 0.01,
 ) -> TrajectoryErrors:
-    """All figures; poses are matched by time, within `tolerance` s, and aligned as `aligned` says."""
+    """All errors; poses are matched by time, within `tolerance` s, and aligned as in `aligned`."""
     estimate, truth = matched(estimate, truth, tolerance)
     absolute = absolute_errors(estimate, truth, alignment)
     translation, rotation = relative_errors(estimate, truth, distance)

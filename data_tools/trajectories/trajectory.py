@@ -1,4 +1,4 @@
-"""A trajectory: where the vehicle was, at increasing times."""
+"""A trajectory: poses of the vehicle at increasing times."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import is_rotation
 
-_ORTHONORMAL = 1e-4  # the largest entry of R R^T - 1 that is let pass, as in `checked_transform`
+_ORTHONORMAL = 1e-4  # largest allowed entry of R R^T - 1, as in `checked_transform`
 
 
 @dataclass(frozen=True, eq=False)

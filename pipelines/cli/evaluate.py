@@ -80,15 +80,15 @@ def _tracked(
     source: DatasetSource, settings: TrackConfig, method: Method
 ) -> tuple[Mapping[str, SceneResult], Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
-    from pipelines.observers import Innovations as Watched
+    from pipelines.observers import InnovationRecorder
     from pipelines.tracking import track_dataset
 
-    watched = Watched()
+    recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-        runs = track_dataset(dataset, lambda: settings.new_tracker(method, watched), progress=progress)
+        runs = track_dataset(dataset, lambda: settings.new_tracker(method, recorder), progress=progress)
         result = Path(folder) / source.tracks_example
         source.write_tracks(result, dataset, ((run.scene, run.tracks) for run in runs))
-        return source.read_results(result), watched.by_class
+        return source.read_results(result), recorder.by_class
 
 
 def _evaluate_labels(

@@ -11,7 +11,7 @@ from pipelines.process import one_thread
 from pipelines.smoothing.config import SmoothConfig
 from pipelines.smoothing.labelling import count_labels, label_moments
 from pipelines.smoothing.passes import smooth_objects, track_evidence
-from pipelines.tracking import Progress
+from pipelines.tracking import Progress, scene_with_frames
 from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import LabelCounts, Labels, gather_evidence
 from saga_fg.types.dataset import Dataset, Scene
@@ -73,4 +73,4 @@ def smooth_dataset(
 ) -> Iterator[SmoothedScene]:
     """Smooth some recordings (default: all), one at a time as they are asked for."""
     for name in dataset.scenes if scenes is None else scenes:
-        yield smooth_scene(dataset.scene(name), config, method, progress)
+        yield smooth_scene(scene_with_frames(dataset, name), config, method, progress)

@@ -25,7 +25,7 @@ taken apart in between, the rest of its N acts through what had decayed to `Bloc
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,13 +108,12 @@ class MarginalCovariances:
     place: IntArray  # (n,) of each node among those of its size
 
     @staticmethod
-    def of(whole: SmoothedCovariance) -> MarginalCovariances:
-        """Marginals of all nodes."""
-        layout = whole.partition.layout
+    def of(layout: Layout, blocks: Callable[[IntArray], FloatArray]) -> MarginalCovariances:
+        """Marginals of all nodes; blocks: of rows whose states have equal size."""
         own, place = {}, np.empty(len(layout), dtype=np.int64)
         for d in np.unique(layout.dims).tolist():
             rows = np.flatnonzero(layout.dims == d)
-            own[d], place[rows] = whole.blocks(rows), np.arange(len(rows))
+            own[d], place[rows] = blocks(rows), np.arange(len(rows))
         return MarginalCovariances(layout, own, place)
 
     def blocks(self, rows: IntArray) -> FloatArray:

@@ -237,7 +237,7 @@ class Recording:
             return self._covariances
         if self._marginals is None:
             wholes = smoothed_covariances(self._steps, joint=False)
-            self._marginals = [MarginalCovariances.of(whole) for whole in wholes][::-1]
+            self._marginals = [MarginalCovariances.of(whole.partition.layout, whole.blocks) for whole in wholes][::-1]
         return self._marginals
 
     def graph(self, means: Sequence[FloatArray] | None = None) -> SceneFactorGraph:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import gtsam
@@ -81,8 +82,16 @@ class SparseSolution:
     def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
         """Marginals of all nodes, by epoch."""
         if self.known is None:
-            self.known = marginal_covariances(tree_covariances(self.tree, self.dims), self.keys, layouts)
+            blocks = tree_covariances(self.tree, self.dims)
+            self.known = [
+                MarginalCovariances.of(layout, partial(_blocks_of, blocks, keys, layout))
+                for keys, layout in zip(self.keys, layouts, strict=True)
+            ]
         return self.known
+
+
+def _blocks_of(blocks: Mapping[int, FloatArray], keys: Mapping[int, int], layout: Layout, rows: IntArray) -> FloatArray:
+    return np.array([blocks[keys[node]] for node in layout.nodes[rows].tolist()])
 
 
 def solved_tree(
@@ -130,21 +139,6 @@ def _mixed(values: gtsam.Values, step: gtsam.VectorValues, accelerated: Anderson
     for key, part in zip(keys, np.split(point, np.cumsum(sizes)[:-1]), strict=True):
         mixed.insert(key, part)
     return mixed
-
-
-def marginal_covariances(
-    blocks: Mapping[int, FloatArray], keys: Sequence[Mapping[int, int]], layouts: Sequence[Layout]
-) -> list[MarginalCovariances]:
-    """Marginals by epoch, from blocks by key; keys: of each epoch's nodes."""
-    epochs = []
-    for own, layout in zip(keys, layouts, strict=True):
-        by_size, place = {}, np.empty(len(layout), dtype=np.int64)
-        for d in np.unique(layout.dims).tolist():
-            rows = np.flatnonzero(layout.dims == d)
-            by_size[d] = np.array([blocks[own[node]] for node in layout.nodes[rows].tolist()])
-            place[rows] = np.arange(len(rows))
-        epochs.append(MarginalCovariances(layout, by_size, place))
-    return epochs
 
 
 def cheapest_order(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> Order:

@@ -32,7 +32,9 @@ from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_to
 from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.numerics.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.class_belief import ClassEvidence
+from saga_fg.tracking.ego_node import relative_covariances
 from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.retrodiction import past_cross_covariances, past_positions
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
@@ -64,15 +66,15 @@ class Candidates(NamedTuple):
 
 def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     """Match the measurements to the tracks, predicted to the time of the frame."""
-    table, joint, association = state.table, state.joint, state.settings.association
+    table, association = state.table, state.settings.association
     if len(table) == 0 or len(measurements) == 0:
         return Matching.empty()
     sensor, delay, cross = measurements.sensor, measurements.delay, None
-    position, P = joint.positions_before(table.id, table.label, delay)
+    position, P = past_positions(state, delay)
     if association.method == "graph":
-        cross = joint.cross_covariances_before(table.id, table.label, delay)
+        cross = past_cross_covariances(state, delay)
     if measurements.relative is not None:
-        P = joint.relative_covariances(table.id, table.label)
+        P = relative_covariances(state.joint, table.id, table.label)
     predicted = state.boxes(position, np.full_like(position, np.nan))
     expected = table.existence * sensor.detection_chance(table.label)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area

@@ -1,18 +1,18 @@
-"""The clock of a tracker: which frames are in time, which come too late, and when the clock itself was set.
+"""The clock of a tracker: whether a frame is in time or too late, and whether the clock itself was set.
 
-One frame with a broken timestamp must not take the tracker to another century, from where all that follows would be
+One frame with a broken timestamp must not take the tracker to another century, from where all later frames would be
 late; and a clock that was set must not stop the tracking. With `apart` the time of a frame less the newest time:
 
     -max_delay <= apart <= max_jump   accepted
     |apart| > max_jump                unconfirmed: left out, until a second frame of about that time confirms it
     else                              late: left out
 
-After a single frame nobody knows which of two times of a sensor is wrong, and the second is believed. A stream whose
-steps are longer than `max_jump` is known by two steps alike, and then has its own limit.
+With a single earlier frame it is unknown which of two times of a sensor is wrong, and the second is taken. A stream
+whose steps are longer than `max_jump` is recognised by two equal steps, and then has its own limit.
 
 A sensor whose own frames go back in time, `reset_after` new ones in a row, has had its clock set back; the tracker
-follows. Frames of others that come late, in a burst after a stall for instance, and frames that are sent again say
-nothing of the clock. A sensor that was never in time, since its own clock is wrong, confirms a jump only by
+follows. Late frames of other sensors, in a burst after a stall for instance, and frames that are sent again are no
+evidence on the clock. A sensor that was never in time, since its own clock is wrong, confirms a jump only by
 `reset_after` frames in a row.
 """
 
@@ -24,24 +24,24 @@ from typing import Literal
 
 from saga_fg.tracking.settings import ClockSettings
 
-REMEMBERED = 200  # accepted frames, by which sensors are known and what is sent again
+REMEMBERED = 200  # accepted frames, by which sensors and repeated frames are recognised
 
 TimeVerdict = Literal["accepted", "late", "unconfirmed", "set_ahead", "set_back"]
-"""About the time of a frame. A late or unconfirmed one was left out. With the others it was used, after the clock had
-been set to it where the verdict says so."""
+"""Verdict on the time of a frame: late and unconfirmed frames are left out, others used; with set_ahead and set_back
+the clock was first set to the frame's time."""
 Stamp = tuple[str, float]
 """Sensor and time of a frame, s."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """The newest time, s, and what speaks for another one. A value: `judged` returns the clock after a frame.
+    """The newest time, s, and the evidence for another one. A value: `judged` returns the clock after a frame.
 
     newest       of the frames accepted, -inf before the first
     accepted     the latest of them, since the clock was set
     step         the latest step of a slow stream, 0 of others, s
     doubtful     the latest frame that was left out, None if there is none since the latest accepted one
-    run          frames in a row that speak for the time of that one
+    run          frames in a row that support the time of that one
     """
 
     newest: float = -math.inf

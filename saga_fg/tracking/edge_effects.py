@@ -1,4 +1,4 @@
-"""What each edge of the scene graph contributed to a prediction: that with it less that without it.
+"""Effect of each edge of the scene graph on a prediction: the prediction with it less the one without it.
 
     effect of e on its target i = x_i(t + dt; all edges) - x_i(t + dt; all edges but e)
 

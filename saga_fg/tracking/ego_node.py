@@ -3,6 +3,9 @@
 It has the id 0 and a state of its own, (position, velocity) by the motion of its class. Its position is measured by
 every frame with a pose: the pose that comes with the frame, or the one estimated in the running graph, to which the
 node is then tied. By the edge rules drivers behind it follow it, also while they are hidden.
+
+A detection seen from an estimated pose (R, t) measures r = R^T (p - t) - z of the pose and the object's position p. The
+errors of both depend on earlier detections, so that a detection is compared with the covariance of r, not of p.
 """
 
 from __future__ import annotations
@@ -11,9 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factors import relative_detection_factors
 from saga_fg.errors import InputError
-from saga_fg.model.interactions import NodeTable
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.estimators import GraphFilter
+from saga_fg.graph import EGO_POSE, key_of
+from saga_fg.model.interactions import POSITION, NodeTable
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.ego_pose import RelativePositions
@@ -101,3 +107,28 @@ class EgoNode:
             None if moved is None else np.append(moved, self.has_moved),
             unseen=None if unseen is None else np.append(unseen, 0.0),
         )
+
+
+def relative_covariances(joint: JointTrackState, ids: IntArray, label: StrArray) -> FloatArray:
+    """Covariances (n, 2, 2) of positions relative to the vehicle's estimated pose, in the axes of the world."""
+    estimator = joint.estimator
+    assert isinstance(estimator, GraphFilter)
+    key = key_of(EGO_POSE, 0, estimator.graph().epoch)
+    pose = estimator.graph().state(key)
+    T, d, result = pose.matrix(), pose.dim(), np.zeros((len(ids), 2, 2))
+    n, turn = len(T) - 1, T[:2, :2]
+    for node_type, rows in joint.rows_by_type(label):
+        x, y = node_type.index(POSITION).tolist()
+        states, poses = estimator.mean(ids[rows]), np.broadcast_to(T, (len(rows), *T.shape))
+        places = np.tile(T[:n, n], (len(rows), 1))
+        places[:, :2] = states[:, [x, y]]
+        keys = np.stack([np.zeros(len(rows)), np.arange(1, len(rows) + 1)], axis=1).astype(np.uint64)
+        seen = relative_detection_factors(keys, (places - T[:n, n]) @ T[:n, :n], np.eye(2), node_type.dim, (x, y))
+        assert seen.jacobians is not None
+        J_pose, J_state = (np.asarray(J) for J in seen.jacobians(poses, states))
+        G = turn @ np.concatenate([J_pose, J_state], axis=2)
+        P = estimator.covariance_with([key], ids[rows])
+        for k, row in enumerate(rows.tolist()):
+            mine = np.r_[0:d, d + k * node_type.dim : d + (k + 1) * node_type.dim]
+            result[row] = G[k] @ P[np.ix_(mine, mine)] @ G[k].T
+    return result

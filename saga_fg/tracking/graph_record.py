@@ -1,11 +1,11 @@
-"""The running graph as a value that JSON can hold, to be drawn: variables where they are, factors by kind.
+"""The running graph as a value that JSON can hold, to be drawn: variables at their positions, factors by kind.
 
 nodes    name ("car 12 at 3.40 s"), kind, time (s; null: for all time), position [x, y], m, in the world; where known
          covariance (2, 2), m^2, and outline [[x, y], ...] of a box or of a line of the map
 factors  kind; nodes: their numbers in the list above; edges: the interaction function and the rate, 1/s, by which each
          node from the third on acts on the first
 
-Variables without a place, such as biases, are left out, and so are factors on these alone.
+Variables without a position, such as biases, are left out, and so are factors on these alone.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ class GraphRecord:
             if key not in numbers:
                 vector = covariance is not None and isinstance(graph.state(key), np.ndarray)
                 more = {"covariance": covariance(key)[:2, :2]} if covariance is not None and vector else {}
-                name, place = f"{variable.label} {variable.id}", _place(variable, graph) + origin
+                name, place = f"{variable.label} {variable.id}", _position(variable, graph) + origin
                 numbers[key] = self.node(variable.kind.name, name, variable.time, place, **more)
             return numbers[key]
 
         for factor in graph.factors():
-            on = [variable for variable in factor.variables if len(_place(variable, graph))]
+            on = [variable for variable in factor.variables if len(_position(variable, graph))]
             present = any(variable.epoch in (graph.epoch, None) for variable in on)
             if on and (known is None or (present and factor.provider not in ("interactions", "marginals"))):
                 self.factor(OWN.get(factor.provider, f"{factor.provider}: {factor.kind}"), [number(one) for one in on])
@@ -133,8 +133,8 @@ def _interactions(
             record.factor("interaction", nodes, edges=[[name, round(rate, 3)] for _, name, rate in on])
 
 
-def _place(variable: GraphVariable, graph: SceneFactorGraph) -> FloatArray:
-    """Where a variable is, (2,), m; (0,) for what has no place."""
+def _position(variable: GraphVariable, graph: SceneFactorGraph) -> FloatArray:
+    """Position (2,) of a variable, m; (0,) for one without a position."""
     state = graph.state(variable.key)
     if isinstance(state, gtsam.Pose2 | gtsam.Pose3):
         return np.asarray(state.translation())[:2]

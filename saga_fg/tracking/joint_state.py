@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
-from saga_fg.graph import FactorProvider, SceneFactorGraph
+from saga_fg.graph import FactorProvider
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.node import Motion, NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
-from saga_fg.numerics.pairwise_costs import CrossCovariances
 from saga_fg.providers import RelativeDetections
-from saga_fg.tracking.ego_pose import RelativePositions, local_pose, relative_covariances
+from saga_fg.tracking.ego_pose import RelativePositions, local_pose
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.names import EstimatorName
-from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion, past_position
+from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
 from saga_fg.types.frame import Frame
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m
@@ -167,80 +166,47 @@ class JointTrackState:
 
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
         """Set the frame that providers see from now on; positions are from `origin` (2,)."""
-        estimator = self.estimator
-        if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.set_frame(frame, origin)
+        if isinstance(self.estimator, GraphFilter | JointKalmanFilter) and self.estimator.providers:
+            self.estimator.set_frame(frame, origin)
             self._changed()
 
     def ask_providers(self) -> None:
         """Let factor providers add their factors."""
-        estimator = self.estimator
-        if isinstance(estimator, GraphFilter | JointKalmanFilter) and estimator.providers:
-            estimator.ask_providers()
+        if isinstance(self.estimator, GraphFilter | JointKalmanFilter) and self.estimator.providers:
+            self.estimator.ask_providers()
             self._changed()
 
     @property
     def empty(self) -> bool:
         """Whether there is neither a track nor any other variable."""
         estimator = self.estimator
-        beside = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
-        return len(estimator.nodes) + len(beside) == 0
+        others = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
+        return len(estimator.nodes) + len(others) == 0
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
-        estimator = self.estimator
-        if isinstance(estimator, JointKalmanFilter):
-            return local_pose(estimator.auxiliary)
-        return local_pose(estimator.graph()) if isinstance(estimator, GraphFilter) else None
-
-    def relative_covariances(self, ids: IntArray, label: StrArray) -> FloatArray:
-        """Covariances (n, 2, 2) of the tracks' positions relative to the vehicle's pose in the running graph."""
-        assert isinstance(self.estimator, GraphFilter)
-        return relative_covariances(self.estimator, ids, self.rows_by_type(label))
-
-    def running_graph(self) -> SceneFactorGraph:
-        """The estimator's graph."""
-        return self.estimator.graph()
+        if isinstance(self.estimator, JointKalmanFilter):
+            return local_pose(self.estimator.auxiliary)
+        return local_pose(self.estimator.graph()) if isinstance(self.estimator, GraphFilter) else None
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """The estimates of all tracks; `ids` must be in the order of the last call until the state changes."""
         if self._kinematics is None or len(self._kinematics.P) != len(ids):
-            self._kinematics = self._read(ids, label)
+            self._kinematics = self.kinematics_of(ids, label)
         return self._kinematics
 
     def kinematics_of(self, ids: IntArray, label: StrArray) -> Kinematics:
         """The estimates of some nodes, which need not be tracks."""
-        return self._read(ids, label)
-
-    def positions_before(self, ids: IntArray, label: StrArray, delay: float) -> tuple[FloatArray, FloatArray]:
-        """Positions (n, 2) `delay` s ago, by own motion, and their covariances (n, 2, 2)."""
-        if delay == 0:
-            now = self.kinematics(ids, label)
-            return now.position, now.P
-        position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
-        for node_type, rows in self.rows_by_type(label, moving=True):
-            H, R = moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
-            position[rows] = self.estimator.mean(ids[rows]) @ H.T
-            P[rows] = H @ self.estimator.covariance(ids[rows]) @ H.T + R
-        return position, P
-
-    def cross_covariances_before(self, ids: IntArray, label: StrArray, delay: float) -> CrossCovariances:
-        """Covariances between positions `delay` s ago, by own motion, of correlated pairs of tracks (rows of `ids`)."""
-        groups = self.rows_by_type(label, moving=True)
-        group = np.zeros(len(ids), dtype=np.int64)
-        for number, (_, rows) in enumerate(groups):
-            group[rows] = number
-        x = self.estimator.posterior()
-        nodes = x.layout.rows(ids)
-        first, second = x.correlated(nodes)
-        past = [past_position(node_type, delay) for node_type, _ in groups]
-        C = np.zeros((len(first), 2, 2))
-        for a, H_a in enumerate(past):
-            for b, H_b in enumerate(past):
-                mine = np.flatnonzero((group[first] == a) & (group[second] == b))
-                if len(mine):
-                    C[mine] = H_a @ x.between(nodes[first[mine]], nodes[second[mine]]) @ H_b.T
-        return CrossCovariances(first, second, C)
+        n = len(ids)
+        result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
+        for node_type, rows in self.rows_by_type(label):
+            mean, covariance = self.estimator.mean(ids[rows]), self.estimator.covariance(ids[rows])
+            at_p = node_type.index(POSITION)
+            result.position[rows], result.P[rows] = mean[:, at_p], covariance[:, at_p[:, None], at_p]
+            if node_type.has(VELOCITY):
+                at_v = node_type.index(VELOCITY)
+                result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
+        return result
 
     def snapshot(self) -> Any:
         """The state as a value."""
@@ -306,15 +272,3 @@ class JointTrackState:
             return [(types[0], np.arange(len(label)))]
         of_row = np.array(kind, dtype=np.int64)[index]
         return [(types[kind.index(k)], np.flatnonzero(of_row == k)) for k in range(len(number))]
-
-    def _read(self, ids: IntArray, label: StrArray) -> Kinematics:
-        n = len(ids)
-        result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
-        for node_type, rows in self.rows_by_type(label):
-            mean, covariance = self.estimator.mean(ids[rows]), self.estimator.covariance(ids[rows])
-            at_p = node_type.index(POSITION)
-            result.position[rows], result.P[rows] = mean[:, at_p], covariance[:, at_p[:, None], at_p]
-            if node_type.has(VELOCITY):
-                at_v = node_type.index(VELOCITY)
-                result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
-        return result

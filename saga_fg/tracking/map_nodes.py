@@ -73,7 +73,7 @@ class MapNodes:
         return dict(zip(COLOURS, self.beliefs[light].tolist(), strict=True))
 
     def add(self, road_map: RoadMap, origin: FloatArray, joint: JointTrackState) -> None:
-        """Add what is new in a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
+        """Add the new elements of a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
         new = [(name, *rest) for name, *rest in _elements(road_map) if name not in self.name]
         if not new:
             return

@@ -1,4 +1,4 @@
-"""What settings and options choose among by name."""
+"""Names of estimators and of association methods in settings and options."""
 
 from typing import Literal
 

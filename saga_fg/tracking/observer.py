@@ -65,7 +65,7 @@ class TrackerView:
         matching: Matching | None = None,
         initiated: IntArray | None = None,
     ) -> TrackerView:
-        """View a state and what is known of a frame so far."""
+        """View a state and the results of a frame so far."""
         table, now = state.table.snapshot(), state.kinematics()
         table.last_detected += state.start
         table.last_in_view += state.start
@@ -81,7 +81,7 @@ class TrackerView:
             matching,
             np.empty(0, dtype=np.int64) if initiated is None else initiated,
             state.boxes(now.position, now.velocity),
-            state.joint.running_graph() if state.providers else None,
+            state.joint.estimator.graph() if state.providers else None,
         )
 
     def positions(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Parts of users' own by name: MODULE:NAME of something that makes one when it is called with its settings."""
+"""Parts of users' own by name: MODULE:NAME of a class or function that makes one when called with its settings."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def new_provider(entry: str | FactorProvider) -> FactorProvider:
 
 
 def made_by_name(setting: str, entry: Any, expected: str) -> Any:
-    """Make what a name in a setting stands for, without arguments; a copy of what is made already.
+    """Make the part that a name in a setting stands for, without arguments; copy one that is made already.
 
-    `expected` ends in the method that it must have. Raises `InputError` for what has none.
+    `expected` ends in the name of the method it must have. Raises `InputError` for a part without it.
     """
     made = deepcopy(entry)
     if isinstance(entry, str):
@@ -35,7 +35,7 @@ def made_by_name(setting: str, entry: Any, expected: str) -> Any:
 
 
 def named(name: str, setting: str = "providers") -> Any:
-    """What a name such as "my_module:WallDistance" in a setting is of.
+    """Look up a name such as "my_module:WallDistance" in a setting.
 
     Imports the module, which runs its code. Raises `InputError` for a name that leads to nothing.
     """

@@ -1,4 +1,4 @@
-r"""Report: the tracks that are believed and were detected recently, with a score and a calibrated covariance.
+r"""Report: the tracks of sufficient existence that were detected recently, with a score and a calibrated covariance.
 
     score       p ( hits / (opportunities + prior_opportunities) )^w           when detected; while coasting times r and
                                                                    coasting_score_factor

@@ -187,7 +187,9 @@ class Tracker:
         self._state.restore(snapshot)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), (self.settings, self.sensors, self.rules, None, self.providers), self.snapshot())
+        return type(self), (self.settings, self.sensors, self.rules, None, self.providers), self.snapshot()
+
+    __setstate__ = restore
 
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
@@ -225,7 +227,7 @@ class Tracker:
     @property
     def running_graph(self) -> SceneFactorGraph:
         """The factor graph of the estimator: variables, factors, values; with `providers` the one that runs."""
-        return self._state.joint.running_graph()
+        return self._state.joint.estimator.graph()
 
     @property
     def map_nodes(self) -> MapNodes:
@@ -245,9 +247,3 @@ class Tracker:
         if settings.ego is not None and settings.ego.estimated:
             return 0.0  # the vehicle's earlier poses are not kept
         return max(settings.max_delay, self._state.joint.window)
-
-
-def _restored(kind: type[Tracker], arguments: tuple[Any, ...], snapshot: TrackerSnapshot) -> Tracker:
-    tracker = kind(*arguments)
-    tracker.restore(snapshot)
-    return tracker

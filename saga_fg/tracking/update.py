@@ -15,6 +15,7 @@ from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
+from saga_fg.tracking.retrodiction import past_positions
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic_flow import Passages
 
@@ -29,7 +30,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
     R, with_velocity = measurements.R[d], measurements.with_velocity[d]
     if state.settings.stationarity.prior > 0:
-        position, P = state.joint.positions_before(table.id, table.label, delay)
+        position, P = past_positions(state, delay)
         moving = state.kinematics()._replace(position=position, P=P).select(t)
         table.stationarity.update(t, z, R, moving, with_velocity)
     relative = None if measurements.relative is None else measurements.relative.select(d)

@@ -1,4 +1,4 @@
-"""A start for pose-graph optimisation that needs no guess: rotations first, then positions, each a linear problem.
+"""A start for pose-graph optimisation without a guess: rotations first, then positions, each a linear problem.
 
 Rotations, relaxed to matrices and anchored at R_0 = 1 (chordal relaxation):
 
@@ -16,16 +16,16 @@ estimation and its use in pose graph optimization", ICRA 2015; the weights are t
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse import bsr_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph.graph import PoseGraph
 
 
 def chordal_poses(graph: PoseGraph) -> FloatArray:
-    """Poses (N, d + 1, d + 1) from the measurements alone; the first keeps its place.
+    """Return poses (N, d + 1, d + 1) from the measurements alone; the first is fixed.
 
     Raises `InputError` for a graph that is not connected.
     """
@@ -43,7 +43,7 @@ def chordal_poses(graph: PoseGraph) -> FloatArray:
 
 
 def nearest_rotations(matrices: FloatArray) -> FloatArray:
-    """The rotations (N, d, d) nearest to matrices (N, d, d) in the Frobenius norm."""
+    """Return the rotations (N, d, d) nearest to matrices (N, d, d) in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(matrices)
     sign = np.ones(U.shape[:2])
     sign[:, -1] = np.linalg.det(U @ Vt)
@@ -52,35 +52,29 @@ def nearest_rotations(matrices: FloatArray) -> FloatArray:
 
 def _rotations(graph: PoseGraph, weight: FloatArray) -> FloatArray:
     """With X_i = R_i^T the residual of an edge is X_second - R_e^T X_first, for each column of X alike."""
-    d, n, m = graph.dim, len(graph), len(graph.first)
+    d = graph.dim
     R = graph.first_T_second[:, :d, :d]
-    edge = np.arange(m)
-    blocks = np.concatenate([-R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape)])
-    A = _block_matrix(np.concatenate([edge, edge]), np.concatenate([graph.first, graph.second]), blocks, (m, n))
-    X = _anchored(A, np.repeat(weight, d), np.zeros((m * d, d)), np.eye(d))
-    return nearest_rotations(X.reshape(n, d, d).swapaxes(1, 2))
+    A = _edge_matrix(graph, -R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape))
+    X = _anchored(A, np.repeat(weight, d), np.zeros((len(R) * d, d)), np.eye(d))
+    return nearest_rotations(X.reshape(-1, d, d).swapaxes(1, 2))
 
 
 def _positions(graph: PoseGraph, R: FloatArray, weight: FloatArray) -> FloatArray:
-    d, n, m = graph.dim, len(graph), len(graph.first)
-    edge = np.arange(m)
-    blocks = np.concatenate([-np.ones((m, 1, 1)), np.ones((m, 1, 1))])
-    A = _block_matrix(np.concatenate([edge, edge]), np.concatenate([graph.first, graph.second]), blocks, (m, n))
+    d, ones = graph.dim, np.ones((len(graph.first), 1, 1))
     moved = (R[graph.first] @ graph.first_T_second[:, :d, d:])[:, :, 0]
-    return _anchored(A, weight, moved, np.zeros((1, d)))
+    return _anchored(_edge_matrix(graph, -ones, ones), weight, moved, np.zeros((1, d)))
 
 
-def _block_matrix(row: IntArray, column: IntArray, blocks: FloatArray, shape: tuple[int, int]) -> csc_array:
-    """The sparse matrix of square blocks (K, b, b) at these block rows and columns."""
-    b = blocks.shape[1]
-    rows = np.broadcast_to(row[:, None, None] * b + np.arange(b)[:, None], blocks.shape)
-    columns = np.broadcast_to(column[:, None, None] * b + np.arange(b), blocks.shape)
-    entries = (blocks.ravel(), (rows.ravel(), columns.ravel()))
-    return coo_array(entries, shape=(shape[0] * b, shape[1] * b)).tocsc()
+def _edge_matrix(graph: PoseGraph, first: FloatArray, second: FloatArray) -> csc_array:
+    """Return the sparse matrix with a row of blocks for each edge: (M, b, b) in the columns of its two poses."""
+    m, b = first.shape[:2]
+    blocks, columns = np.stack([first, second], axis=1), np.stack([graph.first, graph.second], axis=1)
+    entries = (blocks.reshape(-1, b, b), columns.ravel(), 2 * np.arange(m + 1))
+    return bsr_array(entries, shape=(m * b, len(graph) * b)).tocsc()
 
 
 def _anchored(A: csc_array, weight: FloatArray, b: FloatArray, anchor: FloatArray) -> FloatArray:
-    """x minimising sum_i weight_i (A x - b)_i^2 with its first rows fixed at `anchor`."""
+    """Return x minimising sum_i weight_i (A x - b)_i^2 with its first rows fixed at `anchor`."""
     fixed, free = A[:, : len(anchor)], A[:, len(anchor) :]
     if free.shape[1] == 0:
         return anchor

@@ -1,0 +1,189 @@
+"""A new dataset in one file, the example of the documentation: installed as a package, it has all verbs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from data_tools.datasets import registry
+from data_tools.datasets.source import DatasetSource
+from pipelines.cli import app
+from saga_fg.errors import InputError
+
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "add-a-dataset.md"
+
+
+def saga_fg(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def install(folder: Path, package: str, **datasets: str) -> None:
+    """Metadata of an installed package that offers datasets."""
+    metadata = folder / f"{package}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    entries = "".join(f"{name} = {location}\n" for name, location in datasets.items())
+    (metadata / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{entries}")
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder that Python imports from, in which packages can be installed."""
+    folder = tmp_path / "packages"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    registry.external_datasets.cache_clear()
+    yield folder
+    registry.external_datasets.cache_clear()
+
+
+@pytest.fixture
+def square(packages: Path, tmp_path: Path) -> Iterator[Path]:
+    """The dataset of the documentation, installed; recordings of it, made as there."""
+    text = PAGE.read_text(encoding="utf-8")
+    (source,) = re.findall(r"^cat > square.py <<'END'\n(.*?)^END$", text, flags=re.M | re.S)
+    assert len([line for line in source.splitlines() if line.strip()]) <= 60
+    (packages / "square.py").write_text(source)
+    install(packages, "city-square", square="square:Square")
+    (recordings,) = re.findall(r"^```python\n(.*?)^```$", text, flags=re.M | re.S)
+    run = subprocess.run([sys.executable, "-c", recordings], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    yield tmp_path / "recordings"
+    sys.modules.pop("square", None)
+
+
+def test_it_is_listed_and_has_its_options_and_an_example(square: Path) -> None:
+    assert re.search(r"^  square +Pedestrians on a square, seen from above\.$", saga_fg("track", "-h").stdout, re.M)
+    text = saga_fg("track", "square", "--help").stdout
+    assert "  --folder <str>" in text
+    assert "    saga-fg track square --folder FOLDER --output tracks.csv\n" in text
+
+
+def test_it_has_all_verbs(square: Path, tmp_path: Path) -> None:
+    options, tracks, labels = ("--folder", square), tmp_path / "tracks.csv", tmp_path / "labels"
+    for arguments in (
+        ("track", "square", *options, "-o", tracks, "--explain"),
+        ("evaluate", "square", tracks, *options, "--innovations", "--json", tmp_path / "figures.json"),
+        ("evaluate", "square", *options, "--method", "kf"),
+        ("report", "square", tracks, *options, "-o", tmp_path / "report.html"),
+        ("smooth", "square", *options, "-o", labels),
+        ("evaluate", "labels", "square", labels, *options),
+        ("learn", "noise", "square", *options, "-o", tmp_path / "noise.yaml"),
+        ("track", "square", *options, "-o", tmp_path / "again.csv", "--config", tmp_path / "noise.yaml"),
+    ):
+        result = saga_fg(*arguments)
+        assert result.exit_code == 0, (arguments, result.output)
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["scenes"] == ["day0", "day1"]
+    assert figures["tracking"]["overall"]["mota"] > 0.95
+    assert figures["innovations"]["pedestrian"]["matches"] > 300
+    result = saga_fg("learn", "interactions", "square", *options, "-o", tmp_path / "interactions.yaml")
+    assert result.exit_code == 0, result.output
+
+
+def test_it_can_be_viewed(square: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="files for Foxglove come with the extra mcap")
+    assert saga_fg("track", "square", "--folder", square, "-o", tmp_path / "tracks.csv").exit_code == 0
+    result = saga_fg("view", "square", tmp_path / "tracks.csv", "--folder", square, "--save", tmp_path / "a.mcap")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "a.mcap").stat().st_size > 1000
+
+
+def rows(output: Path) -> str:
+    """The tables of all parts as one."""
+    tables = [path.read_text().splitlines(True) for path in sorted(output.iterdir())]
+    return "".join([tables[0][0], *(row for table in tables for row in table[1:])])
+
+
+def test_it_runs_in_parallel_and_again_only_what_has_changed(square: Path, tmp_path: Path) -> None:
+    for verb, serial, parts in (("track", "tracks.csv", "tracks"), ("smooth", "labels/labels.csv", "labels")):
+        run = (verb, "square", "--folder", square, "-o")
+        assert saga_fg(*run, tmp_path / Path(serial).parts[0]).exit_code == 0
+        result = saga_fg(*run, tmp_path / f"{verb}-run", "--workers", "2")
+        assert result.exit_code == 0, result.output
+        assert rows(tmp_path / f"{verb}-run" / parts) == (tmp_path / serial).read_text()
+    again = saga_fg("track", "square", "--folder", square, "-o", tmp_path / "track-run", "--workers", "1")
+    assert "2 scenes: 0 done, 2 unchanged, 0 failed" in again.stdout
+
+
+def test_it_runs_on_ray(square: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray comes with the extra ray")
+    run = ["track", "square", "--folder", str(square), "-o"]
+    command = [sys.executable, "-c", "from pipelines.cli.main import main; main()", *run, str(tmp_path / "run")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    on_ray = [*command, "--ray", "local", "--workers", "2"]
+    done = subprocess.run(on_ray, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert saga_fg(*run, tmp_path / "tracks.csv").exit_code == 0
+    assert rows(tmp_path / "run" / "tracks") == (tmp_path / "tracks.csv").read_text()
+
+
+def test_by_module_and_class_it_need_not_be_installed(square: Path, tmp_path: Path) -> None:
+    result = saga_fg("track", "square:Square", "--folder", square, "-o", tmp_path / "tracks.csv")
+    assert result.exit_code == 0, result.output
+    for name, message in (("square:Round", "has no attribute 'Round'"), ("none_such:A", "No module named 'none_such'")):
+        result = saga_fg("track", name, "--folder", square)
+        assert result.exit_code == 2
+        assert message in result.stderr
+
+
+def test_a_broken_package_is_named_and_hinders_no_other(packages: Path, square: Path, tmp_path: Path) -> None:
+    install(packages, "bad-cameras", cameras="no_such_module:Cameras", odd="json:JSONDecoder")
+    listed = saga_fg("track", "--help").stdout
+    assert re.search(r"^  cameras +Cannot be loaded: dataset cameras of the package", listed, re.M)
+    expected = {"cameras": "no_such_module:Cameras cannot be loaded: ModuleNotFoundError", "odd": "DatasetSource"}
+    for name, message in expected.items():
+        result = saga_fg("track", name, "--folder", "x", "-o", "y")
+        assert result.exit_code == 2
+        assert result.stderr.startswith(f"error: dataset {name} of the package bad-cameras: ")
+        assert message in result.stderr
+    assert saga_fg("track", "square", "--folder", square, "-o", tmp_path / "tracks.csv").exit_code == 0
+
+
+def test_a_name_belongs_to_one_package(packages: Path) -> None:
+    install(packages, "one", lidar="a:A", kitti="a:A")
+    install(packages, "two", lidar="b:B")
+    with pytest.raises(InputError, match="dataset lidar: expected one package to offer it, one and two do"):
+        registry.dataset_source("lidar")
+    with pytest.raises(InputError, match="dataset kitti: expected one package to offer it, one and saga-fg do"):
+        registry.dataset_source("kitti")
+    with pytest.raises(InputError, match="unknown dataset 'kity'; did you mean 'kitti'"):
+        registry.dataset_source("kity")
+
+
+@pytest.mark.parametrize("name", registry.BUILT_IN)
+def test_those_that_come_along_are_sources(name: str) -> None:
+    source = registry.dataset_source(name)
+    assert issubclass(source, DatasetSource)
+    assert source.name == name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("evaluate", "file", "tracks.csv"), "error: evaluate file: expected ground truth, there is none"),
+        (("track", "nothing"), "error: unknown dataset 'nothing'"),
+        (("evaluate", "simulated", "tracks.csv", "--method", "kf"), "error: --method kf: goes without a result"),
+        (
+            ("learn", "interactions", "kitti", "--dataroot", "kitti", "-o", "out"),
+            "error: kitti: expected a folder with oxts/ and calib/",
+        ),
+        (("smooth", "eth_ucy", "--dataroot", ".", "-o", "out"), "error: .: expected eth/obsmat.txt"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = saga_fg(*arguments)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(message)
+    assert len(result.stderr.splitlines()) == 1
