@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.label_table import LabelRows, read_label_table
+from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.results import scene_result
 from data_tools.evaluation.placed_detections import placed_detections
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import SceneBoxes, coverages
@@ -37,7 +38,6 @@ DISTANCES = (0.5, 1.0, 2.0)  # m
 PRECISIONS = (0.9, 0.8, 0.7)
 RANGES = ((0.0, 20.0), (20.0, 40.0), (40.0, np.inf))  # m
 SYSTEMS = ("detections", "online", "labels")
-SAME_TIME = 1e-4  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ def evaluate_labels(
         systems = {
             "detections": _detections(scene, config),
             "online": SceneBoxes.of_tracks(online.tracks),
-            "labels": _labels(scene, rows, table),
+            "labels": scene_result(scene, rows.tracks, table).found,
         }
         first = len(np.concatenate([np.empty(0), *timestamps]))
         for system, found in systems.items():
@@ -137,7 +137,9 @@ def evaluate_labels(
     times = np.concatenate([np.empty(0), *timestamps])
     moment, boxes, R = zip(*seen, strict=True)
     noise = np.concatenate(moment), Boxes.concatenate(boxes), np.concatenate(R)
-    consistency = {name: self_consistency(_joined(parts[name]), times, noise) for name in ("online", "labels")}
+    consistency = {
+        name: self_consistency(SceneBoxes.concatenate(parts[name]), times, noise) for name in ("online", "labels")
+    }
     curves: dict[float, dict[str, PrecisionRecall]] = {}
     same: dict[float, CommonBoxes] = {}
     if len(labelled) == len(scenes):
@@ -150,22 +152,6 @@ def evaluate_labels(
             }
             same[distance] = CommonBoxes.pool(common_boxes(scene, distance) for scene in labelled)
     return LabelEvaluation(tuple(scenes), curves, same, consistency)
-
-
-def _labels(scene: Scene, rows: LabelRows, table: str | Path) -> SceneBoxes:
-    """The rows of a scene at its moments."""
-    mine = np.flatnonzero(rows.tracks.scene == scene.name)
-    times = scene.timestamps
-    moment = np.clip(np.searchsorted(times, rows.tracks.timestamp[mine] - SAME_TIME), 0, len(times) - 1)
-    off = np.abs(times[moment] - rows.tracks.timestamp[mine]) > SAME_TIME
-    if off.any():
-        time = rows.tracks.timestamp[mine][np.argmax(off)]
-        raise InputError(f"{table}: scene {scene.name}: timestamp {time:.6f} s: expected one of the scene's moments")
-    order = np.argsort(moment, kind="stable")
-    mine = mine[order]
-    tracks = rows.tracks
-    boxes = tracks.boxes.select(mine)
-    return SceneBoxes(moment[order], tracks.id[mine], boxes, tracks.score[mine], tracks.position_covariance[mine])
 
 
 def _detections(scene: Scene, config: SmoothConfig) -> SceneBoxes:
@@ -205,17 +191,6 @@ def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
     """The same with moments from `first` on and ids that name the scene."""
     names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
     return replace(table, frame=table.frame + first, id=names)
-
-
-def _joined(tables: Sequence[SceneBoxes]) -> SceneBoxes:
-    """The boxes of several scenes whose moments follow each other."""
-    return SceneBoxes(
-        np.concatenate([t.frame for t in tables]),
-        np.concatenate([t.id for t in tables]),
-        Boxes.concatenate([t.boxes for t in tables]),
-        np.concatenate([t.score for t in tables]),
-        np.concatenate([t.position_covariance for t in tables]),
-    )
 
 
 def _recall_table(curves: Mapping[float, Mapping[str, PrecisionRecall]]) -> FigureTable:

@@ -20,8 +20,8 @@ GROUP = "saga_fg.datasets"
 BUILT_IN = {
     "nuscenes": "data_tools.datasets.nuscenes.source:NuScenesSource",
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
-    "argoverse2": "data_tools.datasets.argoverse2.dataset:ArgoverseSource",
-    "eth_ucy": "data_tools.datasets.eth_ucy.dataset:EthUcySource",
+    "argoverse2": "data_tools.datasets.argoverse2:ArgoverseSource",
+    "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
     "simulated": "data_tools.simulator.source:SimulatedSource",
 }

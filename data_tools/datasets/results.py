@@ -14,7 +14,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
 
-_SAME_TIME = 1e-6  # s
+_SAME_TIME = 1e-4  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +39,10 @@ def read_table_results(path: Path, dataset: Dataset | None) -> dict[str, SceneRe
     rows = read_tracks(path)
     there = tuple(dict.fromkeys(rows.scene.tolist()))
     if dataset is None:
-        return {name: _placed(_scene(rows, name), rows, path) for name in there}
+        return {name: scene_result(_scene(rows, name), rows, path) for name in there}
     if there and not set(there) & set(dataset.scenes):
         raise InputError(f"{path}: {unknown_name('scene', there[0], dataset.scenes)}")
-    return {name: _placed(dataset.scene(name), rows, path) for name in dataset.scenes}
+    return {name: scene_result(dataset.scene(name), rows, path) for name in dataset.scenes}
 
 
 def _scene(rows: TrackRows, name: str) -> Scene:
@@ -53,8 +53,8 @@ def _scene(rows: TrackRows, name: str) -> Scene:
     return Scene(name, times, poses, ("",) * len(times), ())
 
 
-def _placed(scene: Scene, rows: TrackRows, path: Path) -> SceneResult:
-    """The rows of a scene at its moments."""
+def scene_result(scene: Scene, rows: TrackRows, path: str | Path) -> SceneResult:
+    """The rows of a scene at its moments. Raises `InputError` for times that are none; `path` is named."""
     mine: IntArray = np.flatnonzero(rows.scene == scene.name)
     moment = np.searchsorted(scene.timestamps, rows.timestamp[mine] - _SAME_TIME)
     at = np.minimum(moment, len(scene) - 1)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
-from pipelines.config import Family, TrackConfig
-from pipelines.configuration import load_settings, read_settings
+from pipelines.config import Family, TrackConfig, load_config
+from pipelines.configuration import load_settings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -50,10 +49,9 @@ class SlamConfig(TrackConfig):
 
 
 def load_slam_config(family: Family, path: Path | None = None) -> SlamConfig:
-    """The defaults shipped for a kind of data, with what a YAML file overrides.
+    """Return the defaults shipped for a kind of data, with the overrides of a YAML file.
 
-    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    Raises `InputError` naming the file and the dotted key of an error in it.
     """
-    shipped = files("pipelines") / "configs" / f"{family}.yaml"
-    config = read_settings(SlamConfig, shipped.read_text(encoding="utf-8"), shipped.name)
+    config = SlamConfig(**vars(load_config(family)))
     return config if path is None else load_settings(SlamConfig, path, config)

@@ -2,7 +2,7 @@
 
     prior         the first pose
     odometry      || log( (T_k^-1 T_(k+1))^-1  D_k ) ||_{P_k}      between successive keyframes
-    landmarks     walls, ground and poles seen from keyframes, told apart online (`saga_fg.slam.mapping`)
+    landmarks     walls, ground and poles observed at keyframes, associated online (`saga_fg.slam.mapping`)
     loops         || log( (T_i^-1 T_j)^-1  L_ij ) ||, robust       places that the vehicle came back to
 
 Online, every keyframe is placed when it comes, by the joint Gaussian of pose and landmarks; the whole graph is smoothed

@@ -11,7 +11,8 @@ frames (0.2 s) to either side; the poses it rests on jump by decimetres in place
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,10 +20,11 @@ import numpy as np
 
 from data_tools.central_differences import central_differences
 from data_tools.datasets.kitti.calibration import Calibration, read_calibration
-from data_tools.datasets.kitti.detections import detection_files, read_kitti_detections
+from data_tools.datasets.kitti.detections import CLASS_CODES, detection_files, read_kitti_detections
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.kitti.oxts import read_poses
 from data_tools.files.error_messages import error_context, unknown_name
+from data_tools.files.remote_files import local_tree
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -133,3 +135,21 @@ class KittiTracking:
         bounds = np.searchsorted(objects.frame[order], np.arange(len(times) + 1)).tolist()
         moments = (order[bounds[k] : bounds[k + 1]] for k in range(len(times)))
         return [Annotations(ids[rows], boxes.select(rows), visible[rows]) for rows in moments]
+
+
+@contextmanager
+def local_kitti(
+    dataroot: str, detections: str | None = None, sequences: Collection[str] | None = None, ground_truth: bool = False
+) -> Iterator[KittiTracking]:
+    """The sequences (None: all), for the length of the block; the folders of `KittiTracking` by path or URL.
+
+    Raises `InputError` as `KittiTracking` does, naming the URL, and for what cannot be fetched.
+    """
+    names = ["*"] if sequences is None else list(dict.fromkeys(sequences))
+    folders = ("oxts", "calib", *(["label_02"] * ground_truth))
+    files = [f"{root}{folder}/{name}.txt" for root in ("training/", "") for folder in folders for name in names]
+    found = [f"{label}/{name}.txt" for label in CLASS_CODES for name in names]
+    with ExitStack() as stack:
+        root = stack.enter_context(local_tree(dataroot, files))
+        boxes = None if detections is None else stack.enter_context(local_tree(detections, found))
+        yield KittiTracking(root, boxes, sequences, ground_truth)

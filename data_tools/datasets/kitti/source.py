@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from data_tools.datasets.detection_files.tracks import merge_tables
-from data_tools.datasets.kitti.dataset import KittiTracking
-from data_tools.datasets.kitti.remote import local_kitti
+from data_tools.datasets.kitti.dataset import KittiTracking, local_kitti
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence, result_sequences, scored_sequences
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE, write_kitti_labels, write_kitti_results
 from data_tools.datasets.kitti.velodyne import KittiScans

@@ -2,7 +2,6 @@
 
 from data_tools.datasets.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES
 from data_tools.datasets.nuscenes.dataset import NuScenes
-from data_tools.datasets.nuscenes.remote import local_nuscenes
 from data_tools.datasets.nuscenes.result_files import ResultMeta
 from data_tools.datasets.nuscenes.scans import NuScenesScans, nuscenes_scans
 from data_tools.datasets.nuscenes.scored_scenes import ScoredScene, read_scored_scenes
@@ -25,7 +24,6 @@ __all__ = [
     "ScoredScene",
     "TrackedBoxes",
     "TrackingResults",
-    "local_nuscenes",
     "merge_tracking_results",
     "nuscenes_scans",
     "read_scored_scenes",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Self
 
 from data_tools.datasets.nuscenes.dataset import NuScenes
 from data_tools.datasets.nuscenes.labels import merge_label_parts, write_label_part, write_nuscenes_labels
-from data_tools.datasets.nuscenes.remote import local_nuscenes
 from data_tools.datasets.nuscenes.result_files import ResultMeta
 from data_tools.datasets.nuscenes.scans import NuScenesScans, nuscenes_scans
 from data_tools.datasets.nuscenes.scored_scenes import ScoredScene, read_scored_scenes
@@ -28,7 +27,7 @@ from data_tools.datasets.source import (
     names,
     option,
 )
-from data_tools.files.remote_files import is_url
+from data_tools.files.remote_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 
@@ -127,8 +126,11 @@ class NuScenesSource(DatasetSource):
 
     @contextmanager
     def _local(self) -> Iterator[tuple[Path, dict[str, Path]]]:
-        with local_nuscenes(self.dataroot, self.version, sensor_locations(self.detections or ())) as opened:
-            yield opened
+        """The folder that holds the tables, and the files of detections by sensor."""
+        urls = sensor_locations(self.detections or ())
+        with ExitStack() as stack:
+            root = stack.enter_context(local_tree(self.dataroot, [f"{self.version}/*.json"]))
+            yield root, {sensor: stack.enter_context(local_copy(url)) for sensor, url in urls.items()}
 
     def _chosen(self, root: Path) -> tuple[str, ...]:
         if (self.split is None) == (self.scenes is None):

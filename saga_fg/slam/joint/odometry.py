@@ -1,4 +1,4 @@
-"""OdometryIncrements: what a vehicle believes it moved between epochs, and how well it knows.
+"""Odometry: measured motion of a vehicle between epochs, and its noise.
 
 Per interval of dt s and d m, an increment a_T_b has independent noise
 
@@ -26,7 +26,7 @@ from saga_fg.settings import Positive, Settings, setting
 
 @dataclass(frozen=True)
 class OdometryNoise(Settings):
-    """How good an odometry is: standard deviations."""
+    """Noise of an odometry: standard deviations."""
 
     turn_noise: Positive = setting(0.01, "heading, rad after one second")
     tilt_noise: Positive = setting(0.001, "roll and pitch, which gravity tells, rad after one second")
@@ -59,8 +59,8 @@ class OdometryIncrements:
     """timestamps (n,) s, strictly increasing; a_T_b (n - 1, 4, 4): each pose in the frame of the one before.
 
     covariances: (n - 1, 6, 6) of the increments where the device states them, as scan registration does: (rotation
-    vector, translation) in the frame of the later pose, rad^2, m^2; None where `OdometryNoise` is all that is known.
-    Raises `InputError` for times that do not increase, increments that are not rigid, and covariances that are none.
+    vector, translation) in the frame of the later pose, rad^2, m^2; None: by `OdometryNoise` alone.
+    Raises `InputError` for times that do not increase, increments that are not rigid, and invalid covariances.
     """
 
     timestamps: FloatArray
@@ -76,9 +76,8 @@ class OdometryIncrements:
             checked_transform(f"a_T_b[{k}]", increment)
         if self.covariances is not None:
             covariances = checked_covariances("covariances", self.covariances, len(increments), 6)
-            object.__setattr__(self, "covariances", covariances)
-        object.__setattr__(self, "timestamps", timestamps)
-        object.__setattr__(self, "a_T_b", increments)
+            vars(self)["covariances"] = covariances
+        vars(self).update(timestamps=timestamps, a_T_b=increments)
 
     @classmethod
     def of(cls, timestamps: ArrayLike, world_T_ego: ArrayLike) -> Self:

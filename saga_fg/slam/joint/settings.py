@@ -24,7 +24,7 @@ from saga_fg.types.by_class import DEFAULT
 
 @dataclass(frozen=True)
 class LaneSettings(Settings):
-    """How vehicles are drawn to the centre lines of the map's lanes."""
+    """Attraction of vehicles to the centre lines of the map's lanes."""
 
     spread: Positive = setting(0.3, "how far from the centre line drivers keep, standard deviation, m")
     memory: Positive = setting(5.0, "time over which a driver keeps his distance from the line, s")
@@ -40,7 +40,7 @@ class LaneSettings(Settings):
 
 @dataclass(frozen=True)
 class JointSettings(Settings):
-    """What the estimator knows of the odometry, of objects that stand, and how hard it tries."""
+    """Noise of the odometry, stationarity of objects, and effort of the joint estimation."""
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "how good the odometry is")
     start_noise: Positive = setting(1e-3, "standard deviation of the first pose, m and rad")
