@@ -21,7 +21,7 @@ from saga_fg.types.frame import Frame
 
 @dataclass(frozen=True)
 class ChunkSettings(Settings):
-    """How a long recording is cut."""
+    """Lengths of the chunks of a long recording."""
 
     length: Positive = setting(30.0, "length of a chunk, s; higher: more memory")
     margin: Positive = setting(7.0, "time smoothed beyond either end of a chunk, s")
