@@ -171,11 +171,11 @@ def gap_errors(
                 progress(f"{method}, fold {fold + 1}", len(learned[method]), folds)
         for k in range(fold, len(names), folds):
             trajectories = recordings[names[k]]
-            gaps = _sample(trajectories, own, classes, lengths, k).drawn(settings.most_gaps, seed=1)
+            gaps = _sample(trajectories, own, classes, lengths, k).sampled(settings.most_gaps, seed=1)
             fitted = {method: found[-1] for method, found in learned.items()}
             errors = _errors(trajectories, gaps, own, hand_crafted, fitted, lengths)
             alone = FilterNoise(fitted[LEARNED].acceleration_noise, own.position_noise)
-            same = _sample(trajectories, alone, classes, lengths, k).drawn(settings.most_gaps, seed=1)
+            same = _sample(trajectories, alone, classes, lengths, k).sampled(settings.most_gaps, seed=1)
             errors[NOISE_ALONE] = errors_alone(same)
             parts.append((gaps, trajectories.time[gaps.moment] // BLOCK, errors))
             if progress is not None:

@@ -40,7 +40,7 @@ TABLE_TITLE = (
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """The comparison, and the paths of what was written."""
+    """The comparison, and the paths of the files."""
 
     comparison: Comparison
     picture: Path

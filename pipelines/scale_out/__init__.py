@@ -1,4 +1,4 @@
-"""Many scenes in parallel: on the cores of this machine or on a Ray cluster, with a manifest of what was done."""
+"""Many scenes in parallel: on the cores of this machine or on a Ray cluster, with a manifest of the results."""
 
 from pipelines.scale_out.job import Job, Outcome, SceneTask, perform
 from pipelines.scale_out.local_pool import LocalPool

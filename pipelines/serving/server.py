@@ -42,7 +42,7 @@ FILES_IN_RESERVE = 192  # that the process may open besides its connections; a b
 
 
 class _Reader(asyncio.StreamReader):
-    """Ends where the connection is lost, with what was received before."""
+    """Ends where the connection is lost, after the bytes received before."""
 
     def set_exception(self, exc: Exception) -> None:
         self.feed_eof()
@@ -125,7 +125,7 @@ class SocketServer:
         self._log_limit = LogLimit()
 
     def run(self, stop: StopRequest) -> None:
-        """Serve until `stop` is requested; what was received by then is taken in and answered, as far as time allows.
+        """Serve until `stop` is requested; lines received by then are taken in and answered, as far as time allows.
 
         Raises `InputError` where the address cannot be had.
         """
@@ -273,7 +273,7 @@ class SocketServer:
                     self._refuse(client, "idle", f"expected a message within {idle:g} s")
 
     def _refuse(self, client: Client, reason: str, text: str) -> None:
-        """Tell a client why it is closed, and close it; what it has sent is forgotten."""
+        """Send a client the reason, and close it; its lines are forgotten."""
         if not client.transport.is_closing():
             self._count(client, reason, text)
             client.send(encode({"type": "error", "message": f"{text}: the connection is closed"}))

@@ -28,7 +28,7 @@ FORMAT = b"saga-fg state 1"
 def write_state(path: Path, header: Mapping[str, str], state: Any) -> None:
     """Write a state, and return once it is on the disk.
 
-    Raises `InputError` as `atomic_file` does and for what is no tree of values, `OSError` for a disk that fails.
+    Raises `InputError` as `atomic_file` does and for another kind of state, `OSError` for a disk that fails.
     """
     tree = TreeWriter(state)
     lines = [json.dumps(part, separators=(",", ":")).encode() for part in (dict(header), tree.nodes)]

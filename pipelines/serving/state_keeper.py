@@ -58,7 +58,7 @@ class StateKeeper:
         if there:
             try:
                 self._stream.restore(read_state(self._path, self._header))
-            except Exception as error:  # whatever values bring about that do not fit each other
+            except Exception as error:  # of values that do not fit each other
                 self.release()
                 if isinstance(error, InputError):
                     raise

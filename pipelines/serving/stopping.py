@@ -17,7 +17,7 @@ SAVING = 1.0  # s
 class StopRequest:
     """A context in which SIGINT and SIGTERM do not interrupt but request to stop; `number`: of the first signal.
 
-    timeout  time to finish, s; then the process ends, whatever its other threads are doing
+    timeout  time to finish, s; then the process ends in spite of its other threads
     save     called before that end, for at most `SAVING` s
     clear    called last, to remove unfinished files
     """

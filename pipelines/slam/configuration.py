@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
-from pipelines.config import Family, TrackConfig
-from pipelines.configuration import load_settings, read_settings
+from pipelines.config import Family, TrackConfig, load_config
+from pipelines.configuration import load_settings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -19,14 +18,14 @@ from saga_fg.tracking.provider_names import made_by_name, new_provider
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """Settings of `saga-fg slam simulated` and `slam kitti`."""
+    """Settings of `saga-fg slam simulated` and `saga-fg slam kitti`."""
 
     providers: tuple[str | FactorProvider, ...] = setting(
-        (), "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked at every pose"
+        (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, asked at every pose"
     )
-    landmarks: tuple[str, ...] = setting((), "detectors of landmarks of your own as MODULE:NAME, asked at every pose")
-    joint: JointSettings = settings_group(JointSettings, "simulated: vehicle and objects together")
-    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, objects among it")
+    landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
+    joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
+    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, with objects")
 
     def new_providers(self) -> list[FactorProvider]:
         """Fresh providers. Raises `InputError` for a name that cannot be resolved."""
@@ -40,9 +39,9 @@ class SlamSettings:
 
 @dataclass(frozen=True)
 class SlamConfig(TrackConfig):
-    """Everything that shapes SLAM with objects."""
+    """Configuration of SLAM with objects."""
 
-    slam: SlamSettings = settings_group(SlamSettings, "the graph")
+    slam: SlamSettings = settings_group(SlamSettings, "SLAM")
 
     def __post_init__(self) -> None:
         if self.tracker.providers:
@@ -50,10 +49,9 @@ class SlamConfig(TrackConfig):
 
 
 def load_slam_config(family: Family, path: Path | None = None) -> SlamConfig:
-    """The defaults shipped for a kind of data, with what a YAML file overrides.
+    """Return the defaults shipped for a kind of data, with the overrides of a YAML file.
 
-    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    Raises `InputError` naming the file and the dotted key of an error in it.
     """
-    shipped = files("pipelines") / "configs" / f"{family}.yaml"
-    config = read_settings(SlamConfig, shipped.read_text(encoding="utf-8"), shipped.name)
+    config = SlamConfig(**vars(load_config(family)))
     return config if path is None else load_settings(SlamConfig, path, config)

@@ -73,7 +73,7 @@ def run_joint(
 ) -> JointRun:
     """Estimate jointly from the frames of one sensor and odometry degraded as `settings.odometry` says.
 
-    landmarks: what is observed of them at n frames; lag: s, to estimate online as well; new_providers: gives fresh
+    landmarks: gives their observations at n frames; lag: s, to estimate online as well; new_providers: gives fresh
     providers of other factors. Raises `InputError` as `degraded_drive`.
     """
     frames, truth, odometry = degraded_drive(scene, settings, sensor, seed)

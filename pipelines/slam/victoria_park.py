@@ -26,9 +26,9 @@ _START = 1e-6  # variance of the first pose, m^2 and rad^2
 class ParkSettings(Settings):
     """Settings of mapping a drive past trees."""
 
-    mapper: MapperSettings = settings_group(lambda: MapperSettings(smooth_every=300), "how trees are told apart")
+    mapper: MapperSettings = settings_group(lambda: MapperSettings(smooth_every=300), "association of trees")
     tree: PointLandmark = settings_group(
-        lambda: PointLandmark(name="tree", density=0.01), "what is seen; a tree on 10 m by 10 m"
+        lambda: PointLandmark(name="tree", density=0.01), "the landmarks; one tree on 10 m by 10 m"
     )
     odometry_scales: tuple[float, ...] = setting(
         (1.0, 4.0, 16.0, 64.0, 256.0), "factors on the covariance to choose of"

@@ -1,9 +1,9 @@
-r"""How often a sensor takes objects of each class for one of another, from detections beside the truth.
+r"""Class confusion of a sensor: how often objects of each class are reported as another, from matches to the truth.
 
     A(z | c) = ( n_cz + 1 ) / ( n_c + k )
 
-n_cz of the n_c detections of objects of class c were reported as z, among the k classes of its group: the mean of the
-posterior after a uniform prior.
+n_cz of the n_c detections of objects of class c were reported as z, among the k classes of its group: the posterior
+mean with a uniform prior.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from saga_fg.learning.truth_matches import match_to_truth
 from saga_fg.types.dataset import Scene
 from saga_fg.types.sensor import Sensor
 
-FEWEST = 20  # detections of a class that tell what it is taken for
+FEWEST = 20  # detections of a class, for a row of its own
 
 
 def learn_confusion(
     scenes: Iterable[Scene], sensors: Mapping[str, Sensor], groups: Sequence[Sequence[str]]
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Sensor -> true class -> reported class -> share, of the classes in `groups` that were detected often enough.
+    """Sensor -> true class -> reported class -> share, for classes in `groups` with enough detections.
 
     Raises `InputError` for a scene without ground truth.
     """

@@ -1,7 +1,7 @@
-"""Process and position noise of the classical filter by the likelihood of where hidden objects reappear.
+"""Process and position noise of the independent filter by the likelihood of positions after gaps.
 
-The likelihood is that of `gap_prediction` without edges. It is evaluated on a grid, once a recording, so that the
-maximum over any set of recordings (all but those that are tested on) costs nothing more.
+The likelihood is that of `gap_prediction` without edges. It is evaluated on a grid once for each recording, so that the
+maximum over any set of recordings is cheap.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ POSITION_NOISE = (0.01, 0.02, 0.05, 0.1, 0.2)  # m
 
 
 class FilterNoiseLikelihood:
-    """Of one recording: for each class, `loss` (Q, R), the sum over its gaps, and their `count`."""
+    """Likelihoods of one recording: for each class, `loss` (Q, R), the sum over its gaps, and their `count`."""
 
     def __init__(self, trajectories: Trajectories, classes: tuple[str, ...], settings: GapSettings) -> None:
         self.loss = {c: np.zeros((len(ACCELERATION_NOISE), len(POSITION_NOISE))) for c in classes}
         self.count = dict.fromkeys(classes, 0)
-        settings = replace(settings, neighbours=1)  # nobody asks where they are
+        settings = replace(settings, neighbours=1)  # not used without edges
         for i, q in enumerate(ACCELERATION_NOISE):
             for j, r in enumerate(POSITION_NOISE):
                 filtered = filter_independently(trajectories, np.full(len(trajectories.label), q), r)
@@ -51,7 +51,7 @@ class FilterNoise:
 
     @classmethod
     def most_likely(cls, likelihoods: Sequence[FilterNoiseLikelihood]) -> FilterNoise:
-        """The maximum over some recordings: one position noise, and for it a process noise of every class."""
+        """Maximise the likelihood of some recordings: one position noise, and a process noise for every class."""
         classes = list(likelihoods[0].loss)
         losses = {c: np.sum([of.loss[c] for of in likelihoods], axis=0) for c in classes}
         best: FloatArray = np.sum([loss.min(axis=0) for loss in losses.values()], axis=0)
@@ -61,6 +61,6 @@ class FilterNoise:
         return cls({**noise, DEFAULT: ACCELERATION_NOISE[int(np.argmin(together[:, r]))]}, POSITION_NOISE[r])
 
     def filtered(self, trajectories: Trajectories) -> FilteredTrajectories:
-        """The classical filter with this noise."""
+        """The trajectories, filtered with this noise."""
         noise = [self.acceleration_noise.get(c, self.acceleration_noise[DEFAULT]) for c in trajectories.label.tolist()]
         return filter_independently(trajectories, np.array(noise), self.position_noise)

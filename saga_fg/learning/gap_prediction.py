@@ -1,6 +1,6 @@
-r"""Where an object is at each moment of a gap, and how likely the place at which it is seen again.
+r"""Prediction of hidden objects through a gap, and the likelihood of their positions.
 
-Inside a gap the object is moved by its own velocity and by its edges to the neighbours, who stay in view. All shipped
+Inside a gap an object moves by its own velocity and by its edges to the neighbours, which stay in view. All shipped
 interactions act on the velocity alone, so that over a step with rates frozen at its start
 
     dp/dt = v,    dv/dt = D v + c + w,    E[w w^T] = q exp(-explained_noise K) I delta
@@ -13,8 +13,8 @@ with, for each edge j -> i at rate r (K is the sum of all r), u the unit heading
 
 D is negative semidefinite, and the implicit midpoint rule, E = (I - D h/2)^{-1} (I + D h/2), keeps every step stable.
 The neighbours' states are taken as known: this is the innovation likelihood of the joint filter up to the correlation
-of an object with its neighbours, at a cost that does not grow with their number. As surprises have heavy tails, the
-innovation is taken to be Student's t with covariance scale S = H P H^T + R; `xp` is NumPy or JAX.
+of an object with its neighbours, at a cost that does not grow with their number. As innovations have heavy tails, they
+are modelled as Student's t with covariance scale S = H P H^T + R; `xp` is NumPy or JAX.
 """
 
 from __future__ import annotations
@@ -95,12 +95,12 @@ def predict_gaps(
 
 
 def gap_errors(sample: GapSample, prediction: GapPrediction) -> Any:
-    """(W, S) distances, m, between where the objects are and where they were predicted; NaN where nobody knows."""
+    """Position errors (W, S), m, of a prediction; NaN where the true position is unknown."""
     return np.hypot(*np.moveaxis(sample.measured - prediction.position, -1, 0))
 
 
 def errors_alone(sample: GapSample) -> FloatArray:
-    """(W, S) errors, m, of the classical filter: objects go on as they moved when they were hidden."""
+    """Errors (W, S), m, of the independent filter: objects keep the velocity they had when the gap began."""
     return np.asarray(gap_errors(sample, predict_gaps(sample, lambda _features, _seen: [], 0.0, 0.0)))
 
 

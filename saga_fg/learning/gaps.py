@@ -1,7 +1,6 @@
-"""Gaps made in trajectories on purpose: an object is hidden for some seconds while its neighbours stay in view.
+"""Artificial gaps in trajectories: an object is hidden for some seconds while its neighbours stay in view.
 
-What the innovation is at each moment of a gap, had the object been seen again then for the first time, is what
-interactions are learned from and judged by.
+Interactions are learned from, and evaluated by, the innovations at the steps of a gap.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class GapSample(Columns):
     moment, row      (W,) where in the recording, and of which object; recording (W,) number, label (W,)
     mean, P          (W, 4), (W, 4, 4) of the object when the gap starts; heading, has_moved (W,) then
     dt               (W, S) lengths of the steps, s; 0 after the end of the recording
-    measured         (W, S, 2) where it truly is at the end of each step, NaN if nobody knows
+    measured         (W, S, 2) where it truly is at the end of each step, NaN where unknown
     other_mean       (W, S, M, 4) of the neighbours when the step starts; other_heading, other_moved, other_seen
                      (W, S, M); other_label (W, M)
     """
@@ -60,8 +59,8 @@ class GapSample(Columns):
     other_seen: FloatArray
     other_label: StrArray
 
-    def drawn(self, most: int, seed: int) -> Self:
-        """At most so many of them, drawn at random."""
+    def sampled(self, most: int, seed: int) -> Self:
+        """At most `most` of the gaps, chosen at random."""
         if len(self) <= most:
             return self
         return self.select(np.sort(np.random.default_rng(seed).choice(len(self), most, replace=False)))

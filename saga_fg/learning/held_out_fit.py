@@ -1,22 +1,22 @@
-r"""Where learned interactions act, by recordings that are held out: everywhere, on what is hidden, or not at all.
+r"""Choice by held-out recordings where learned interactions act: everywhere, on hidden objects, or not at all.
 
-Interactions are fitted (`interaction_fit`) to gaps that begin with what the classical filter knows. A joint filter
-whose edges always act treats objects in view otherwise, too. That may be right or wrong: parked cars that seem to move
-because the pose of the vehicle errs move alike; errors of labels that were set one by one have nothing in common. So
-the recordings are dealt into two parts, and what one taught is tried by the joint filter (`joint_gaps`) on the other:
+Interactions are fitted (`interaction_fit`) to gaps that begin with estimates of the independent filter. Edges that
+always act change the estimates of objects in view too, for better or worse: parked cars that seem to move because the
+pose of the vehicle errs move alike; errors of labels that were set one by one have nothing in common. So the recordings
+are split into two parts, and rules learned on one are tried by the joint filter (`joint_gaps`) on the other:
 
     everywhere           edges act as fitted, with the process noise that was fitted with them
     hidden               edges are weighted by their information gain (`EdgeInformation`), low into objects in view
-    hidden, own noise    the same with the process noise of the classical filter
-    nowhere              the classical filter
+    hidden, filter noise likewise, with the process noise of the independent filter
+    nowhere              the independent filter
 
-The form with the least ratio of errors to those of the classical filter, which has 1, is given to what all recordings
-taught. The ratio is the mean over the lengths of the gaps of the larger of two ratios, of the means and of the medians,
-so that neither the many small errors nor the few large ones pay for the others. Each group of classes between which
-there are edges has its own form. Who is in no group keeps the noise of the classical filter.
+The form with the least ratio of errors to those of the independent filter, whose ratio is 1, is given to the rules
+learned from all recordings. The ratio is the mean over the lengths of the gaps of the larger of two ratios, of the
+means and of the medians, so that neither many small nor few large errors decide alone. Each group of classes between
+which there are edges has its own form. Classes in no group keep the noise of the independent filter.
 
-A tracker has a process noise of its own, which suits its detections, not the one fitted to true positions. What is
-right in view with one is not with the other: it is given edges that leave what is in view alone.
+A tracker has a process noise of its own, which suits its detections, not the one fitted to true positions. It is
+therefore given edges that hardly act on objects in view.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
 
 
 class Form(NamedTuple):
-    """How fitted interactions act: what makes edges count, if anything, and whether the fitted noise is taken."""
+    """A way in which fitted interactions act: the weighting of edges, and whether the fitted noise is used."""
 
     information_gain: EdgeInformation | None
     fitted_noise: bool
 
 
-FORMS = {"everywhere": Form(None, True), "hidden": Form(HIDDEN, True), "hidden, own noise": Form(HIDDEN, False)}
-FORMS_OF_TRACKERS = {"hidden, own noise": FORMS["hidden, own noise"]}
-CLASSICAL = "classical"
+FORMS = {"everywhere": Form(None, True), "hidden": Form(HIDDEN, True), "hidden, filter noise": Form(HIDDEN, False)}
+FORMS_OF_TRACKERS = {"hidden, filter noise": FORMS["hidden, filter noise"]}
+INDEPENDENT = "independent"
 Rules = tuple[Following | Neighbours | EdgeNetwork, ...]
 Fit = Callable[[GapSample, float, Mapping[str, float]], FittedInteractions]
 Trial = tuple[StrArray, dict[str, FloatArray]]
-"""Labels (n,) of gaps, and their errors (n, S) by form and of the classical filter, m."""
+"""Labels (n,) of gaps, and their errors (n, S) by form and of the independent filter, m."""
 
 
 def fit_by_held_out(
@@ -66,22 +66,22 @@ def fit_by_held_out(
     settings: GapSettings | None = None,
     forms: Mapping[str, Form] = FORMS,
 ) -> FittedInteractions:
-    """What `fit` learns from all recordings, acting where that lowers errors on recordings held out.
+    """Learn interactions from all recordings, and let them act where that lowers errors on recordings held out.
 
     classes     those that are hidden
-    own         process and position noise of the classical filter
+    own         process and position noise of the independent filter
     fit         `fit_interactions` or `fit_networks`; raises `InputError` where there is nothing to learn from
-    forms       to choose from, besides nowhere; `FORMS_OF_TRACKERS` for those that keep a process noise of their own
+    forms       to choose from, besides nowhere; `FORMS_OF_TRACKERS` for trackers, which keep their process noise
     """
     settings = settings or GapSettings()
     fitted = fit(_gaps(recordings, classes, own, settings), own.position_noise, own.acceleration_noise)
     first, second = held_out_parts(recordings)
     trials: list[Trial] = []
-    for teaching, tried in ((first, second), (second, first)):
-        sample = _gaps(teaching, classes, own, settings).drawn(MOST_GAPS // 2, seed=3)
+    for training, tried in ((first, second), (second, first)):
+        sample = _gaps(training, classes, own, settings).sampled(MOST_GAPS // 2, seed=3)
         if len(sample):
-            taught = fit(sample, own.position_noise, own.acceleration_noise)
-            trials += [_trial(each, taught, classes, own, settings, forms) for each in tried]
+            learned = fit(sample, own.position_noise, own.acceleration_noise)
+            trials += [_trial(each, learned, classes, own, settings, forms) for each in tried]
     rules: list[Following | Neighbours | EdgeNetwork] = []
     noise = dict(own.acceleration_noise)
     for group in coupled_classes(fitted.rules):
@@ -127,37 +127,37 @@ def _gaps(
 
 def _trial(
     of: Trajectories,
-    taught: FittedInteractions,
+    learned: FittedInteractions,
     classes: tuple[str, ...],
     own: FilterNoise,
     settings: GapSettings,
     forms: Mapping[str, Form],
 ) -> Trial:
     filtered = own.filtered(of)
-    gaps = sample_gaps(of, filtered, classes, settings).drawn(TRIED_GAPS, seed=2)
-    errors = {CLASSICAL: errors_alone(gaps)}
+    gaps = sample_gaps(of, filtered, classes, settings).sampled(TRIED_GAPS, seed=2)
+    errors = {INDEPENDENT: errors_alone(gaps)}
     for name, form in forms.items():
-        rules = [replace(rule, information_gain=form.information_gain) for rule in taught.rules]
-        noise = taught.acceleration_noise if form.fitted_noise else own.acceleration_noise
-        joint = JointGaps(of, filtered, noise, own.position_noise, rules, taught.explained_noise)
+        rules = [replace(rule, information_gain=form.information_gain) for rule in learned.rules]
+        noise = learned.acceleration_noise if form.fitted_noise else own.acceleration_noise
+        joint = JointGaps(of, filtered, noise, own.position_noise, rules, learned.explained_noise)
         errors[name] = joint.errors(gaps, settings)
     return gaps.label, errors
 
 
 def _ratio(trials: Sequence[Trial], group: set[str], form: str, position_noise: float) -> float:
-    """Errors of a form against the classical filter's, see the module; 1 where nothing was tried."""
+    """Errors of a form against the independent filter's, see the module; 1 without trials."""
     ratios = []
     for step in range(max((errors[form].shape[1] for _, errors in trials), default=0)):
         pairs = [
-            (errors[form][known, step], errors[CLASSICAL][known, step])
+            (errors[form][known, step], errors[INDEPENDENT][known, step])
             for label, errors in trials
             if step < errors[form].shape[1] and (known := _known(label, errors, group, form, step)).any()
         ]
         if pairs:
-            mine, classical = (np.concatenate(each) for each in zip(*pairs, strict=True))
+            mine, independent = (np.concatenate(each) for each in zip(*pairs, strict=True))
             ratios.append(
-                max(  # what is smaller than the noise of the places is no difference
-                    float((average(mine) + position_noise) / (average(classical) + position_noise))
+                max(  # differences below the position noise do not count
+                    float((average(mine) + position_noise) / (average(independent) + position_noise))
                     for average in (np.mean, np.median)
                 )
             )
@@ -165,5 +165,5 @@ def _ratio(trials: Sequence[Trial], group: set[str], form: str, position_noise: 
 
 
 def _known(label: StrArray, errors: Mapping[str, FloatArray], group: set[str], form: str, step: int) -> BoolArray:
-    finite = np.isfinite(errors[form][:, step]) & np.isfinite(errors[CLASSICAL][:, step])
+    finite = np.isfinite(errors[form][:, step]) & np.isfinite(errors[INDEPENDENT][:, step])
     return np.asarray(finite & np.isin(label, list(group)))

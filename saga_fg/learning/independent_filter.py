@@ -1,7 +1,7 @@
-"""The classical filter of every object of a recording by itself: constant velocity, positions measured.
+"""Independent Kalman filters of the objects of a recording: constant velocity, measured positions.
 
-An object that is out of sight at a moment starts afresh when it is seen again. What is known of each at the moments at
-which it is seen is what gaps start from, and how neighbours are seen while an object is hidden.
+An object that was out of sight for a moment is initialised anew. Gaps start from these estimates, and neighbours of a
+hidden object are represented by them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from saga_fg.model.node import ConstantVelocity
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.box_filter import MOVING
 
-BIRTH_SPEED = 10.0  # standard deviation of a velocity component before the second sighting, m/s
+BIRTH_SPEED = 10.0  # standard deviation of a velocity component before the second measurement, m/s
 
 
 class FilteredTrajectories(NamedTuple):
     """K moments, N objects: mean (K, N, 4) and covariance (K, N, 4, 4) of x, y, vx, vy; NaN where one is not seen.
 
-    followed (K, N) s in sight without a break; heading (K, N) rad, the course where the box tells none; has_moved
+    followed (K, N) s in sight without interruption; heading (K, N) rad, the course where the box has none; has_moved
     (K, N) whether one was ever clearly in motion
     """
 

@@ -2,8 +2,8 @@
 
 The parameters are the logarithms of rates and widths within fixed bounds, so that rates stay positive and the dynamics
 stable, the logarithm of each class's acceleration noise, and the explained noise. The objective (`gap_prediction`) is
-maximised by L-BFGS-B with differences for derivatives; a weak Gaussian prior about the template decides what the
-recordings leave open.
+maximised by L-BFGS-B with differences for derivatives; a weak Gaussian prior about the template decides where the
+recordings do not.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "heading_scale": (0.05, 3.0),
     "speed_scale": (0.1, 10.0),
 }
-"""Of the rates and widths of rules; an infinite width stays infinite."""
+"""Bounds of the rates and widths of rules; an infinite width stays infinite."""
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s
 PRIOR = 2e-2  # weight of a unit of squared difference from the template, against the mean over the gaps
 FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
-MOST_GAPS = 500  # that are learned from, drawn at random; more add nothing but time
+MOST_GAPS = 500  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
 _SPEED = Following(
@@ -199,5 +199,5 @@ def acting_classes(classes: tuple[str, ...], sample: GapSample) -> BoolArray:
 
 
 def thinned(sample: GapSample) -> GapSample:
-    """At most `MOST_GAPS` gaps, the same ones every time."""
-    return sample.drawn(MOST_GAPS, seed=0)
+    """At most `MOST_GAPS` gaps, a reproducible choice."""
+    return sample.sampled(MOST_GAPS, seed=0)

@@ -1,7 +1,7 @@
-"""Trajectories, and gaps in them, as the joint filter lives through them: all objects in one state, coupled by rules.
+"""Joint filter over trajectories with gaps: all objects in one state, coupled by rules.
 
-Every object is measured at every moment at which it is seen. Where gaps begin the joint state is kept, and for each of
-them it goes on from there: neighbours are measured at every step, the hidden object is not.
+Every object is measured at every time at which it is seen. Where gaps begin the joint state is kept, and each gap is
+filtered from there: neighbours are measured at every step, the hidden object is not.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class JointGaps:
         self._R = position_noise**2 * np.eye(2)
         by_class = {c: NodeType(c, ConstantVelocity(noise.get(c, noise[DEFAULT]))) for c in set(trajectories.label)}
         self._types = [by_class[c] for c in trajectories.label]
-        self._birth = np.diag(np.repeat([position_noise**2, BIRTH_SPEED**2], 2))
+        self._initial = np.diag(np.repeat([position_noise**2, BIRTH_SPEED**2], 2))
 
     def errors(self, gaps: GapSample, settings: GapSettings) -> FloatArray:
-        """(W, S) distances, m, between where the objects of the gaps are and where they were predicted."""
+        """Position errors (W, S), m, of the predictions through the gaps."""
         _, stride, steps = gap_moments(self._of, settings)
         errors = np.full((len(gaps), steps), np.nan)
         for k, state, present, _ in self._in_view(int(gaps.moment.max(initial=-1)) + 1):
@@ -62,31 +62,31 @@ class JointGaps:
         return errors
 
     def log_likelihood(self) -> tuple[float, int]:
-        """Of all positions but the first of each object, with the number of them."""
-        passed = list(self._in_view(len(self._of)))
-        return sum(log for *_, (log, _) in passed), sum(count for *_, (_, count) in passed)
+        """Log-likelihood of all positions but the first of each object, and their number."""
+        steps = [result for *_, result in self._in_view(len(self._of))]
+        return sum(log for log, _ in steps), sum(count for _, count in steps)
 
     def _in_view(self, moments: int) -> Iterator[tuple[int, JointKalmanFilter, IntArray, tuple[float, int]]]:
-        """After each moment: the filter, who is in view, and the log-likelihood of how many positions seen then."""
+        """After each moment: the filter, the rows in view, and log-likelihood and number of the positions measured."""
         seen = np.isfinite(self._of.position[..., 0])
         state, present = JointKalmanFilter(), np.empty(0, dtype=np.int64)
         for k in range(moments):
             now = np.flatnonzero(seen[k])
-            gone = np.setdiff1d(present, now)
-            if len(gone):
-                state.marginalise(gone)
-            kept, told = np.setdiff1d(present, gone), 0.0
+            lost = np.setdiff1d(present, now)
+            if len(lost):
+                state.marginalise(lost)
+            kept, log = np.setdiff1d(present, lost), 0.0
             if len(kept):
                 self._predict(
                     state, kept, self._filtered.heading[k - 1], k - 1, self._of.time[k] - self._of.time[k - 1]
                 )
-                told = self._measure(state, kept, k)
-            born = np.setdiff1d(now, kept)
-            if len(born):
-                mean = np.concatenate([self._of.position[k, born], np.zeros((len(born), 2))], axis=1)
-                state.add(born, mean, np.tile(self._birth, (len(born), 1, 1)))
+                log = self._measure(state, kept, k)
+            new = np.setdiff1d(now, kept)
+            if len(new):
+                mean = np.concatenate([self._of.position[k, new], np.zeros((len(new), 2))], axis=1)
+                state.add(new, mean, np.tile(self._initial, (len(new), 1, 1)))
             present = now
-            yield k, state, present, (told, len(kept))
+            yield k, state, present, (log, len(kept))
 
     def _gap(
         self, state: JointKalmanFilter, present: IntArray, hidden: int, k: int, stride: int, steps: int
@@ -117,10 +117,10 @@ class JointGaps:
                 if self._filtered.has_moved[k, hidden] and v @ v > TURNS_ABOVE**2:
                     course[hidden] += np.arctan2(v[0] * new[1] - v[1] * new[0], v @ new)
             here = np.isfinite(self._of.position[at, :, 0])
-            gone = present[~here[present] & (present != hidden)]
-            if len(gone):
-                state.marginalise(gone)
-                present = np.setdiff1d(present, gone)
+            lost = present[~here[present] & (present != hidden)]
+            if len(lost):
+                state.marginalise(lost)
+                present = np.setdiff1d(present, lost)
             self._measure(state, present[present != hidden], at)
             errors[step] = np.hypot(*(self._of.position[at, hidden] - state.mean([hidden])[0, :2]))
         return errors

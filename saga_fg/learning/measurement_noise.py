@@ -1,10 +1,10 @@
-r"""Measurement noise from errors that are known: the sensor's own noise model by maximum likelihood, robustly.
+r"""Measurement noise from known errors: the sensor's noise model by robust maximum likelihood.
 
     (along, across) ~ (1 - e) N(0, f^2 (position^2 + (range_noise r)^2)) N(0, f^2 (position^2 + (bearing_noise r)^2))
                       + e / (area of the gate),                  f = 1 + low_score_growth (1 - p)
 
-The uniform part takes up wrong matches, so that they do not widen the rest. All parameters are positive and are sought
-as logarithms; a normal prior of width 1 around what is known of other classes decides where there is little data.
+The uniform part models wrong matches. All parameters are positive and are estimated as logarithms; a normal prior of
+width 1 about the values of all classes decides where there is little data.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_sco
 PRIOR_WIDTH = 1.0  # of the logarithms
 WRONG = 0.05  # share of wrong matches expected
 POSITION = ("position", "range_noise", "bearing_noise", "low_score_growth")
-LEAST = 1e-4  # below, a parameter is nothing
+LEAST = 1e-4  # smaller parameters count as zero
 NINE_IN_TEN = 1.6448536269514722  # standard deviations of a normal distribution
-FEWEST = 10  # errors, to say anything of a standard deviation
+FEWEST = 10  # errors, for a standard deviation
 
 
 def fit_position_noise(
@@ -73,15 +73,15 @@ def fit_position_noise(
 
 
 def _starts(prior: NoiseModel) -> list[FloatArray]:
-    """Logarithms from which a good and a poor sensor are found; the cost has minima of which one calls all wrong."""
+    """Starts near a good and near a poor sensor (logarithms): the cost also has a minimum with all matches wrong."""
     low = max(prior.low_score_growth, 0.1)
     return [np.log([0.1, 0.005, 0.005, low]), np.log([0.3, 0.03, 0.01, low])]
 
 
 def robust_deviation(errors: FloatArray) -> float:
-    """Standard deviation of the errors (N,), NaN left out, by the size that nine in ten do not exceed.
+    """Standard deviation of the errors (N,), NaN left out, by the 90 % quantile.
 
-    NaN for less than ten errors. Errors of velocity and heading have long tails, of which the median would say nothing.
+    NaN for less than ten errors. Errors of velocity and heading have long tails, which a median would ignore.
     """
     known = errors[np.isfinite(errors)]
     return float(np.quantile(np.abs(known), 0.9)) / NINE_IN_TEN if len(known) >= FEWEST else math.nan

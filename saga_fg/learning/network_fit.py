@@ -2,7 +2,7 @@
 
 One `EdgeNetwork` each for following, shared course and shared velocity, trained together by Adam (Kingma and Ba, ICLR
 2015) on the likelihood of `gap_prediction`, with the process noise of each class and the explained noise. Rates stay
-between 0 and `max_rate` by construction. What comes out are plain numbers: inference needs NumPy alone.
+between 0 and `max_rate` by construction. Inference needs NumPy alone.
 """
 
 from __future__ import annotations

@@ -36,9 +36,8 @@ class MeasuredTrajectory:
         time = checked("time", self.time, (None,))
         if (np.diff(time) < 0).any():
             raise InputError(f"time[{int(np.argmax(np.diff(time) < 0)) + 1}]: expected times that do not decrease")
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "position", checked("position", self.position, (len(time), 2)))
-        object.__setattr__(self, "R", checked("R", self.R, (len(time), 2, 2)))
+        position, R = checked("position", self.position, (len(time), 2)), checked("R", self.R, (len(time), 2, 2))
+        vars(self).update(time=time, position=position, R=R)
 
     def __len__(self) -> int:
         return len(self.time)

@@ -1,7 +1,7 @@
-r"""Scores that compare: the logistic model of the chance that a detection with a given score is true.
+r"""Score calibration: the logistic model of the probability that a detection with a given score is true.
 
     logit P(true) = offset + slope s,   s the logit of the score        maximum likelihood, with two weak priors:
-    slope ~ N(1, 1), offset ~ N(0, 1.5^2)                               that decide where a class was hardly seen
+    slope ~ N(1, 1), offset ~ N(0, 1.5^2)                               for classes with few detections
 
 Source: Platt, Probabilistic outputs for support vector machines, 1999. Solved by Newton's method.
 """
@@ -15,7 +15,7 @@ from saga_fg.types.sensor import ScoreCalibration
 
 PRIOR_MEAN = np.array([0.0, 1.0])  # offset, slope
 PRIOR_PRECISION = np.array([1 / 1.5**2, 1.0])
-LEAST_SLOPE = 0.05  # a detector whose scores say the reverse is told from one whose scores say nothing by nobody
+LEAST_SLOPE = 0.05  # a falling calibration is taken for one without information
 
 
 def fit_score_calibration(
@@ -23,7 +23,7 @@ def fit_score_calibration(
 ) -> ScoreCalibration:
     """The most probable calibration of detections with these logits of their scores (N,), true or not (N,).
 
-    prior: what to expect of a class that was hardly seen, in place of the identity.
+    prior: for classes with few detections, in place of the identity.
     """
     mean = PRIOR_MEAN if prior is None else np.array([prior.offset, prior.slope])
     X = np.column_stack([np.ones(len(logit)), logit])

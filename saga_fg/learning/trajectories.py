@@ -1,4 +1,4 @@
-"""Where the objects of a recording were: one table, to learn from how they move."""
+"""Trajectories of the objects of a recording, as one table."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from saga_fg.types.track import Tracks
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """N objects at K moments, NaN where one is not seen.
+    """N objects at K moments, NaN where it is not seen.
 
     time (K,) s; id (N,), label (N,); length (N,) m, 0 where unknown; position (K, N, 2) m from a local origin;
     heading (K, N) rad, NaN where unknown
@@ -40,7 +40,7 @@ class Trajectories:
 
     @classmethod
     def of_tracks(cls, tracks: Sequence[Tracks]) -> Self:
-        """What a tracker saw in a recording: its tracks at the moments at which they have a detection."""
+        """The tracks of a tracker at the times at which they have a detection."""
         seen = [(moment, np.flatnonzero(moment.coasting == 0)) for moment in tracks]
         rows = [(moment.id[at].astype(np.str_), moment.boxes.select(at)) for moment, at in seen]
         return cls._of(np.array([moment.timestamp for moment in tracks]), rows)

@@ -19,13 +19,13 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.settings import Positive, Settings, setting
 
 CONES = ("traffic_cone", "barrier")
-MIN_SPEED = 1.0  # m/s; who is slower is not pushed, since he goes nowhere
+MIN_SPEED = 1.0  # m/s; slower vehicles are not pushed
 BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still beside it
 
 
 @dataclass(frozen=True)
 class ConeGeometry(Settings):
-    """Which cones concern a vehicle, and the distance at which it passes them."""
+    """Range of cones that concern a vehicle, and the clearance to them."""
 
     clearance: Positive = setting(
         1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m; usual 1.5 to 2"

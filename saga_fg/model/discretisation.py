@@ -63,7 +63,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     b = np.zeros(int(offsets[-1]))
     F: list[Blocks] = []
     Q: list[Blocks] = []
-    alike: dict[tuple[int, bool], list[int]] = {}  # nodes that nobody acts on share their kind's dynamics
+    alike: dict[tuple[int, bool], list[int]] = {}  # nodes without incoming edges share their kind's dynamics
     for k in np.flatnonzero(np.bincount(kind[~coupled])).tolist():
         alike.setdefault((kinds[k].dim, kinds[k].nilpotency is None), []).append(k)
     for numbers in alike.values():

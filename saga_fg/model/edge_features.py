@@ -1,10 +1,10 @@
-"""What edge rules see of a pair of nodes: how the source of an edge stands and moves, as its target sees it.
+"""Features of a pair of nodes for edge rules: position and motion of the source of an edge relative to its target.
 
-    ahead, lateral   the source's offset along and across the target's heading (left is positive), m
+    ahead, lateral   offset of the source along and across the target's heading (left is positive), m
     turn             heading of the target less that of the source, in [-pi, pi), rad
 
-The functions take arrays of any shape, NumPy's or JAX's (`xp`), so that a learned rule is trained on the very features
-that it will see.
+The functions take arrays of any shape, NumPy's or JAX's (`xp`), so that a learned rule is trained on the features
+it is used with.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class EdgeEnds(NamedTuple):
 
 
 class EdgeFeatures(NamedTuple):
-    """Of edges (...): see the module; distance m, velocity_difference m/s, speeds m/s, has_moved 1 or 0."""
+    """Features of edges (...), see the module; distance m, velocity_difference m/s, speeds m/s, has_moved 1 or 0."""
 
     ahead: Any
     lateral: Any
@@ -62,7 +62,7 @@ def edge_features(target: EdgeEnds, source: EdgeEnds, xp: Any = np) -> EdgeFeatu
 
 
 def features_of(nodes: NodeTable, target: IntArray, source: IntArray) -> EdgeFeatures:
-    """The features (E,) of edges between rows of a table; who has moved is taken for granted where nobody knows."""
+    """The features (E,) of edges between rows of a table; without `has_moved` all nodes count as moved."""
     return edge_features(_ends(nodes, target), _ends(nodes, source))
 
 

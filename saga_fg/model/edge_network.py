@@ -3,7 +3,7 @@ r"""Edge rates from a small message-passing network (Gilmer et al., Neural Messa
 With the features f_ij of edge j -> i (`saga_fg.model.edge_features`, scaled to order 1) and N(i) all candidates,
 
     h_ij    = tanh( W_edge f_ij + b_edge )                               message of an edge
-    m_i     = tanh( W_node sum_{j in N(i)} h_ij / (1 + |N(i)|) )         what a node hears
+    m_i     = tanh( W_node sum_{j in N(i)} h_ij / (1 + |N(i)|) )         mean message into a node
     rate_ij = max_rate * logistic( w_out . [ h_ij, m_i ] + b_out )
 
 Whatever the weights are, 0 <= rate <= max_rate, so that no network can make the dynamics unstable. The forward pass is
@@ -83,12 +83,12 @@ class EdgeNetwork(Settings):
         if len(target) == 0:
             return Pairs(target, source, np.empty(0))
         features = features_of(nodes, target, source)
-        heard = np.zeros((len(nodes), len(self.edge_bias)))
+        received = np.zeros((len(nodes), len(self.edge_bias)))
         weights = self.weights()
         message = messages(weights, features)
-        np.add.at(heard, target, message)
-        heard /= 1 + np.bincount(target, minlength=len(nodes))[:, None]
-        rate = edge_rates(weights, message, heard[target], self.max_rate)
+        np.add.at(received, target, message)
+        received /= 1 + np.bincount(target, minlength=len(nodes))[:, None]
+        rate = edge_rates(weights, message, received[target], self.max_rate)
         if self.ahead_only:
             rate = np.where(features.ahead > 0, rate, 0.0)
         rate = weighted_by_gain(rate, self.information_gain, nodes, target, source)
@@ -98,8 +98,8 @@ class EdgeNetwork(Settings):
         """Rates (W, M) of the edges from M candidates into each of W nodes; able (W, M) whether one takes part."""
         present = xp.where(able & (features.distance <= self.max_distance), 1.0, 0.0)
         message = messages(weights, features, xp)
-        heard = (present[..., None] * message).sum(axis=1) / (1 + present.sum(axis=1))[:, None]
-        rate = present * edge_rates(weights, message, heard[:, None], self.max_rate, xp)
+        received = (present[..., None] * message).sum(axis=1) / (1 + present.sum(axis=1))[:, None]
+        rate = present * edge_rates(weights, message, received[:, None], self.max_rate, xp)
         return xp.where(features.ahead > 0, rate, 0.0) if self.ahead_only else rate
 
     def weights(self) -> dict[str, Any]:
@@ -133,9 +133,9 @@ def messages(weights: dict[str, Any], f: EdgeFeatures, xp: Any = np) -> Any:
     return xp.tanh(xp.stack(columns, axis=-1) @ weights["edge_weights"].T + weights["edge_bias"])
 
 
-def edge_rates(weights: dict[str, Any], message: Any, heard: Any, max_rate: float, xp: Any = np) -> Any:
-    """Rates (...), 1/s, of edges with messages (..., h) into nodes that hear the mean `heard` (..., h)."""
+def edge_rates(weights: dict[str, Any], message: Any, received: Any, max_rate: float, xp: Any = np) -> Any:
+    """Rates (...), 1/s, of edges with messages (..., h) into nodes with the mean message `received` (..., h)."""
     h = message.shape[-1]
-    node = xp.tanh(heard @ weights["node_weights"].T)
+    node = xp.tanh(received @ weights["node_weights"].T)
     logit = message @ weights["output_weights"][:h] + node @ weights["output_weights"][h:] + weights["output_bias"]
     return max_rate * 0.5 * (1 + xp.tanh(logit / 2))

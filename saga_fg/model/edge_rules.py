@@ -63,8 +63,7 @@ class Neighbours(Settings):
         SharedVelocity, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        0.3,
-        "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6",
+        0.3, "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6"
     )
     distance_scale: PositiveOrInf = setting(8.0, "sigma of the kernel on the distance, m; .inf: no kernel")
     heading_scale: PositiveOrInf = setting(
@@ -83,9 +82,9 @@ class Neighbours(Settings):
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
-        """Rates (...), 1/s, of edges with these features, whatever their ends are and is known of them."""
+        """Rates (...), 1/s, of edges with these features, before classes are considered."""
         exponent = (f.distance / self.distance_scale) ** 2 + (f.turn / self.heading_scale) ** 2
-        if self.parked:  # who creeps in a jam does not share what makes standing objects seem to move
+        if self.parked:  # creeping objects do not share the errors that make parked ones seem to move
             able = (f.target_moved == 0) & (f.source_moved == 0)
             exponent = exponent + (f.target_speed**2 + f.source_speed**2) / self.speed_scale**2
         else:
@@ -97,7 +96,7 @@ class Neighbours(Settings):
         able = of_classes(nodes.label, self.classes)
         if not self.parked:
             able &= np.hypot(*nodes.velocity.T) >= self.min_speed
-        else:  # a new track may move for all that is known of it
+        else:  # the velocity of a new track is not known well enough
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= ~nodes.has_moved if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
@@ -109,14 +108,13 @@ class Neighbours(Settings):
 
 @dataclass(frozen=True)
 class Following(Settings):
-    """An edge to each vehicle from the nearest vehicle ahead in its lane, as far as headings tell the lane."""
+    """A vehicle is led by the nearest vehicle ahead in its lane, as estimated from headings."""
 
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        0.5,
-        "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1",
+        0.5, "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1"
     )
     max_gap: NonNegative = setting(40.0, "no edge from a leader further ahead than this, centre to centre, m")
     gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m; .inf: no kernel")
@@ -143,7 +141,7 @@ class Following(Settings):
     )
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
-        """Rates (...), 1/s, of edges with these features, whatever the classes of their ends and whoever is nearer."""
+        """Rates (...), 1/s, of edges with these features, before classes and nearest leaders are considered."""
         lateral = lateral_of_arc(f)
         led = (f.ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
         if not self.parked:
@@ -156,7 +154,7 @@ class Following(Settings):
         return np.where(led & (f.distance <= self.max_gap), self.rate * np.exp(-exponent / 2), 0.0)
 
     def remoteness(self, f: EdgeFeatures) -> FloatArray:
-        """What is least for the leader among all that are ahead, m."""
+        """Measure, m, that is least for the leader among all vehicles ahead."""
         return np.asarray(f.ahead + 10 * np.abs(lateral_of_arc(f)))
 
     def pairs(self, nodes: NodeTable) -> Pairs:
@@ -211,7 +209,7 @@ def build_graph(
     """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out.
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
-    a driver who does what his leader does is no longer a surprise. `noise_scale` (n,) are further factors on it.
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
     """
@@ -245,7 +243,7 @@ def build_graph(
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
-    """What the rule, perhaps a user's own, chooses; `InputError` if it makes no sense."""
+    """The pairs of a rule, which may be a user's; `InputError` for rows or rates that are not valid."""
     what = f"edge rule {type(rule).__name__}"
     pairs = rule.pairs(nodes)
     target = checked_rows(f"{what}: target", pairs[0])

@@ -1,17 +1,17 @@
-r"""How a driver follows, and how he comes to a halt: the Intelligent Driver Model as an interaction function.
+r"""The Intelligent Driver Model as an interaction function: following a leader, and stopping.
 
     f(v, s, w) = a [ 1 - (v / v_free)^4 - (s* / s)^2 ],      s* = s0 + max(0, v T + v (v - w) / (2 sqrt(a b)))
 
 is the acceleration at speed v with the gap s, bumper to bumper, to a leader of speed w (Treiber, Hennecke, Helbing
-2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line where he has to stop is a leader that stands. Nobody
-drives backwards, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with all of it, linearised at the
+2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line to stop at is a stationary leader. Vehicles do not
+reverse, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with the full acceleration, linearised at the
 estimate (v', s', w'):
 
     dv_i/dt += rate tau u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
 
-Nobody starts behind one who stands, f <= max(v, w) / tau: parked cars stay where they are, and so does a queue.
-A gap of at least `hidden_vehicle_gap` may hold an undetected vehicle. Then a driver does not speed up into it: at most
-as the leader does, f <= (w - v) / tau, and before a line at most at constant speed, f <= 0.
+A vehicle does not start behind a stationary one, f <= max(v, w) / tau: parked cars and queues stay at rest. A gap of
+at least `hidden_vehicle_gap` may hold an undetected vehicle, so that a driver does not speed up into it: he approaches
+at most the speed of the leader, f <= (w - v) / tau, and before a line he keeps his speed at most, f <= 0.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Tri
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, PositiveOrInf, Settings, setting
 
-LEAST_GAP = 0.5  # m; nearer, the estimate of a gap is all noise
+LEAST_GAP = 0.5  # m; smaller gaps are below their own noise
 
 
 class Linearised(NamedTuple):
@@ -44,7 +44,7 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True)
 class IntelligentDriver(Settings):
-    """A vehicle follows its leader as a driver does; the source is the leader.
+    """A vehicle follows its leader, which is the source.
 
     The defaults are those of city traffic in Treiber and Kesting, Traffic Flow Dynamics (2013), table 11.2.
     """
@@ -63,7 +63,7 @@ class IntelligentDriver(Settings):
     time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau has the full acceleration of the law, s")
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
-        """f (E,) where nobody hides in the gap; v, w >= 0 m/s, s m."""
+        """f (E,) without an undetected vehicle in the gap; v, w >= 0 m/s, s m."""
         a, T, s = self.acceleration, self.headway, np.maximum(s, LEAST_GAP)
         root = 2 * math.sqrt(a * self.deceleration)
         dynamic = v * T + v * (v - w) / root
@@ -94,12 +94,12 @@ class IntelligentDriver(Settings):
         return self._capped(v, s, w, Linearised(rate * (w - v), none - rate, none, none + rate))
 
     def stopping(self, v: FloatArray, s: FloatArray) -> Linearised:
-        """Acceleration (E,) before a line where one has to stop."""
+        """Acceleration (E,) before a line to stop at."""
         none = np.zeros_like(v)
         return self._capped(v, s, none, Linearised(none, none, none, none))
 
     def _capped(self, v: FloatArray, s: FloatArray, w: FloatArray, highest: Linearised) -> Linearised:
-        """f, but at most `highest` where the gap has room for somebody else."""
+        """f, but at most `highest` where the gap has room for another vehicle."""
         f = self.alone(v, s, w)
         return highest.where((s >= self.hidden_vehicle_gap) & (highest.value < f.value), f)
 

@@ -36,15 +36,15 @@ Needs = tuple[tuple[str, ...], tuple[str, ...]]
 
 @dataclass(frozen=True, eq=False)
 class NodeTable:
-    """The nodes as rules and interactions see them: estimates at the start of an interval, in world coordinates.
+    """The nodes as input of rules and interactions: estimates at the start of an interval, in world coordinates.
 
     id (n,); label (n,) classes; types n node types; position (n, 2) m; velocity (n, 2) m/s; heading (n,) rad;
     length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2;
-    has_moved (n,) whether a node was ever clearly in motion, which tells a parked car from one that waits in a queue;
-    None if nobody knows; closed (n,) the weight in [0, 1] with which a stop line is closed, as the belief on its light
-    says, None where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
+    has_moved (n,) whether a node was ever clearly in motion, which distinguishes parked from waiting cars; None if
+    unknown; closed (n,) the weight in [0, 1] with which a stop line is closed, by the belief on its light, None
+    where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
     or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
-    nobody knows
+    unknown
     """
 
     id: IntArray
@@ -92,8 +92,7 @@ class SharedVelocity:
 
     needs: ClassVar[Needs] = (VELOCITY, VELOCITY)
     along_heading: bool = setting(
-        False,
-        "true: turn the neighbour's velocity by the difference of headings, for queues in bends",
+        False, "true: turn the neighbour's velocity by the difference of headings, for queues in bends"
     )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:

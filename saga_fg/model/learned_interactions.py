@@ -1,6 +1,6 @@
 """Interactions learned from recordings, as a value that is written to a file and given to a tracker.
 
-Dynamics that were learned must not run away: `saga_fg.model.stability` says what is tried on construction.
+Learned dynamics must be stable: construction checks them by `saga_fg.model.stability`.
 """
 
 from __future__ import annotations

@@ -15,12 +15,12 @@ one linear motion with the same means, covariances and cross-covariance of x and
     Q = sum_sr w_sr ( Q_r + (F_r - F) P_s (F_r - F)^T + e_sr e_sr^T ),     e_sr = F_r m_s + c_r - F m_s - b
 
 They are recorded with the interval (`saga_fg.model.scene_graph`). Before and after it the node's Gaussians follow the
-joint state, which has heard of its neighbours too, by the one affine map that gives their mixture its marginal's
-moments.
+joint state, which includes the neighbours' information, by the affine map that gives their mixture the moments of its
+marginal.
 
-A measurement is evidence of the mode as well. So the joint state is updated by an equivalent measurement, of the whole
-state of the node, which takes the moments (m, P) of its mixture before to those after, (m', P'): with P = L L^T, and
-s, u the eigenvalues and vectors of L^-1 P' L^-T,
+A measurement is evidence of the mode as well. The joint state is therefore updated by an equivalent measurement of the
+whole state of the node, which takes the moments (m, P) of its mixture before to those after, (m', P'): with P = L L^T,
+and s, u the eigenvalues and vectors of L^-1 P' L^-T,
 
     u^T L^-1 (x - m) = y / (1 - s) + v,     v ~ N(0, s / (1 - s)),     y = u^T L^-1 (m' - m)
 
@@ -53,7 +53,7 @@ _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurem
 
 @dataclass(frozen=True)
 class Stationary(Settings):
-    """A stationary object: its position drifts, its velocity fades."""
+    """Motion of an object at rest: its position drifts, its velocity decays."""
 
     drift: NonNegative = setting(0.2, "standard deviation of the drift of the position in one second, m")
     speed: Positive = setting(0.1, "standard deviation of a component of the velocity, m/s")
@@ -96,17 +96,17 @@ class Mixture(Settings):
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Those of all modes, position and velocity first."""
+        """The components of all modes, position and velocity first."""
         return tuple(dict.fromkeys(POSITION + VELOCITY + tuple(c for m in self.motions for c in m.components)))
 
     @property
     def generator(self) -> FloatArray:
-        """That of constant velocity: along it edges act, and late measurements are moved."""
+        """The generator of constant velocity, along which edges act and late measurements are predicted."""
         return np.diag([1.0, 1.0] + [0.0] * (len(self.components) - 4), k=2)
 
     @property
     def diffusion(self) -> FloatArray:
-        """The mean of the modes'."""
+        """The mean diffusion of the modes."""
         total = np.zeros((len(self.components), len(self.components)))
         for motion in self.motions:
             at = [self.components.index(c) for c in motion.components]
@@ -125,7 +125,7 @@ class Mixture(Settings):
 
 
 class ModeDynamics(NamedTuple):
-    """Of n nodes and M modes: F (n, M, d, d), c (n, M, d), Q (n, M, d, d)."""
+    """Dynamics of n nodes and M modes: F (n, M, d, d), c (n, M, d), Q (n, M, d, d)."""
 
     F: FloatArray
     c: FloatArray
@@ -249,7 +249,7 @@ class ModeTable:
 
 
 def mode_dynamics(mixture: Mixture, mean: FloatArray, dt: float) -> ModeDynamics:
-    """Every mode over dt, linearised at means (n, M, d); what a mode has no use for is drawn anew, from 0."""
+    """Every mode over dt, linearised at means (n, M, d); components that a mode does not have are reset to 0."""
     n, M, d = mean.shape
     F, c, Q = np.zeros((n, M, d, d)), np.zeros((n, M, d)), np.zeros((n, M, d, d))
     for r, motion in enumerate(mixture.motions):

@@ -41,7 +41,7 @@ class Motion(Protocol):
 class NonlinearMotion(Motion, Protocol):
     """Own motion x(t + dt) = flow(x(t), dt) + q; both functions take stacks of states (..., d).
 
-    Any motion may have an `initial_deviation` (d,) as well: of components that nothing is known of, 1 by default.
+    Any motion may also have an `initial_deviation` (d,), of unmeasured components of a new object, 1 by default.
     """
 
     def flow(self, x: FloatArray, dt: float) -> FloatArray: ...
@@ -59,8 +59,7 @@ class ConstantVelocity(Settings):
     """White noise acceleration in the plane (Bar-Shalom, Li, Kirubarajan 2001, section 6.2.2)."""
 
     acceleration_noise: NonNegative = setting(
-        1.0,
-        "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3; higher: follows detections faster",
+        1.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3; higher: follows detections faster"
     )
 
     @property
@@ -170,7 +169,7 @@ class NodeType:
 
     @cached_property
     def initial_deviation(self) -> FloatArray:
-        """(d,) of components that nothing is known of: 1 unless the motion says otherwise."""
+        """(d,) of unmeasured components of a new object: 1 unless the motion defines it."""
         given = getattr(self.motion, "initial_deviation", np.ones(self.dim))
         return checked("initial_deviation", given, (self.dim,))
 

@@ -8,12 +8,12 @@
 
 The second is the circular specification of the social force (Helbing, Farkas, Vicsek 2000, doi 10.1038/35035023,
 equation 2 without body contact). The first is that of Treiber, Hennecke, Helbing (2000, doi
-10.1103/PhysRevE.62.1805, equations 3 and 4) with round corners: a least-squares solution that lies on a corner has no
-linearisation, and solvers go round it for ever.
+10.1103/PhysRevE.62.1805, equations 3 and 4) with round corners: at a corner a least-squares solution has no
+linearisation, and solvers do not converge.
 
     f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + hardest
     s* = s0 + S(v T + v (v - w) / (2 sqrt(a b))),    S(x) = log(1 + e^x) for max(0, x), s likewise, m
-    f  = -v / t_stop + h S((f0 + v / t_stop) / h)    for max(f0, -v / t_stop): nobody drives backwards; h 0.05 m/s^2
+    f  = -v / t_stop + h S((f0 + v / t_stop) / h)    for max(f0, -v / t_stop): vehicles do not reverse; h 0.05 m/s^2
 
 An edge rule whose `interaction` is one of these makes `NonlinearEdges` of a scene graph: a filter linearises them at
 the start of the interval, smoothers wherever their estimates are. `interaction` gives the same law for factors by hand.
@@ -39,7 +39,7 @@ _HALT = 0.05  # m/s^2
 
 
 class Accelerations(NamedTuple):
-    """Of E pairs: value (E, 2), m/s^2, and its derivatives (E, 2, 4) by (p, v) of the node and of the other."""
+    """Accelerations (E, 2) of E pairs, m/s^2, and derivatives (E, 2, 4) by (p, v) of the node and of the other."""
 
     value: FloatArray
     by_own: FloatArray
@@ -48,7 +48,7 @@ class Accelerations(NamedTuple):
 
 @runtime_checkable
 class AccelerationLaw(Protocol):
-    """How a node with position and velocity is accelerated by another; an edge of rate 1 / tau acts with all of it."""
+    """Acceleration of a node with position and velocity by another; an edge of rate 1 / tau acts with all of it."""
 
     @property
     def time_constant(self) -> float:
@@ -56,14 +56,14 @@ class AccelerationLaw(Protocol):
 
     @property
     def alone(self) -> FloatArray:
-        """What `accelerations` is given of a pair where nobody says more."""
+        """Default argument `given` of `accelerations`, for a pair without a node table."""
 
     @property
     def needs(self) -> Needs:
         """Components that target and source must have."""
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
-        """What of the edges source[k] -> target[k] does not depend on states: (E, ...)."""
+        """Parameters (E, ...) of the edges source[k] -> target[k] that do not depend on states."""
 
     def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
         """At (p, v) of the nodes (E, 4) and of the others, whose v is 0 if they have none."""
@@ -71,7 +71,7 @@ class AccelerationLaw(Protocol):
 
 @dataclass(frozen=True)
 class SmoothDriver(Settings):
-    """A vehicle follows its leader, the source, as a driver does: an intelligent driver whose law has no corners."""
+    """A vehicle follows its leader, the source: an intelligent driver whose law has no corners."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
     driver: IntelligentDriver = settings_group(
@@ -184,7 +184,7 @@ def interaction(law: AccelerationLaw) -> NonlinearInteraction:
 
 
 def held(by_state: FloatArray, dt: float) -> FloatArray:
-    """What accelerations (..., 2, n) held over dt do to positions and velocities, (..., 4, n)."""
+    """Change (..., 4, n) of positions and velocities by accelerations (..., 2, n) held over dt."""
     return np.concatenate([0.5 * dt * dt * by_state, dt * by_state], axis=-2)
 
 

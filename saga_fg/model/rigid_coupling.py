@@ -1,9 +1,9 @@
-r"""Two objects that are one: a truck and its trailer, a bicycle and its rider.
+r"""Rigid coupling of two objects that move as one: a truck and its trailer, a bicycle and its rider.
 
     dv_i/dt += rate ( v_j - v_i + ( p_j - p_i - d_ij ) / tau ),    d_ij the offset at the start of the interval
 
-Edges go both ways: either takes on the other's velocity and keeps its place relative to it, so that whatever one of the
-two is seen to do, the other does as well. From one interval to the next the offset may turn with the pair.
+Edges go both ways: each takes on the other's velocity and keeps its place relative to it, so that detections of one
+correct the other as well. From one interval to the next the offset may turn with the pair.
 """
 
 from __future__ import annotations

@@ -44,23 +44,10 @@ class Edges:
     b: FloatArray
 
     def __post_init__(self) -> None:
-        what = f"edges of {self.interaction}"
-        count = len(checked_rows(f"{what}: target", self.target))
-        for name in ("target", "source"):
-            object.__setattr__(self, name, checked_rows(f"{what}: {name}", getattr(self, name), count))
-        rate = checked(f"{what}: rate", self.rate, (count,))
-        if (rate < 0).any():
-            raise InputError(
-                f"{what}: rate[{int(np.argmax(rate < 0))}]: expected a rate >= 0 in 1/s, got {rate.min():g}"
-            )
-        if (self.target == self.source).any():
-            raise InputError(
-                f"{what}: node row {int(self.target[self.target == self.source][0])} has an edge to itself"
-            )
+        what, count = _checked_ends(self)
         d_i, d_j = np.shape(self.A_other)[1:] if np.ndim(self.A_other) == 3 else (0, 0)
-        object.__setattr__(self, "rate", rate)
         for name, shape in (("A_self", (count, d_i, d_i)), ("A_other", (count, d_i, d_j)), ("b", (count, d_i))):
-            object.__setattr__(self, name, checked(f"{what}: {name}", getattr(self, name), shape))
+            vars(self)[name] = checked(f"{what}: {name}", getattr(self, name), shape)
 
     def __len__(self) -> int:
         return len(self.target)
@@ -94,7 +81,7 @@ class NonlinearEdges:
     target  (E,) rows of the influenced nodes in the graph
     source  (E,) rows of the influencing nodes
     rate    (E,) >= 0, 1/s
-    given   (E, ...) what the law takes besides the states
+    given   (E, ...) arguments of the law besides the states
     """
 
     law: AccelerationLaw
@@ -104,14 +91,8 @@ class NonlinearEdges:
     given: FloatArray
 
     def __post_init__(self) -> None:
-        what, given = f"edges of {self.interaction}", np.asarray(self.given)
-        count = len(checked_rows(f"{what}: target", self.target))
-        for name in ("target", "source"):
-            object.__setattr__(self, name, checked_rows(f"{what}: {name}", getattr(self, name), count))
-        object.__setattr__(self, "rate", checked(f"{what}: rate", self.rate, (count,)))
-        object.__setattr__(self, "given", checked(f"{what}: given", given, (count, *given.shape[1:])))
-        if (self.rate < 0).any() or (self.target == self.source).any():
-            raise InputError(f"{what}: expected rates >= 0 and no edge of a node to itself")
+        what, count = _checked_ends(self)
+        vars(self)["given"] = checked(f"{what}: given", self.given, (count, *np.shape(self.given)[1:]))
 
     def __len__(self) -> int:
         return len(self.target)
@@ -120,6 +101,21 @@ class NonlinearEdges:
     def interaction(self) -> str:
         """Name of the law."""
         return type(self.law).__name__
+
+
+def _checked_ends(edges: Edges | NonlinearEdges) -> tuple[str, int]:
+    """Check ends and rates; returns a description of the edges and their number."""
+    what = f"edges of {edges.interaction}"
+    count = len(checked_rows(f"{what}: target", edges.target))
+    for name in ("target", "source"):
+        vars(edges)[name] = checked_rows(f"{what}: {name}", getattr(edges, name), count)
+    rate = vars(edges)["rate"] = checked(f"{what}: rate", edges.rate, (count,))
+    if (rate < 0).any():
+        raise InputError(f"{what}: rate[{int(np.argmax(rate < 0))}]: expected a rate >= 0 in 1/s, got {rate.min():g}")
+    if (edges.target == edges.source).any():
+        row = int(edges.target[edges.target == edges.source][0])
+        raise InputError(f"{what}: node row {row} has an edge to itself")
+    return what, count
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +142,7 @@ class SceneGraph:
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "types", tuple(self.types))
+        vars(self).update(nodes=nodes, types=tuple(self.types))
         if len(self.types) != len(nodes):
             raise InputError(f"types: expected {len(nodes)} node types, got {len(self.types)}")
         given = np.ones(len(nodes)) if self.diffusion_scale is None else self.diffusion_scale
@@ -156,7 +151,7 @@ class SceneGraph:
             raise InputError(
                 f"diffusion_scale[{int(np.argmax(scale <= 0))}]: expected a factor > 0, got {scale.min():g}"
             )
-        object.__setattr__(self, "diffusion_scale", scale)
+        vars(self)["diffusion_scale"] = scale
         for group in self._groups:
             d_i, d_j = group.A_other.shape[1:] if isinstance(group, Edges) else (None, None)
             for name, rows, dim in (("target", group.target, d_i), ("source", group.source, d_j)):
@@ -189,7 +184,7 @@ class SceneGraph:
         return sum(len(group) for group in self._groups)
 
     def without_edges(self) -> SceneGraph:
-        """The same nodes, moving on their own: the classical filter's graph."""
+        """The nodes without edges, as for independent filters."""
         return SceneGraph(self.nodes, self.types)
 
     def after(self, dt: float) -> SceneGraph:

@@ -1,4 +1,4 @@
-r"""Whether edge rules, alone and together, can make objects run away from each other.
+r"""Stability of edge rules, alone and together: they must not drive objects apart.
 
 By Gershgorin's theorem the eigenvalues of couplings whose rates sum to K_i at node i lie in discs about -K_i of radius
 K_i, so within 2 max K_i of zero, and two nodes that act on each other at the rate max K_i reach that bound. Rules are
@@ -7,11 +7,11 @@ act, unless the rule has leaders. No eigenvalue of the joint generator may have 
 step, which is of first order in the coupling, may be outside the unit circle.
 
 Each rule is tried alone, on pairs in several directions to each other, and together with all that may act on the same
-object, on a pair that heads the same way. (Where headings differ, one rule that speaks of speeds along headings and one
-of velocities may feed each other while headings are held; but the next interval sees these follow the velocities.)
+object, on a pair that heads the same way. (Where headings differ, a rule for speeds along headings and one
+for velocities may feed each other while headings are held; but in the next interval these follow the velocities.)
 
-Rules by which lanes, lines or cones act on vehicles are not tried: what stands cannot be driven to run away. Nor are
-laws of acceleration, which are bounded in themselves.
+Rules by which lanes, lines or cones act on vehicles are not tried, as their sources are stationary. Nor are laws of
+acceleration, which are bounded in themselves.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _classes(rule: MovingRule) -> tuple[str, ...]:
 
 
 def _states(rule: MovingRule) -> tuple[bool, ...]:
-    """Whether a rule acts on objects that were seen moving, on others, or on both."""
+    """States of objects that a rule acts on: True for seen moving, False for others."""
     match rule:
         case Neighbours():
             return (not rule.parked,)

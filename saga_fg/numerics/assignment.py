@@ -34,7 +34,7 @@ class Matching:
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """id (k,) of tracks and the row (k,) of the detection, among all of a frame, that each took in or was born from."""
+    """id (k,) of tracks, and the row (k,) in the frame of the detection that updated or initiated each."""
 
     id: IntArray
     detection: IntArray
@@ -80,7 +80,7 @@ def assign(cost: FloatArray, possible: BoolArray, unmatched: float | FloatArray)
 
 
 def least_total(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
-    """Which of K candidates, pairs (row, column), make the assignment of least total gain; ascending.
+    """Choose from K candidates, pairs (row, column), the assignment of least total gain; ascending.
 
     gain (K,): what a candidate costs less than leaving both alone. Candidates without a rival need no assignment.
     """

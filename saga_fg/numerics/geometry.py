@@ -29,7 +29,7 @@ def checked_transform(name: str, value: ArrayLike) -> FloatArray:
 
 
 def is_rotation(R: FloatArray, tolerance: float) -> BoolArray:
-    """Which of the matrices (..., 3, 3) are orthonormal to within `tolerance` and no reflections; of any magnitude."""
+    """Test matrices (..., 3, 3): orthonormal to within `tolerance` and no reflection."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         orthonormal = (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) <= tolerance).all(axis=(-2, -1))
         return np.asarray(orthonormal & (np.linalg.det(R) > 0))

@@ -1,4 +1,4 @@
-r"""What two associations say of each other: the pairwise costs of matching a graph to a graph.
+r"""Pairwise costs of two associations, for matching a graph to a graph.
 
 Track i is predicted at m_i, tracks i and j with the joint covariance of the filter; detection a is at z_a. If a is i's
 and b is j's, the two innovations are jointly Gaussian, and the two associations are not independent:
@@ -13,9 +13,9 @@ L_jb^-T, L L^T = S, and u = L^-1 nu, it is a function of 2x2 matrices alone:
 
     c = log det( I - U U^T ) + v^T ( I - U U^T )^-1 v - u_ia^T u_ia,       v = u_ia - U u_jb
 
-Of k objects that move as one there are k (k - 1) / 2 such terms, which would count what they know in common k / 2 times
-over. A tree of k - 1 of them makes a proper density; every spanning tree does. The costs are the mean over all of them,
-drawn with weights proportional to the mutual information I_ij of the two predictions: each term is multiplied by the
+Among k objects that move as one there are k (k - 1) / 2 such terms, which would count their common information k / 2
+times. A tree of k - 1 of them makes a proper density; every spanning tree does. The costs are the mean over all trees,
+sampled with weights proportional to the mutual information I_ij of the two predictions: each term is multiplied by the
 probability that its edge is in the tree, by Kirchhoff's theorem I_ij times the resistance between i and j in a network
 of the conductances I (Wainwright, Jaakkola, Willsky, A new class of upper bounds on the log partition function, IEEE
 Trans. Information Theory 51, 2005). For two objects that is exactly the joint likelihood.
@@ -33,7 +33,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.quadratic_matching import PairCosts
 
 PARTNERS = 4  # of each track, the most informative
-LEAST_INFORMATION = 1e-4  # nats; tracks whose positions tell less of each other are independent
+LEAST_INFORMATION = 1e-4  # nats; tracks with less mutual information are taken for independent
 
 
 class CrossCovariances(NamedTuple):
@@ -71,7 +71,7 @@ def pair_costs(
 
 
 def tree_edges(track: IntArray, whitening: FloatArray, cross: CrossCovariances) -> tuple[CrossCovariances, FloatArray]:
-    """The pairs of tracks that tell something of each other, and (E,) the share of spanning trees that join them.
+    """The pairs of tracks with mutual information, and (E,) the share of spanning trees that contain them.
 
     whitening (K, 2, 2): L^-1 of the candidates of tracks `track` (K,), S = L L^T; the first of each track's serves
     """
@@ -84,8 +84,8 @@ def tree_edges(track: IntArray, whitening: FloatArray, cross: CrossCovariances) 
     U = whitening[row[i]] @ C @ np.swapaxes(whitening[row[j]], 1, 2)
     information = -0.5 * np.log(_determinant(np.eye(2) - U @ np.swapaxes(U, 1, 2)))
     kept = np.flatnonzero(information > LEAST_INFORMATION)
-    told = information[kept]
-    strongest = _strongest(np.concatenate([i[kept], j[kept]]), np.concatenate([told, told]))
+    mutual = information[kept]
+    strongest = _strongest(np.concatenate([i[kept], j[kept]]), np.concatenate([mutual, mutual]))
     kept = kept[np.unique(strongest % max(len(kept), 1))]
     i, j, information = i[kept], j[kept], information[kept]
     return CrossCovariances(i, j, C[kept]), information * _resistance(i, j, information)
@@ -115,7 +115,7 @@ def _resistance(i: IntArray, j: IntArray, conductance: FloatArray) -> FloatArray
     L = np.tile(np.eye(int(size.max())), (parts, 1, 1))
     L[part, slot, slot] = np.bincount(a, conductance, k) + np.bincount(b, conductance, k)
     L[part[a], slot[a], slot[b]] = L[part[a], slot[b], slot[a]] = -conductance
-    # which knows no level: fixing it by a conductance to ground everywhere changes no difference
+    # which is singular: fixing the level by a conductance to ground everywhere changes no difference
     ground = np.bincount(part, L[part, slot, slot]) / size**2
     inside = np.arange(L.shape[1]) < size[:, None]
     G = np.linalg.inv(L + ground[:, None, None] * (inside[:, :, None] & inside[:, None, :]))

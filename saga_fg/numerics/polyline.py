@@ -10,7 +10,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 class Feet(NamedTuple):
-    """Of m places: the nearest points (m, 2) of a polyline, s (m,) and e (m,), m, and its direction (m, 2) at s."""
+    """Nearest points (m, 2) of a polyline to m places, s (m,) and e (m,), m, and its direction (m, 2) at s."""
 
     point: FloatArray
     s: FloatArray
@@ -43,7 +43,7 @@ def feet(polyline: FloatArray, places: FloatArray) -> Feet:
 
 
 def on_it(polyline: FloatArray, s: FloatArray) -> BoolArray:
-    """Which distances (m,) along a polyline (k, 2) are neither before its first nor beyond its last point."""
+    """Mask (m,) of distances along a polyline (k, 2) between its first and its last point."""
     return np.asarray((s >= 0) & (s <= np.hypot(*np.diff(polyline, axis=0).T).sum()))
 
 

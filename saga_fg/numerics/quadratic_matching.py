@@ -34,7 +34,7 @@ _EXACT = 1e-9  # costs closer than this are the same
 
 
 class PairCosts(NamedTuple):
-    """What it costs beyond their own to choose candidates `first` (E,) and `second` (E,) together: cost (E,)."""
+    """Costs (E,), beyond their own, of choosing candidates `first` (E,) and `second` (E,) together."""
 
     first: IntArray
     second: IntArray
@@ -203,6 +203,6 @@ def _search(track: IntArray, detection: IntArray, gain: FloatArray, C: FloatArra
 
 
 def _incumbent(track: IntArray, detection: IntArray, gain: FloatArray, C: FloatArray) -> tuple[float, IntArray]:
-    """What the assignment of least g costs, and that assignment."""
+    """Cost of the assignment of least g, and that assignment."""
     chosen = least_total(track, detection, gain)
     return float(gain[chosen].sum() + C[np.ix_(chosen, chosen)].sum() / 2), chosen

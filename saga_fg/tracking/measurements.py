@@ -92,7 +92,7 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     limit = sensor.max_speed if sensor.use_velocity else -1.0
-    covariance_scale, position_bias = sensor.told(boxes.label, probability)
+    covariance_scale, position_bias = sensor.covariance_calibration(boxes.label, probability)
     return FrameMeasurements(
         sensor,
         frame.sensor,

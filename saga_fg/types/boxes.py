@@ -57,14 +57,7 @@ class Boxes(Columns):
                 raise InputError(f"{name}[{row}]: expected numbers within {limit:g}, got {values[row].tolist()}")
         yaw = wrap_angle(checked("yaw", self.yaw, (n,), "finite-or-nan"))
         yaw.flags.writeable = False
-        for name, array in (
-            ("label", label),
-            ("position", position),
-            ("size", size),
-            ("yaw", yaw),
-            ("velocity", velocity),
-        ):
-            object.__setattr__(self, name, array)
+        vars(self).update(label=label, position=position, size=size, yaw=yaw, velocity=velocity)
 
     @classmethod
     def of(

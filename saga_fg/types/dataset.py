@@ -40,8 +40,7 @@ class Annotations:
         visible = np.asarray(self.visible)
         if visible.shape != (n,) or (n and visible.dtype != np.bool_):
             raise InputError(f"visible: expected {n} booleans, got {visible.dtype} {visible.shape}")
-        object.__setattr__(self, "id", ids)
-        object.__setattr__(self, "visible", visible.astype(bool))
+        vars(self).update(id=ids, visible=visible.astype(bool))
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -89,15 +88,14 @@ class Scene:
             raise InputError(
                 f"scene {self.name}: frames[{k}]: expected frames in order of time, {times[k]:.6f} s comes late"
             )
-        object.__setattr__(self, "timestamps", timestamps)
-        object.__setattr__(self, "world_T_ego", poses)
+        vars(self).update(timestamps=timestamps, world_T_ego=poses)
 
     def __len__(self) -> int:
         return len(self.timestamps)
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """The names of the sensors that speak in this scene, sorted."""
+        """The names of the sensors of this scene, sorted."""
         return tuple(sorted({frame.sensor for frame in self.frames}))
 
 

@@ -1,4 +1,4 @@
-"""What the vehicle measured of itself by the time of a frame: odometry, GPS, inertial samples, landmarks."""
+"""Ego measurements of a frame: odometry, GPS, inertial samples, landmarks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _TANGENT = {3: 3, 4: 6}  # dimension of the motions of so large a transform
 
 @dataclass(frozen=True, eq=False)
 class OdometryIncrement:
-    """How the vehicle has moved over the last `dt` s.
+    """Motion of the vehicle over the last `dt` s.
 
     before_T_now  where it is now in its frame of then, (3, 3) in the plane or (4, 4) in space
     covariance    (3, 3) of (x, y, heading), or (6, 6) of (rotation vector, translation), in the frame of now, m and
-                  rad; None: as the provider's settings say
+                  rad; None: by the provider's settings
     """
 
     before_T_now: FloatArray
@@ -40,15 +40,13 @@ class OdometryIncrement:
             raise InputError(str(error)) from error
         if not (isinstance(self.dt, int | float) and math.isfinite(self.dt) and self.dt > 0):
             raise InputError(f"odometry: dt: expected a finite number of seconds > 0, got {self.dt!r}")
-        object.__setattr__(self, "before_T_now", motion)
-        object.__setattr__(
-            self, "covariance", _covariance("odometry: covariance", self.covariance, _TANGENT[len(motion)])
-        )
+        covariance = _covariance("odometry: covariance", self.covariance, _TANGENT[len(motion)])
+        vars(self).update(before_T_now=motion, covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class GpsFix:
-    """A measured place, (2,) or (3,), world, m; covariance (2, 2) or (3, 3), None: as the provider's settings say."""
+    """A measured place, (2,) or (3,), world, m; covariance (2, 2) or (3, 3), None: by the provider's settings."""
 
     position: FloatArray
     covariance: FloatArray | None = None
@@ -57,8 +55,7 @@ class GpsFix:
         place = checked("gps", self.position, (None,))
         if len(place) not in (2, 3):
             raise InputError(f"gps: expected a place of 2 or 3 coordinates, got {len(place)}")
-        object.__setattr__(self, "position", place)
-        object.__setattr__(self, "covariance", _covariance("gps: covariance", self.covariance, len(place)))
+        vars(self).update(position=place, covariance=_covariance("gps: covariance", self.covariance, len(place)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +76,9 @@ class ImuSamples:
             raise InputError("imu: expected at least one sample, got none")
         if not (dt > 0).all():
             raise InputError(f"imu: dt[{int(np.argmin(dt))}]: expected a number of seconds > 0, got {dt.min():g}")
-        object.__setattr__(self, "dt", dt)
+        vars(self)["dt"] = dt
         for name in ("acceleration", "angular_rate"):
-            object.__setattr__(self, name, checked(f"imu: {name}", getattr(self, name), (len(dt), 3)))
+            vars(self)[name] = checked(f"imu: {name}", getattr(self, name), (len(dt), 3))
 
 
 @dataclass(frozen=True, eq=False)

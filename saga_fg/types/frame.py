@@ -1,4 +1,4 @@
-"""What a sensor says: `Detection`, a table of them (`Detections`), and a `Frame`, one message of one sensor."""
+"""Sensor messages: `Detection`, a table of them (`Detections`), and a `Frame`, one message of one sensor."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Detection:
 class Detections(Columns):
     """N detections as columns: `boxes`, their `score` (N,) and `range_rate` (N,). Iterating gives `Detection`s.
 
-    A range rate (m/s; NaN, as by default: not measured) is what a radar says of motion: the component of the velocity
+    A range rate (m/s; NaN, as by default: not measured) is measured by radars: the component of the velocity
     *over ground* along the horizontal line of sight from the sensor, positive when the object moves away. Where the
     radar gives it relative to itself, add the component of the sensor's own velocity along that line first.
     """
@@ -58,13 +58,12 @@ class Detections(Columns):
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
-        object.__setattr__(self, "score", checked("score", self.score, (n,)))
         rate = np.full(n, self.range_rate) if np.ndim(self.range_rate) == 0 else self.range_rate
         rate = checked("range_rate", rate, (n,), "finite-or-nan")
         if (np.abs(rate) > MAX_SPEED).any():
             row = int(np.argmax(np.abs(rate) > MAX_SPEED))
             raise InputError(f"range_rate[{row}]: expected numbers within {MAX_SPEED:g}, got {rate[row]:g}")
-        object.__setattr__(self, "range_rate", rate)
+        vars(self).update(score=checked("score", self.score, (n,)), range_rate=rate)
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Self:
@@ -115,7 +114,7 @@ class Detections(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One message of one sensor: everything it detected at `timestamp`. An empty frame says "looked, saw nothing".
+    """One message of one sensor: everything it detected at `timestamp`. An empty frame means that it detected nothing.
 
     timestamp    s, any epoch, the same for all sensors of a scene
     sensor       the sensor's name, e.g. "lidar"
@@ -123,7 +122,7 @@ class Frame:
     world_T_ego  (4, 4) pose of the vehicle at `timestamp`; required unless `coordinates` is "world" and no range rate
                  was measured, or `ego` is there to estimate it from
     token        the dataset's own name of the record, "" if none
-    road_map     what is known of the road from now on, besides what earlier frames brought; None: nothing new
+    road_map     the road from now on, in addition to maps of earlier frames; None: nothing new
     ego          what the vehicle measured of itself, for factor providers (`saga_fg.providers`)
 
     Raises `InputError` for a timestamp that is not finite or cannot be seconds, an unknown kind of coordinates, a pose
@@ -143,7 +142,7 @@ class Frame:
         timestamp = finite_seconds(self.timestamp)
         if abs(timestamp) > LATEST:
             raise InputError(f"timestamp: expected seconds, got {timestamp:g}: milli-, micro- or nanoseconds?")
-        object.__setattr__(self, "timestamp", timestamp)
+        vars(self)["timestamp"] = timestamp
         if not isinstance(self.sensor, str) or not self.sensor:
             raise InputError(f"sensor: expected a name, got {self.sensor!r}")
         if not isinstance(self.detections, Detections):
@@ -159,7 +158,7 @@ class Frame:
             if (np.abs(pose[:3, 3]) > MAX_POSITION).any():
                 place = pose[:3, 3].tolist()
                 raise InputError(f"world_T_ego: expected a place within {MAX_POSITION:g} m, got {place}")
-            object.__setattr__(self, "world_T_ego", pose)
+            vars(self)["world_T_ego"] = pose
         elif self.ego is not None:
             return
         elif self.coordinates != "world":

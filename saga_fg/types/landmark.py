@@ -1,12 +1,11 @@
-"""What a landmark is to the map: a type of variable, its factors, and where one is when first seen.
+"""Types of landmarks: the variable, its factors, and its initial state.
 
 A new type of landmark is one object with these members; association, filtering, smoothing, merging and output follow
 from them. `docs/guides/add-a-landmark.md` adds one.
 
-    state      `variable`: how it is read from `gtsam.Values`, moved and compared
-    predict    `factors`: their residual is how far an observation is off what the map predicts, their covariance how
-               far it may be; linearised they are all that the gates and the filter need
-    initialise where a landmark stands by one observation alone
+    state      `variable`: reading from `gtsam.Values`, retraction and difference
+    predict    `factors`: residual and covariance of an observation against the map, which gates and filter linearise
+    initialise the state of a landmark from its first observation
 
 An observation must determine its landmark: as many residuals as the state has dimensions.
 """
@@ -26,15 +25,15 @@ LandmarkFactors = Sequence[Linearisable] | gtsam.NonlinearFactorGraph
 
 
 class LandmarkType(Protocol):
-    """A kind of thing that stands."""
+    """A type of stationary object."""
 
     @property
     def name(self) -> str:
-        """What it is called in messages and files."""
+        """Name in messages and files."""
 
     @property
     def pose(self) -> PlanarPose | SpatialPose:
-        """The type of pose it is seen from."""
+        """The type of pose that observes it."""
 
     @property
     def variable(self) -> Variable:
@@ -42,7 +41,7 @@ class LandmarkType(Protocol):
 
     @property
     def density(self) -> float:
-        """How many of its kind to expect per unit of its tangent, e.g. 1/m^2: what a new one competes with."""
+        """Expected number per unit of its tangent, e.g. 1/m^2, for the odds of a new landmark in association."""
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> LandmarkFactors:
         """Return n factors, in this order: rows (n, 2) keys of pose and landmark, observed (n, m), covariances
@@ -50,12 +49,10 @@ class LandmarkType(Protocol):
         """
 
     def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> Any:
-        """Return the state that an observation (m,) from a pose, as a matrix, says."""
+        """Return the state of a landmark by an observation (m,) from a pose, given as a matrix."""
 
     def coordinates(self, state: Any) -> dict[str, float]:
-        """Return the numbers by which a state is written to files, by name; among them "x" and "y", m, where to draw
-        it.
-        """
+        """Return the numbers of a state for files, by name; among them "x" and "y", m, for drawings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +67,9 @@ class Observation:
 
     def __post_init__(self) -> None:
         d = self.kind.variable.dim
-        object.__setattr__(self, "value", checked(f"observed {self.kind.name}", self.value, (None,)))
+        value = checked(f"observed {self.kind.name}", self.value, (None,))
         covariance = checked_covariances(f"covariance of a {self.kind.name}", [self.covariance], 1, d)[0]
-        object.__setattr__(self, "covariance", covariance)
+        vars(self).update(value=value, covariance=covariance)
 
 
 @dataclass(frozen=True, eq=False)

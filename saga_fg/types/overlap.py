@@ -1,4 +1,4 @@
-"""How much oriented boxes overlap: IoU in the plane and in space, generalised IoU, over all pairs at once.
+"""Overlap of oriented boxes: IoU in the plane and in space, generalised IoU, over all pairs at once.
 
 With footprints A and B (rectangles in the horizontal plane), areas |.|, C the convex hull of both:
 

@@ -1,8 +1,8 @@
-"""What is known of the road: traffic lights, the stop lines they govern, lanes and walls, in world coordinates.
+"""Road maps: traffic lights, the stop lines they control, lanes and walls, in world coordinates.
 
-A `Frame` may bring a map along (`frame.road_map`), as a vehicle does that drives from tile to tile, or the
-configuration holds one (`tracker.road_map`). Every element becomes a node of the scene graph: its place is a state with
-a standard deviation, as maps err too.
+A `Frame` may carry a map (`frame.road_map`), such as a tile along the drive, or the configuration holds one
+(`tracker.road_map`). Every element becomes a node of the scene graph: its place is a state with a standard deviation,
+as maps err too.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class TrafficLight:
 
 @dataclass(frozen=True)
 class StopLine:
-    """Where a red light stops traffic; `left` and `right` are its ends as the drivers see them who come to it."""
+    """A line where a red light stops traffic; `left` and `right` are its ends as approaching drivers see them."""
 
     name: str = required_setting("its name")
     left: Point = required_setting("left end (x, y), m")
@@ -78,7 +78,7 @@ class Lane(Settings):
 
 @dataclass(frozen=True)
 class Wall:
-    """What nobody walks through: a house front, a fence."""
+    """An obstacle to pedestrians: a house front, a fence."""
 
     name: str = required_setting("its name")
     points: tuple[Point, ...] = required_setting("points (x, y) of its foot, m")
@@ -105,7 +105,7 @@ class RoadMap(Settings):
         names = [e.name for group in (self.lights, self.stop_lines, self.lanes, self.walls) for e in group]
         twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
         if twice is not None:
-            raise InputError(f"road map: expected names of their own, {twice!r} occurs twice")
+            raise InputError(f"road map: expected unique names, {twice!r} occurs twice")
         lights = {light.name for light in self.lights}
         for line in self.stop_lines:
             if line.light not in lights:

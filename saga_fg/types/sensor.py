@@ -1,15 +1,15 @@
-r"""Sensors: all that a sensor contributes to the filter is what it observes, how well, where, and when.
+r"""Sensor models: measurement noise, score calibration, field of view and extrinsics of a sensor.
 
     z = H x + v,   v ~ N(0, R)
     R = s(score)^2 ( position^2 I + (range_noise r)^2 u u^T + (bearing_noise r)^2 n n^T )
 
-with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. A radar besides
-measures the range rate u . velocity, with the variance (s(score) range_rate)^2. A score means
-something else for every detector and class; its calibration makes it a probability that compares (Platt 1999),
+with r the range from the sensor, u the line of sight, n across it, and s growing as the score falls. A radar also
+measures the range rate u . velocity, with the variance (s(score) range_rate)^2. The meaning of a score depends on the
+detector and the class; its calibration makes it a probability (Platt 1999),
 
     P(the detection is true) = 1 / (1 + exp(-(offset + slope logit(score)))).
 
-The motion of the world never depends on which sensor speaks, so a new sensor is a few lines of configuration.
+The motion model does not depend on the sensor, so a new sensor is a few lines of configuration.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class ScoreCalibration(Settings):
 
 @dataclass(frozen=True)
 class FieldOfView(Settings):
-    """What a sensor can see, in its own frame."""
+    """The field of view of a sensor, in its own frame."""
 
     min_azimuth: Finite = setting(-np.pi, "smallest azimuth, from straight ahead, left positive, rad")
     max_azimuth: Finite = setting(np.pi, "largest azimuth, rad")
@@ -102,7 +102,7 @@ class FieldOfView(Settings):
             )
 
     def holds(self, distance: FloatArray, azimuth: FloatArray) -> BoolArray:
-        """Which places (N,), m and rad, lie in it; one that is not known (NaN) does."""
+        """Mask (N,) of places, m and rad, inside it; unknown ones (NaN) count as inside."""
         middle, half = (self.min_azimuth + self.max_azimuth) / 2, (self.max_azimuth - self.min_azimuth) / 2
         aside = np.abs(wrap_angle(azimuth - middle))
         return np.asarray(~(distance > self.max_range) & ~(aside > half + 1e-9))
@@ -230,7 +230,7 @@ class Sensor(Settings):
     def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
         """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
 
-        Where the sensor stood is unknown (None), so is the range, and its part of the noise is left out.
+        Without a place of the sensor (None) the range is unknown, and its part of the noise is left out.
         """
         label, position = detections.boxes.label, detections.boxes.position[:, :2]
         probability = self.probability(detections.score, label)
@@ -247,8 +247,8 @@ class Sensor(Settings):
         deviation, low_score_growth = self.deviations(label, "range_rate", "low_score_growth")
         return np.asarray(deviation**2 * _score_factor(low_score_growth, probability))
 
-    def told(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is told of positions (N,): the factor on their deviations, and the shared error, m."""
+    def covariance_calibration(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """For reported covariances of positions (N,): the factor on deviations, and the deviation of the bias, m."""
         scale, shared, scale_growth, shared_growth = self.deviations(
             label, "reported_deviation_scale", "position_bias", "reported_low_score_growth", "position_bias_growth"
         )
@@ -256,7 +256,7 @@ class Sensor(Settings):
         return scale * (1 + scale_growth * doubt), shared * (1 + shared_growth * doubt)
 
     def in_world(self, frame: Frame) -> Detections:
-        """The detections of a frame of this sensor, in world coordinates; `InputError` where nobody knows the pose."""
+        """The detections of a frame of this sensor, in world coordinates; `InputError` where the pose is unknown."""
         if frame.coordinates == "world":
             return frame.detections
         if frame.world_T_ego is None:
@@ -265,13 +265,13 @@ class Sensor(Settings):
         return frame.detections.transformed(frame.world_T_ego @ ego_T_source)
 
     def origin(self, frame: Frame) -> FloatArray | None:
-        """Where the sensor stood (2,), world, m; None where the pose is unknown."""
+        """Place of the sensor (2,), world, m; None where the pose is unknown."""
         if frame.world_T_ego is None:
             return None
         return np.asarray((frame.world_T_ego @ self.extrinsics.ego_T_sensor)[:2, 3])
 
     def sees(self, position: FloatArray, world_T_ego: FloatArray | None) -> BoolArray:
-        """Which positions (N, 2), world, lie in the field of view; all of them where the pose is unknown."""
+        """Mask (N,) of positions (N, 2), world, in the field of view; all where the pose is unknown."""
         if world_T_ego is None:
             return np.ones(len(position), dtype=bool)
         return self.field_of_view.holds(*self.polar(position, world_T_ego))

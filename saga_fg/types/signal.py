@@ -31,7 +31,7 @@ LEAST_BELIEF = 1e-6  # no colour is ever ruled out
 
 @dataclass(frozen=True)
 class SignalSettings(Settings):
-    """Durations of traffic lights, and how the belief in their colour acts."""
+    """Colour changes of traffic lights, and the effect of the belief on stop lines."""
 
     red_duration: Positive = setting(15.0, "mean duration of red, s")
     amber_duration: Positive = setting(3.0, "mean duration of amber, s")
@@ -49,7 +49,7 @@ class SignalSettings(Settings):
 
     @property
     def stationary(self) -> FloatArray:
-        """(3,) belief of one who has seen nothing: the shares of the durations."""
+        """(3,) belief without observations: the shares of the durations."""
         durations = np.array([self.red_duration, self.amber_duration, self.green_duration])
         return np.asarray(durations / durations.sum())
 

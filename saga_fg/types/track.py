@@ -1,4 +1,4 @@
-"""What a tracker says: the `Track`s of one moment, as a table (`Tracks`)."""
+"""Tracker output: the `Track`s of one moment, as a table (`Tracks`)."""
 
 from __future__ import annotations
 
@@ -51,14 +51,11 @@ class Tracks:
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
-        for name, array in (
-            ("id", checked_ids("id", self.id, n)),
-            ("score", checked("score", self.score, (n,))),
-            ("position_covariance", checked("position_covariance", self.position_covariance, (n, 2, 2))),
-            ("velocity_covariance", checked("velocity_covariance", self.velocity_covariance, (n, 2, 2))),
-            ("coasting", checked("coasting", self.coasting, (n,))),
-        ):
-            object.__setattr__(self, name, array)
+        vars(self)["id"] = checked_ids("id", self.id, n)
+        for name in ("score", "coasting"):
+            vars(self)[name] = checked(name, getattr(self, name), (n,))
+        for name in ("position_covariance", "velocity_covariance"):
+            vars(self)[name] = checked(name, getattr(self, name), (n, 2, 2))
 
     @classmethod
     def empty(cls, timestamp: float) -> Self:

@@ -2,9 +2,9 @@ r"""A closed stop line brings the first vehicle to a halt, and through it the qu
 
     dv_i/dt += rate tau u ( -v^2 / (2 g) ),    v = u.v_i,    g = u.(p_j - p_i) + bend - length_i / 2 - margin
 
-is the even deceleration that ends at the line: v its speed along the lane, g the way left from the front of the vehicle
-to `margin` before the line, `bend` what the way along the lane is longer than the straight one. Linearised at the
-estimate (v0, g0):
+is the constant deceleration that ends at the line: v the speed along the lane, g the remaining way from the front of
+the vehicle to `margin` before the line, `bend` the extra length of the way along the lane over the straight one.
+Linearised at the estimate (v0, g0):
 
     -v^2 / (2 g) ~ -v0^2 / (2 g0) - (v0 / g0) (v - v0) + v0^2 / (2 g0^2) (g - g0)
 
@@ -12,10 +12,10 @@ The rule: of the vehicles that come to a line, the first of each lane that can s
 
     rate = rate  closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
 
-since nobody brakes for a line far away; vehicles that would have to brake harder than `max_deceleration` go on. Those
-behind follow by other interactions. Lanes of the map tell who comes to the line; without them, straight on along the
-heading. Or the vehicle comes to the line as a driver does, the line being a leader that stands
-(`saga_fg.model.intelligent_driver`): late and harder rather than evenly, and on to the line who is slow.
+since drivers do not brake for a line far away; a vehicle that would have to brake harder than `max_deceleration` goes
+on. Those behind follow by other interactions. A vehicle approaches a line along its lane of the map, or without lanes
+straight along its heading. Alternatively the line is a stationary leader of the Intelligent Driver Model
+(`saga_fg.model.intelligent_driver`): the vehicle brakes later and harder, and a slow one creeps up to the line.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in differe
 
 
 class Approach(NamedTuple):
-    """Of E pairs of a vehicle and a stop line: whether it comes to it, the way to it (from the centre, along the lane),
+    """E pairs of a vehicle and a stop line: whether it comes to it, the way to it (from the centre, along the lane),
     m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m to the left of its middle.
     """
 
@@ -51,7 +51,7 @@ class Approach(NamedTuple):
 
 
 def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
-    """How vehicles `target` (E,) stand to stop lines `source` (E,)."""
+    """The approaches of vehicles `target` (E,) to stop lines `source` (E,)."""
     offset = nodes.position[source] - nodes.position[target]
     u = facing = unit(nodes.heading[target])
     way = np.einsum("ei,ei->e", offset, u)

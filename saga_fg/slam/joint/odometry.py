@@ -1,4 +1,4 @@
-"""OdometryIncrements: what a vehicle believes it moved between epochs, and how well it knows.
+"""Odometry: measured motion of a vehicle between epochs, and its noise.
 
 Per interval of dt s and d m, an increment a_T_b has independent noise
 
@@ -26,20 +26,18 @@ from saga_fg.settings import Positive, Settings, setting
 
 @dataclass(frozen=True)
 class OdometryNoise(Settings):
-    """How good an odometry is: standard deviations."""
+    """Noise of an odometry: standard deviations."""
 
-    turn_noise: Positive = setting(0.01, "heading, rad after one second")
-    tilt_noise: Positive = setting(0.001, "roll and pitch, which gravity tells, rad after one second")
-    distance_noise: Positive = setting(0.03, "translation, m after one metre")
-    time_noise: Positive = setting(0.01, "translation, m after one second")
-    scale: Positive = setting(0.02, "scale of distances at the start")
-    scale_drift: Positive = setting(0.002, "change of the scale after one second")
-    bias: Positive = setting(0.005, "bias of the yaw rate at the start, rad/s")
-    bias_drift: Positive = setting(0.0005, "change of the bias after one second, rad/s")
-    course: Positive = setting(
-        0.01, "direction of travel against the axes in which objects are seen, at the start, rad"
-    )
-    course_drift: Positive = setting(0.0003, "change of that after one second, rad")
+    turn_noise: Positive = setting(0.01, "standard deviation of the heading after one second, rad")
+    tilt_noise: Positive = setting(0.001, "standard deviation of roll and pitch after one second, rad")
+    distance_noise: Positive = setting(0.03, "standard deviation of the translation after one metre, m")
+    time_noise: Positive = setting(0.01, "standard deviation of the translation after one second, m")
+    scale: Positive = setting(0.02, "standard deviation of the scale of distances at the start")
+    scale_drift: Positive = setting(0.002, "random walk of the scale in one second")
+    bias: Positive = setting(0.005, "standard deviation of the yaw-rate bias at the start, rad/s")
+    bias_drift: Positive = setting(0.0005, "random walk of the yaw-rate bias in one second, rad/s")
+    course: Positive = setting(0.01, "standard deviation of the course against the sensor axes at the start, rad")
+    course_drift: Positive = setting(0.0003, "random walk of that course in one second, rad")
 
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
         """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
@@ -59,8 +57,8 @@ class OdometryIncrements:
     """timestamps (n,) s, strictly increasing; a_T_b (n - 1, 4, 4): each pose in the frame of the one before.
 
     covariances: (n - 1, 6, 6) of the increments where the device states them, as scan registration does: (rotation
-    vector, translation) in the frame of the later pose, rad^2, m^2; None where `OdometryNoise` is all that is known.
-    Raises `InputError` for times that do not increase, increments that are not rigid, and covariances that are none.
+    vector, translation) in the frame of the later pose, rad^2, m^2; None: by `OdometryNoise` alone.
+    Raises `InputError` for times that do not increase, increments that are not rigid, and invalid covariances.
     """
 
     timestamps: FloatArray
@@ -76,9 +74,8 @@ class OdometryIncrements:
             checked_transform(f"a_T_b[{k}]", increment)
         if self.covariances is not None:
             covariances = checked_covariances("covariances", self.covariances, len(increments), 6)
-            object.__setattr__(self, "covariances", covariances)
-        object.__setattr__(self, "timestamps", timestamps)
-        object.__setattr__(self, "a_T_b", increments)
+            vars(self)["covariances"] = covariances
+        vars(self).update(timestamps=timestamps, a_T_b=increments)
 
     @classmethod
     def of(cls, timestamps: ArrayLike, world_T_ego: ArrayLike) -> Self:

@@ -51,7 +51,7 @@ def nearest_rotations(matrices: FloatArray) -> FloatArray:
 
 
 def _rotations(graph: PoseGraph, weight: FloatArray) -> FloatArray:
-    """With X_i = R_i^T the residual of an edge is X_second - R_e^T X_first, for each column of X alike."""
+    """Return rotations (N, d, d); with X_i = R_i^T an edge has the residual X_second - R_e^T X_first in each column."""
     d = graph.dim
     R = graph.first_T_second[:, :d, :d]
     A = _edge_matrix(graph, -R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape))

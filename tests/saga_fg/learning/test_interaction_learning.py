@@ -119,13 +119,13 @@ def test_a_gap_knows_its_neighbours_and_where_the_object_reappears():
     assert (sample.dt[late][:, 1:] == 0).all()
 
 
-def test_of_many_gaps_some_are_drawn_the_same_every_time():
+def test_of_many_gaps_some_are_chosen_the_same_every_time():
     _, sample = gaps_of(following_pairs(pairs=2, moments=60))
-    few = sample.drawn(5, seed=1)
+    few = sample.sampled(5, seed=1)
     assert len(few) == 5
     assert set(zip(few.moment, few.row, strict=True)) <= set(zip(sample.moment, sample.row, strict=True))
-    np.testing.assert_array_equal(sample.drawn(5, seed=1).moment, few.moment)
-    assert sample.drawn(len(sample), seed=1) is sample
+    np.testing.assert_array_equal(sample.sampled(5, seed=1).moment, few.moment)
+    assert sample.sampled(len(sample), seed=1) is sample
 
 
 def test_edges_that_tell_the_hidden_alone_leave_those_in_view_to_their_measurements():

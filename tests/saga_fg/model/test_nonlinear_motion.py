@@ -186,7 +186,7 @@ def test_a_law_that_fails_is_one_clear_error_after_which_all_goes_on(name, what)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rate": [-1.0]}, "rates >= 0"),
+        ({"rate": [-1.0]}, "a rate >= 0"),
         ({"rate": [np.nan]}, "finite"),
         ({"source": [0]}, "itself"),
         ({"given": [np.inf]}, "finite"),
