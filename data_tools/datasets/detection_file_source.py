@@ -1,4 +1,4 @@
-"""Tables of detections of one's own as a dataset of the command."""
+"""Tables of detections as a dataset of the command."""
 
 from __future__ import annotations
 
@@ -98,6 +98,6 @@ class DetectionFilePart:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
-        """With the digest of the file."""
+        """Open with the digest of the file."""
         with local_copy(self.url) as path:
             yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path))

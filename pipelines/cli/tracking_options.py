@@ -94,7 +94,7 @@ def _estimator_fits(method: str, estimator: str | None, lag: float | None, confi
 
 
 def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
-    """Where the journal goes, if one is wanted. Raises `InputError` where none can be kept."""
+    """Path of the journal, None if none is wanted. Raises `InputError` where none can be kept."""
     from pipelines.explaining import journal_of
 
     if explain and at_scale:

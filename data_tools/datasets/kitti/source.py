@@ -133,7 +133,7 @@ class KittiPart:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
-        """With the digests of its text files."""
+        """Open with the digests of its text files."""
         with self.source.open() as dataset:
             files = dataset.files(self.name)
             yield OpenedPart({f"{path.parent.name}/{path.name}": file_digest(path) for path in files}, lambda: dataset)
