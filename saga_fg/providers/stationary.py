@@ -1,4 +1,4 @@
-"""Objects that stand: v ~ N(0, deviation^2 / dt), robust, so that one which drives off is let go.
+"""Stationary objects: v ~ N(0, deviation^2 / dt), robust, so that one which drives off is let go.
 
 The variance shrinks with the length of the interval, so that a second says the same however often sensors speak.
 """
