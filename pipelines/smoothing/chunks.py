@@ -21,7 +21,7 @@ from saga_fg.types.frame import Frame
 
 @dataclass(frozen=True)
 class ChunkSettings(Settings):
-    """How a long recording is cut."""
+    """Lengths of the chunks of a long recording."""
 
     length: Positive = setting(30.0, "of a chunk, s")
     margin: Positive = setting(7.0, "that is smoothed with it at either end, s")

@@ -187,7 +187,7 @@ class _Passes:
         return smooth_states(self.evidence, object_of, longer, self.velocity_prior(longer), self.settings.classes)
 
     def coupled(self, lifespans: Lifespans, object_of: IntArray, ahead: float, states: StateTable) -> StateTable:
-        """The same states with the edges that follow from given ones."""
+        """States as by `alone`, with the edges that follow from given states."""
         if not self.tracker.edges:
             return states
         longer = lifespans.reaching(self.evidence.times, self.settings.extension, ahead)
@@ -218,4 +218,4 @@ class _Passes:
         yaw = np.full(len(lifespans), np.nan)
         known = np.isfinite(boxes.yaw[rows])
         yaw[owner[known]] = boxes.yaw[rows[known]]
-        return SmoothedEdges.of(self.tracker.edges, self.tracker.explained_noise, lifespans, states, yaw, size[:, 0])
+        return SmoothedEdges(self.tracker.edges, self.tracker.explained_noise, lifespans, states, yaw, size[:, 0])

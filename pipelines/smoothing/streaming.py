@@ -223,7 +223,7 @@ class _Run:
             self._spool.add(wanted, at, labelled, names, signs)
         begun = [(at[:1] <= gone.first) & (gone.first <= at[-1:]) for gone in objects.dropped]
         new = LabelCounts(
-            **source_counts(labelled.source[emitted]),
+            **source_counts(labelled.columns.source[emitted]),
             dropped=dropped_boxes(evidence, objects, wanted),
             dropped_objects=sum(int(each.sum()) for each in begun),
         )

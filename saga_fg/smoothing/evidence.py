@@ -88,7 +88,7 @@ def gather_evidence(
     sensors: Mapping[str, Sensor],
     classes: Mapping[str, ClassSettings],
 ) -> Evidence:
-    """The table of a recording's frames, in order of measurement.
+    """Build the table of a recording's frames, in order of measurement.
 
     wanted (M,): times at which boxes are wanted, s
     """
@@ -125,7 +125,7 @@ def gather_evidence(
 
 
 def measured_in_order(frames: Sequence[Frame], sensors: Mapping[str, Sensor]) -> list[tuple[float, Frame]]:
-    """The frames with their times of measurement (s), in that order: offline, no frame is late."""
+    """Sort frames by their times of measurement (s), which are returned with them: offline, no frame is late."""
     timed = [(frame.timestamp + sensor_model(sensors, frame.sensor).time_offset, frame) for frame in frames]
     return sorted(timed, key=lambda pair: pair[0])
 

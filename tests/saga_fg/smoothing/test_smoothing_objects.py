@@ -143,7 +143,7 @@ def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own() -> 
     mean = np.array([[0.0, 0.0, 10.0, 0.0], [20.0, 0.0, 10.0, 0.0]])
     states = StateTable.of_moments([(0, np.array([1, 2]), mean, np.tile(0.01 * np.eye(4), (2, 1, 1)))])
     rules = (Following(interaction=SharedVelocity()),)
-    edges = SmoothedEdges.of(rules, 0.0, lifespans, states, np.zeros(3), np.full(3, 4.5))
+    edges = SmoothedEdges(rules, 0.0, lifespans, states, np.zeros(3), np.full(3, 4.5))
     graph = edges(0, np.array([5, 2, 1]), (NodeType("object", CLASSES["default"].motion),) * 3)
     assert sorted(graph.nodes.tolist()) == [1, 2, 5]
     (group,) = graph.edges
