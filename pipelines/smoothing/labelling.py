@@ -97,7 +97,7 @@ def label_states(
     yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "position_bias")
     turning = yaw_drift**2 * duration
     turning = np.where(_is_stationary(objects), 1e-6, turning)
-    (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "motion_heading")
+    (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "min_heading_speed")
     headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])

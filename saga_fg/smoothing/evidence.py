@@ -141,15 +141,15 @@ def _origin(frames: Sequence[Frame]) -> FloatArray:
 
 
 def evidence_scores(
-    evidence: Evidence, object_of: IntArray, lifespans: Lifespans, states: StateTable, prior_time: float
+    evidence: Evidence, object_of: IntArray, lifespans: Lifespans, states: StateTable, prior_opportunity_time: float
 ) -> FloatArray:
-    """(n,) scores in [0, 1). prior_time: of the prior's opportunities at the rate of this recording's frames, s."""
+    """(n,) scores in [0, 1). prior_opportunity_time: of missed opportunities that every object starts with, s."""
     rows = np.flatnonzero(object_of >= 0)
     owner = lifespans.rows_of(object_of[rows])
     total = np.bincount(owner, evidence.probability[rows], minlength=len(lifespans))
     seen = np.bincount(owner, minlength=len(lifespans))
     count = np.maximum(opportunities(evidence, lifespans, states), seen)
-    return np.asarray(total / (count + prior_time * frame_rate(evidence)))
+    return np.asarray(total / (count + prior_opportunity_time * frame_rate(evidence)))
 
 
 def opportunities(evidence: Evidence, lifespans: Lifespans, states: StateTable) -> IntArray:
