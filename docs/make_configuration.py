@@ -44,14 +44,15 @@ sensors:
 def configuration_page() -> str:
     """The whole page."""
     parts = [INTRODUCTION]
+    documented: dict[tuple[type, str], str] = {}
     for title, cls in (("Tracking (`saga-fg track`, `saga-fg demo`)", TrackConfig),
                        ("Smoothing (`saga-fg smooth`, below `smoothing`)", SmoothingSettings),
                        ("SLAM (`saga-fg slam`, below `slam`)", SlamSettings),
                        ("Limits of the service (`saga-fg serve --limits`)", StreamSettings),
                        ("The simulator (`saga-fg simulate`)", SimulatorSettings)):  # fmt: skip
-        parts += [f"# {title}\n", settings_reference(cls)]
+        parts += [f"# {title}\n", settings_reference(cls, documented)]
     for cls in (Odometry, Gps, Imu, Landmarks, Lanes, StationaryObjects):
-        parts += [f"# Factor provider `saga_fg.providers:{cls.__name__}`\n", settings_reference(cls)]
+        parts += [f"# Factor provider `saga_fg.providers:{cls.__name__}`\n", settings_reference(cls, documented)]
     return "\n".join(parts)
 
 

@@ -22,7 +22,7 @@ from factors.between import noise_model
 from factors.errors import FactorError
 from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
-from factors.stacked import ResidualFactors
+from factors.stacked import ResidualFactors, residual_factors
 from factors.validation import FloatArray, checked, checked_keys
 from factors.variables import PlanarPose, SpatialPose
 
@@ -46,15 +46,8 @@ def position_factor(
     if len(z) not in (2, 3):
         raise FactorError(f"position: expected 2 or 3 coordinates, got {len(z)}")
     function = _Place(z, checked("antenna", antenna, (3,))[: len(z)])
-    return ResidualFactors(
-        rows=np.array([[key]], dtype=np.uint64),
-        dims=(PlanarPose() if len(z) == 2 else SpatialPose(),),
-        residual=function.residual,
-        covariances=checked("covariance", covariance, (len(z), len(z))),
-        jacobians=function.jacobians,
-        robust=robust,
-        name="measured place",
-    )
+    pose = PlanarPose() if len(z) == 2 else SpatialPose()
+    return residual_factors(function, [[key]], (pose,), covariance, len(z), "measured place", robust)
 
 
 def attitude_factor(

@@ -31,8 +31,8 @@ from factors.errors import FactorError
 from factors.measurement import checked_components
 from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
-from factors.stacked import ResidualFactors
-from factors.validation import FloatArray, checked, checked_covariances
+from factors.stacked import ResidualFactors, residual_factors
+from factors.validation import FloatArray, checked
 from factors.variables import SpatialPose
 
 
@@ -55,15 +55,8 @@ def lane_boundary_factors(
     n = len(measured)
     curve = _Curve(_frames(world_T_curve, n), _checked_count(coefficients), _column("offsets", offsets, n))
     function = _Boundary(measured, curve)
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(SpatialPose(), coefficients),
-        residual=function.residual,
-        covariances=checked_covariances("variances", _column("variances", variances, n)[:, None, None], n, 1),
-        jacobians=function.jacobians,
-        robust=robust,
-        name="points of a lane curve",
-    )
+    noise, dims = _column("variances", variances, n)[:, None, None], (SpatialPose(), coefficients)
+    return residual_factors(function, rows, dims, noise, 1, "points of a lane curve", robust)
 
 
 def lane_keeping_factors(
@@ -86,15 +79,8 @@ def lane_keeping_factors(
     checked_components("position", position, state_dim, least=2)
     curve = _Curve(_frames(world_T_curve, n), _checked_count(coefficients), _column("offsets", offsets, n))
     function = _Keeping(curve, state_dim, tuple(position))
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(state_dim, coefficients),
-        residual=function.residual,
-        covariances=checked_covariances("variances", _column("variances", variances, n)[:, None, None], n, 1),
-        jacobians=function.jacobians,
-        robust=robust,
-        name="objects keeping to a lane curve",
-    )
+    noise, dims = _column("variances", variances, n)[:, None, None], (state_dim, coefficients)
+    return residual_factors(function, rows, dims, noise, 1, "objects keeping to a lane curve", robust)
 
 
 @dataclass(frozen=True, eq=False)

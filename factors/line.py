@@ -27,8 +27,8 @@ from numpy.typing import ArrayLike
 
 from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
-from factors.stacked import ResidualFactors
-from factors.validation import FloatArray, checked, checked_covariances
+from factors.stacked import ResidualFactors, residual_factors
+from factors.validation import FloatArray, checked
 from factors.variables import SpatialPose, Vector
 
 
@@ -70,15 +70,7 @@ def line_factors(
     """
     measured = checked("ends", ends, (None, 2, 3)).copy()
     function = _Edge(measured)
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(SpatialPose(), 2),
-        residual=function.residual,
-        covariances=checked_covariances("covariances", covariances, len(measured), 2),
-        jacobians=function.jacobians,
-        robust=robust,
-        name="straight lines",
-    )
+    return residual_factors(function, rows, (SpatialPose(), 2), covariances, 2, "straight lines", robust)
 
 
 @dataclass(frozen=True, eq=False)

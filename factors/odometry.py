@@ -32,8 +32,8 @@ from numpy.typing import ArrayLike
 from factors.errors import FactorError
 from factors.robust import RobustLoss
 from factors.rotations import cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
-from factors.stacked import ResidualFactors
-from factors.validation import FloatArray, checked, checked_covariances
+from factors.stacked import ResidualFactors, residual_factors
+from factors.validation import FloatArray, checked
 from factors.variables import SpatialPose
 
 ERROR_DIM = 3  # scale, yaw-rate bias in rad/s, course in rad
@@ -54,15 +54,8 @@ def odometry_factors(
     if (seconds < 0).any():
         raise FactorError(f"dt[{int(np.argmax(seconds < 0))}]: expected seconds >= 0, got {seconds.min()}")
     function = _Odometry(measured[:, :3, :3].copy(), measured[:, :3, 3].copy(), seconds.copy())
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(SpatialPose(), SpatialPose(), ERROR_DIM, ERROR_DIM),
-        residual=function.residual,
-        covariances=checked_covariances("covariances", covariances, len(measured), 6 + ERROR_DIM),
-        jacobians=function.jacobians,
-        robust=robust,
-        name="odometry",
-    )
+    dims = (SpatialPose(), SpatialPose(), ERROR_DIM, ERROR_DIM)
+    return residual_factors(function, rows, dims, covariances, 6 + ERROR_DIM, "odometry", robust)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ from numpy.typing import ArrayLike
 from factors.between import noise_model
 from factors.errors import FactorError
 from factors.robust import RobustLoss
-from factors.stacked import ResidualFactors
-from factors.validation import FloatArray, checked, checked_covariances, checked_keys
+from factors.stacked import ResidualFactors, residual_factors
+from factors.validation import FloatArray, checked, checked_keys
 from factors.variables import PlanarPose
 
 
@@ -84,15 +84,7 @@ def calibrated_range_factors(
     measured = checked("z", z, (None,)).copy()
     function = _Range(measured)
     noise = np.reshape(checked("variance", variance, ()), (1, 1))
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(PlanarPose(), 2, 2),
-        residual=function.residual,
-        covariances=checked_covariances("variance", noise, len(measured), 1),
-        jacobians=function.jacobians,
-        robust=robust,
-        name="ranges",
-    )
+    return residual_factors(function, rows, (PlanarPose(), 2, 2), noise, 1, "ranges", robust)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,8 +32,8 @@ from factors.measurement import position as position_model
 from factors.polar import RangeBearing
 from factors.robust import RobustLoss
 from factors.rotations import cross_matrix
-from factors.stacked import ResidualFactors
-from factors.validation import FloatArray, checked, checked_covariances
+from factors.stacked import ResidualFactors, residual_factors
+from factors.validation import FloatArray, checked
 from factors.variables import PlanarPose, SpatialPose
 
 _LEVEL = np.diag([1.0, 1.0, 0.0])
@@ -61,16 +61,9 @@ def relative_factors(
     checked_components("position", position, state_dim, least=d)
     measured = checked("z", z, (None, model.dim)).copy()
     function = _Relative(model, measured, state_dim, tuple(position))
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(PlanarPose() if d == 2 else SpatialPose(), state_dim),
-        residual=function.residual,
-        covariances=checked_covariances("covariances", covariances, len(measured), model.dim),
-        jacobians=function.jacobians,
-        robust=robust,
-        angles=tuple(model.angles),
-        name=name or f"{model.name} from the vehicle",
-    )
+    dims = (PlanarPose() if d == 2 else SpatialPose(), state_dim)
+    name = name or f"{model.name} from the vehicle"
+    return residual_factors(function, rows, dims, covariances, model.dim, name, robust, model.angles)
 
 
 def point_factors(
@@ -124,15 +117,7 @@ def relative_detection_factors(
     measured = checked("z", z, (None, 3)).copy()
     checked_components("position", position, state_dim, least=2)
     function = _Levelled(measured, state_dim, tuple(position))
-    return ResidualFactors(
-        rows=np.asarray(rows),
-        dims=(SpatialPose(), state_dim),
-        residual=function.residual,
-        covariances=checked_covariances("covariances", covariances, len(measured), 2),
-        jacobians=function.jacobians,
-        robust=robust,
-        name=name,
-    )
+    return residual_factors(function, rows, (SpatialPose(), state_dim), covariances, 2, name, robust)
 
 
 def _dimension(z: ArrayLike) -> int:

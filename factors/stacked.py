@@ -212,3 +212,19 @@ class ResidualFactors:
 
 def _of(array: FloatArray, chosen: IntArray | None) -> FloatArray:
     return array if chosen is None else array[chosen]
+
+
+def residual_factors(
+    function: Any,
+    rows: ArrayLike,
+    dims: Sequence[int | PlanarPose | SpatialPose],
+    covariances: ArrayLike,
+    dim: int,
+    name: str,
+    robust: RobustLoss | None = None,
+    angles: Sequence[int] = (),
+) -> ResidualFactors:
+    """Return the factors of an object with `residual` and `jacobians`; dim: m, of the residuals; the rest as there."""
+    keys = np.asarray(rows)
+    noise = checked_covariances("covariances", covariances, len(keys), dim)
+    return ResidualFactors(keys, tuple(dims), function.residual, noise, function.jacobians, robust, tuple(angles), name)

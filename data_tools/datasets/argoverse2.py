@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.central_differences import central_differences
 from data_tools.datasets.annotated import AnnotatedSource
+from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
 from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.files.input_files import open_bytes
@@ -155,7 +155,7 @@ def _pyarrow() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ArgoverseSource(AnnotatedSource):
-    """Argoverse 2 sensor logs: annotated boxes and poses, ten a second. Needs the extra [parquet]."""
+    """Argoverse 2 sensor logs, annotated ten times a second; needs the extra [parquet]."""
 
     name = "argoverse2"
     family = "nuscenes"

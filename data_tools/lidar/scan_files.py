@@ -26,8 +26,8 @@ from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes
 from data_tools.files.numpy_files import load_archive, load_array
 from data_tools.lidar.cloud_headers import check_pcd, check_ply
+from data_tools.lidar.open3d_loader import load_open3d
 from data_tools.lidar.scan import Scan
-from data_tools.open3d_loader import load_open3d
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 

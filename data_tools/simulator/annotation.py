@@ -7,6 +7,7 @@ counts as visible only in views of some duration; a shorter view does not reveal
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from data_tools.simulator.sensors import in_view, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
@@ -40,12 +41,7 @@ def annotate(
 
 def without_short_runs(visible: BoolArray, shortest: int) -> BoolArray:
     """`visible` (K, N) without runs along the first axis shorter than `shortest` keyframes."""
-    length = np.zeros(visible.shape, dtype=np.int64)  # length of each run: up to k, then in total
-    for k in range(len(visible)):
-        length[k] = np.where(visible[k], (length[k - 1] if k else 0) + 1, 0)
-    for k in range(len(visible) - 2, -1, -1):
-        length[k] = np.where(visible[k] & visible[k + 1], length[k + 1], length[k])
-    return np.asarray(visible & (length >= shortest))
+    return np.asarray(ndimage.binary_opening(visible, np.ones((max(shortest, 1), 1))))
 
 
 def recently_visible(time: FloatArray, visible: BoolArray, memory: float) -> BoolArray:

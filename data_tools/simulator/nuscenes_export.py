@@ -11,7 +11,7 @@ measured velocities to the sample's time; unknown velocities are NaN.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from data_tools.datasets.nuscenes.classes import DETECTION_CLASSES
 from data_tools.datasets.nuscenes.records import Record, box_fields
+from data_tools.datasets.nuscenes.result_files import ResultMeta
 from data_tools.files.atomic_files import atomic_directory
 from data_tools.simulator.nuscenes_tables import (
     Tables,
@@ -105,9 +106,7 @@ def _boxes(sample: str, time: float, frame: Frame) -> list[Record]:
 
 
 def _meta(sensor: str) -> dict[str, bool]:
-    modality = channel_of(sensor).modality
-    kinds = {f"use_{kind}": kind == modality for kind in ("camera", "lidar", "radar")}
-    return {**kinds, "use_map": False, "use_external": False}
+    return asdict(ResultMeta(**{f"use_{channel_of(sensor).modality}": True}))
 
 
 def _write_json(path: Path, content: object) -> None:

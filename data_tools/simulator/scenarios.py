@@ -9,7 +9,7 @@ cycling      cyclists beside slow traffic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -28,41 +28,25 @@ ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "cycling"
 SCENARIOS: tuple[ScenarioName, ...] = get_args(ScenarioName)
 
 
-def scenario_settings(name: ScenarioName) -> SimulatorSettings:
-    """The settings of a scenario."""
-    return _SETTINGS[name]()
-
-
-def _red_light() -> SimulatorSettings:
-    return SimulatorSettings(
+_SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
+    "traffic": SimulatorSettings(),
+    "red-light": SimulatorSettings(
         road=RoadSettings(merge_probability=0.0),
         traffic=TrafficSettings(signal_probability=1.0),
         lights=LightSettings(mapped=True),
         sensors={"lidar": lidar(), "camera": replace(camera(), colour_accuracy=0.9)},
-    )
-
-
-def _road_works() -> SimulatorSettings:
-    return SimulatorSettings(
+    ),
+    "road-works": SimulatorSettings(
         road=RoadSettings(lanes=(1, 1), merge_probability=1.0),
         traffic=TrafficSettings(platoon_size=(2, 5), platoon_gap=(15.0, 60.0)),  # light: one lane less makes no jam
         roadworks=RoadworkSettings(probability=1.0),
         lights=LightSettings(mapped=True),
-    )
-
-
-def _towing() -> SimulatorSettings:
-    return SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8))
-
-
-def _cycling() -> SimulatorSettings:
-    return SimulatorSettings(cyclists=CyclistSettings(count=(5, 9)))
-
-
-_SETTINGS: Mapping[ScenarioName, Callable[[], SimulatorSettings]] = {
-    "traffic": SimulatorSettings,
-    "red-light": _red_light,
-    "road-works": _road_works,
-    "towing": _towing,
-    "cycling": _cycling,
+    ),
+    "towing": SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8)),
+    "cycling": SimulatorSettings(cyclists=CyclistSettings(count=(5, 9))),
 }
+
+
+def scenario_settings(name: ScenarioName) -> SimulatorSettings:
+    """The settings of a scenario."""
+    return _SETTINGS[name]

@@ -8,11 +8,10 @@ import numpy as np
 
 from data_tools.simulator.disturbances import SlowZone, StopLine, sample_intervals
 from data_tools.simulator.driver_models import equilibrium_gap
-from data_tools.simulator.fleet import Fleet, sample_fleet
+from data_tools.simulator.fleet import Fleet, attach_trailers, sample_fleet
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import curved_road
 from data_tools.simulator.settings import RoadSettings, RoadworkSettings, SimulatorSettings, TrafficSettings
-from data_tools.simulator.trailers import attach_trailers
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 JUNCTION = 10.0  # m between the stop lines of the two directions

@@ -12,12 +12,10 @@ The offset from the centre line follows a smooth step of q, so that a vehicle mo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.simulator.disturbances import SlowZone, StopLine
 from data_tools.simulator.driver_models import (
     HARDEST_BRAKING,
     best_lane_changes,
@@ -25,8 +23,8 @@ from data_tools.simulator.driver_models import (
     free_acceleration,
     lane_change_gain,
 )
-from data_tools.simulator.fleet import Fleet
-from data_tools.simulator.lanes import LaneOrder, Lanes, smooth_step, smooth_step_slope
+from data_tools.simulator.lanes import LaneOrder, smooth_step, smooth_step_slope
+from data_tools.simulator.scene_layout import SceneLayout
 from data_tools.simulator.settings import DriverSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -36,9 +34,8 @@ SLOWEST_CHANGE = 2.0  # m/s, lowest speed at which a voluntary lane change start
 
 @dataclass(frozen=True, eq=False)
 class TrafficHistory:
-    """States of N vehicles at T time steps: time (T,) s and arrays (T, N).
-
-    s m, speed m/s, lane, offset d m, slope dd/ds, on_road; leader: the vehicle ahead in the lane, or -1.
+    """States of N vehicles at T time steps: time (T,) s; arrays (T, N) s m, speed m/s, lane, offset d m, slope dd/ds,
+    on_road.
     """
 
     time: FloatArray
@@ -48,38 +45,36 @@ class TrafficHistory:
     offset: FloatArray
     slope: FloatArray
     on_road: BoolArray
-    leader: IntArray
 
 
 class Traffic:
-    """Vehicles in traffic, advanced by `step`."""
+    """Vehicles in traffic, advanced by `step`.
+
+    step   time step, s
+    early  spread of the positions at which drivers leave a lane closed by cones, m
+    """
 
     def __init__(
         self,
-        lanes: Lanes,
-        fleet: Fleet,
-        lane: IntArray,
-        s: FloatArray,
-        speed: FloatArray,
+        layout: SceneLayout,
         settings: DriverSettings,
         rng: np.random.Generator,
-        stop_lines: Sequence[StopLine] = (),
-        slow_zones: Sequence[SlowZone] = (),
         step: float = 0.05,
-        time: float = 0.0,
         early: float = 0.0,
     ) -> None:
-        self._lanes, self._fleet, self._settings, self._rng = lanes, fleet, settings, rng
-        self._stop_lines, self._slow_zones, self._step = stop_lines, slow_zones, step
-        n = len(fleet)
-        self.time = time
-        self.lane, self.s, self.speed = lane.copy(), s.astype(np.float64), speed.astype(np.float64)
+        self._lanes, self._fleet, self._settings, self._rng = layout.lanes, layout.fleet, settings, rng
+        self._stop_lines, self._slow_zones, self._step = layout.stop_lines, layout.slow_zones, step
+        n = len(layout.fleet)
+        self.time = 0.0
+        self.lane, self.s, self.speed = layout.lane.copy(), layout.s, layout.speed
         self._from = np.full(n, -1)
         self._share = np.zeros(n)
         self._change_length = np.ones(n)
         self._noise = settings.acceleration_noise * rng.standard_normal(n)
-        self._passes = np.zeros((len(stop_lines), n), dtype=np.bool_)  # vehicles too close to stop for a red light
-        self._was_closed = [False] * len(stop_lines)
+        self._passes = np.zeros(
+            (len(layout.stop_lines), n), dtype=np.bool_
+        )  # vehicles too close to stop for a red light
+        self._was_closed = [False] * len(layout.stop_lines)
         self._pending = [np.zeros(n)] * round(settings.reaction_time / step)
         self._steps = 0
         self._early = rng.uniform(0.0, early, n) if early > 0 else np.zeros(n)
@@ -108,10 +103,6 @@ class Traffic:
         weight = smooth_step(q)
         turn = smooth_step_slope(q) / self._change_length
         return d0 + weight * (d - d0), slope0 + weight * (slope - slope0) + turn * (d - d0)
-
-    def settle(self) -> None:
-        """Fill the reaction delay with the accelerations desired now, as if the reaction time had passed."""
-        self._pending = [self._desired_acceleration(self.order(), self._metric())] * len(self._pending)
 
     def _metric(self) -> FloatArray:
         """Length over ground per unit of s (N,)."""
@@ -226,6 +217,5 @@ def record_traffic(traffic: Traffic, steps: int) -> TrafficHistory:
         if k:
             traffic.step()
         d, slope = traffic.lateral()
-        leader = traffic.order().ahead(traffic.lane, traffic.s)
-        columns.append((traffic.time, traffic.s, traffic.speed, traffic.lane.copy(), d, slope, traffic.on_road, leader))
+        columns.append((traffic.time, traffic.s, traffic.speed, traffic.lane.copy(), d, slope, traffic.on_road))
     return TrafficHistory(*(np.array(column) for column in zip(*columns, strict=True)))

@@ -10,25 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_tools.simulator.fleet import TRUCK, Fleet
+from data_tools.simulator.fleet import HITCH
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.traffic import TrafficHistory
 from data_tools.simulator.trajectories import Trajectories
 from saga_fg.numerics.arrays import FloatArray, IntArray
-
-HITCH = 0.9  # m between truck and trailer
-TRAILER_LENGTH = (6.0, 11.0)  # m
-
-
-def attach_trailers(fleet: Fleet, share: float, rng: np.random.Generator) -> tuple[Fleet, FloatArray]:
-    """Attach trailers to a share of the trucks: the fleet with total lengths, and lengths (N,) of trailers, m, or 0."""
-    trailer = np.zeros(len(fleet))
-    if share > 0:
-        tows = (fleet.kind == TRUCK) & (rng.random(len(fleet)) < share)
-        trailer = np.where(tows, rng.uniform(*TRAILER_LENGTH, len(fleet)), 0.0)
-    size = fleet.size.copy()
-    size[:, 0] += np.where(trailer > 0, trailer + HITCH, 0.0)
-    return replace(fleet, size=size), trailer
 
 
 def split_trailers(

@@ -113,19 +113,8 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
 
 def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.random.Generator) -> TrafficHistory:
     """Run the warm-up, then record slightly more than the scene's duration."""
-    traffic = Traffic(
-        layout.lanes,
-        layout.fleet,
-        layout.lane,
-        layout.s,
-        layout.speed,
-        settings.drivers,
-        rng,
-        layout.stop_lines,
-        layout.slow_zones,
-        settings.step,
-        early=settings.roadworks.early if layout.lanes.taper > 0 else 0.0,
-    )
+    early = settings.roadworks.early if layout.lanes.taper > 0 else 0.0
+    traffic = Traffic(layout, settings.drivers, rng, settings.step, early)
     for _ in range(round(settings.warm_up / settings.step)):
         traffic.step()
     return record_traffic(traffic, int(np.ceil(settings.duration / settings.step)) + 2)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers
@@ -82,7 +82,7 @@ def with_objects(
         result,
         trajectory=Trajectory(scans.timestamps, poses),
         covariances=estimate.pose_covariances[at],
-        landmarks=known[0].landmarks(estimate.solution, s.mapper.confirm),
+        landmarks=known[0].landmarks(estimate.solution, s.mapper.confirm_after),
         world_T_lidar=estimate.world_T_ego[at],
     )
     if lag is not None:

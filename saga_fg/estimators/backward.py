@@ -52,7 +52,7 @@ def smoothed_means(steps: Sequence[FilterStep]) -> list[FloatArray]:
         if after is None or dynamics is None:
             means.append(x.mean)
         else:
-            back = dynamics.moved_back(after)
+            back = dynamics.transpose_times(after)
             if len(back) == len(r):
                 r = back
             else:

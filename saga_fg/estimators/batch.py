@@ -222,7 +222,7 @@ class BatchSmoother(RecordedSmoother):
         return self._sparse
 
     def _give_up(self, reason: Exception) -> None:
-        """Sparse elimination does not do for this recording."""
+        """Fall back to elimination in the order of time."""
         log.info("eliminated in the order of time: %s", reason)
         self._order, self._sparse = "time", None
 

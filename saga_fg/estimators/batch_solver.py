@@ -77,7 +77,7 @@ class BatchSolver:
         self._asked(None, providers)
 
     def marginalise(self, keys: Iterable[int]) -> None:
-        """Integrate variables out, linearised at the solution; what they knew of others stays."""
+        """Integrate variables out, linearised at the solution; their information on others stays."""
         graph = self.graph().copy()
         graph.marginalise(keys)
         self._changed(graph)

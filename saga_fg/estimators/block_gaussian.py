@@ -41,7 +41,7 @@ class BlockGaussian:
         return BlockGaussian(partition, self.mean, regrouped(self.blocks, self.partition, partition, rows))
 
     def extended(self, layout: Layout, means: FloatArray, covariances: FloatArray) -> BlockGaussian:
-        """With the further nodes of `layout`, independent of all others: means (k, d), covariances (k, d, d)."""
+        """Add the further nodes of `layout`, independent of all others: means (k, d), covariances (k, d, d)."""
         if len(means) == 0:
             return self
         sizes, size = [places.shape[1] for places in self.partition.groups], covariances.shape[1]
@@ -53,7 +53,7 @@ class BlockGaussian:
         return BlockGaussian(self.partition.extended(layout), np.concatenate([self.mean, means.ravel()]), tuple(blocks))
 
     def without(self, rows: IntArray) -> BlockGaussian:
-        """With the nodes at `rows` integrated out."""
+        """Integrate out the nodes at `rows`."""
         if len(rows) == 0:
             return self
         keep = np.ones(len(self.layout), dtype=bool)
@@ -70,7 +70,7 @@ class BlockGaussian:
         return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
 
     def decoupled(self) -> BlockGaussian:
-        """With components taken apart whose parts are no longer correlated, long after the last interaction."""
+        """Separate the parts of components that are no longer correlated, long after the last interaction."""
         partition, layout = self.partition, self.layout
         if partition.count == len(layout):
             return self
@@ -136,7 +136,7 @@ def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray)
         return result
     if partition.size:
         own = np.empty((len(partition.layout), d, d))
-        for (nodes, row, slot), block in zip(partition.homes, blocks, strict=True):
+        for (nodes, row, slot), block in zip(partition.nodes_by_group, blocks, strict=True):
             own[nodes] = partition.by_nodes(block)[row, slot, slot]
         return own if len(rows) == len(own) and (rows == np.arange(len(own))).all() else own[rows]
     for number, members, at in partition.members(rows, d):

@@ -167,7 +167,7 @@ class BlockVariables:
             flat[at + (new.offset[node][:, None, None] + np.arange(d_i)[:, None])] = values
 
         W = {d: np.zeros((len(layout), d, d)) for d in np.unique(layout.dims).tolist()}
-        left_over = dynamics.moved(before.origin[before.partition.layout.places(rows)]) + dynamics.b - self.origin
+        left_over = dynamics.times(before.origin[before.partition.layout.places(rows)]) + dynamics.b - self.origin
         for noise in dynamics.Q:
             node, d = noise.target, noise.values.shape[1]
             W[d][node] = np.linalg.inv(np.linalg.cholesky(noise.values))
@@ -253,12 +253,12 @@ def _inverted(roots: FloatArray) -> FloatArray:
 
 
 def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:
-    """BlockVariables: the components, large ones cut into parts of nodes that are close in the graph."""
+    """Cut large components into parts of nodes that are close in the graph."""
     layout, label = components.layout, components.label
     size = np.bincount(label, weights=layout.dims, minlength=components.count).astype(np.int64)
     if (size <= _WHOLE).all():
         return components
-    order = _neighbours_first(layout, dynamics)
+    order = _neighbours_together(layout, dynamics)
     order = order[np.argsort(label[order], kind="stable")]  # component by component
     ends = np.cumsum(layout.dims[order])
     within = np.empty(len(layout), dtype=np.int64)  # where a node's state ends in its component
@@ -267,7 +267,7 @@ def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:
     return Partition(layout, np.unique(label * (part.max() + 1) + part, return_inverse=True)[1].astype(np.int64))
 
 
-def _neighbours_first(layout: Layout, dynamics: Dynamics | None) -> IntArray:
+def _neighbours_together(layout: Layout, dynamics: Dynamics | None) -> IntArray:
     """Order the nodes so that those that interact are close (reverse Cuthill-McKee)."""
     if dynamics is None:
         return np.arange(len(layout))

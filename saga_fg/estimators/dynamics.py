@@ -50,13 +50,13 @@ class Dynamics:
         return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
 
     def with_static(self, layout: Layout, others: IntArray) -> Dynamics:
-        """Over `layout`, which has further nodes at the rows `others`: these stay as they are."""
+        """Extend to `layout`, which has further nodes at the rows `others`: these stay as they are."""
         rows, b = np.delete(np.arange(len(layout)), others), np.zeros(layout.size)
         b[layout.places(rows)] = self.b
         return Dynamics(layout, (*_renamed(self.F, rows), *identity(layout, others)), b, _renamed(self.Q, rows))
 
     def only(self, rows: IntArray) -> Dynamics:
-        """Without the dynamics of all nodes but those at `rows`; itself if these are all."""
+        """Keep the dynamics of the nodes at `rows` alone; itself if these are all."""
         if len(rows) == len(self.layout):
             return self
         kept = np.zeros(len(self.layout), dtype=bool)
@@ -64,7 +64,7 @@ class Dynamics:
         return replace(self, F=_where(kept, self.F), Q=_where(kept, self.Q))
 
     def restricted(self, rows: IntArray) -> Dynamics:
-        """Over the nodes at `rows` alone, ascending, who do not listen to others; itself if these are all."""
+        """Restrict to the nodes at `rows`, ascending, on which no others act; itself if these are all."""
         if len(rows) == len(self.layout):
             return self
         some = self.only(rows)
@@ -73,7 +73,7 @@ class Dynamics:
         layout = Layout(self.layout.nodes[rows], self.layout.dims[rows])
         return Dynamics(layout, _renamed(some.F, where), self.b[self.layout.places(rows)], _renamed(some.Q, where))
 
-    def moved(self, x: FloatArray) -> FloatArray:
+    def times(self, x: FloatArray) -> FloatArray:
         """F x of a joint state (D,)."""
         starts, result = self.layout.offsets[:-1], np.zeros(self.layout.size)
         for F in self.F:
@@ -83,7 +83,7 @@ class Dynamics:
             result += np.bincount(at.ravel(), weights=products.ravel(), minlength=len(result))
         return result
 
-    def moved_back(self, r: FloatArray) -> FloatArray:
+    def transpose_times(self, r: FloatArray) -> FloatArray:
         """F^T r of a gradient (D,)."""
         starts, result = self.layout.offsets[:-1], np.zeros(self.layout.size)
         for F in self.F:
@@ -99,8 +99,8 @@ class Dynamics:
         return _sparse(self.F, self.layout.offsets[:-1], self.layout.size)
 
     @property
-    def still(self) -> BoolArray:
-        """(n,) which nodes stay exactly where they are, x' = x without noise, whatever the others do."""
+    def unchanged(self) -> BoolArray:
+        """(n,) true for nodes that stay exactly as they are, x' = x without noise, whatever the others do."""
         n = len(self.layout)
         same, driven = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for F in self.F:
@@ -121,7 +121,7 @@ class Dynamics:
         return partition.joined(target, source)
 
     def separated(self, x: BlockGaussian) -> BlockGaussian:
-        """`x` with components taken apart that have fallen apart, where no interaction of this interval ties them."""
+        """Separate the uncorrelated parts of components that no interaction of this interval ties."""
         tied = self.joined(Partition.apart(x.layout))
         return x if tied.count == self.joined(x.partition).count else x.decoupled()
 
@@ -248,7 +248,7 @@ class PredictionSummary:
         for d, blocks in predicted.items():
             rows = np.flatnonzero(layout.dims == d)
             variances[layout.spans(rows)] = np.diagonal(blocks[rows], axis1=1, axis2=2)
-        mean = dynamics.moved(x.mean) + dynamics.b
+        mean = dynamics.times(x.mean) + dynamics.b
         if not (np.isfinite(mean).all() and np.isfinite(variances).all() and (variances > 0).all()):
             raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
         return PredictionSummary(dynamics.joined(x.partition), mean, np.sqrt(variances), ratio)
@@ -261,7 +261,7 @@ def identity(layout: Layout, rows: IntArray) -> tuple[Blocks, ...]:
 
 
 def _symmetric(product: FloatArray) -> FloatArray:
-    """Without what rounding has done to the symmetry of a stack."""
+    """Remove the asymmetry that rounding leaves in a stack."""
     symmetric = product + np.swapaxes(product, 1, 2)
     symmetric *= 0.5
     return np.asarray(symmetric)

@@ -118,7 +118,7 @@ def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequen
             stay = layout.without(leaving) if len(leaving) else layout
             before = mean[layout.places(layout.rows(stay.nodes))]
             dynamics = epoch.interval.linearised(stay, before)
-            mean = dynamics.moved(before) + dynamics.b
+            mean = dynamics.times(before) + dynamics.b
     return means
 
 

@@ -127,14 +127,14 @@ class GraphFilter(LatestMarginals):
         interval.check(self._layout)
         x, nodes = self.posterior(), self._layout.nodes
         dynamics = interval.linearised(self._layout, x.mean)
-        still = dynamics.still
+        still = dynamics.unchanged
         if transition.dt == 0 and still.all():
             return
         carried_over, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
         keys = {n: key if n in carried_over else node_key(n, epoch) for n, key in self._keys.items()}
         chosen = lossy(x, dynamics, still, window=self._lag > 0)
         unused = np.isin(transition.nodes, nodes[still | chosen])
-        change = self._in_moments(dynamics, chosen, keys) if chosen.any() else None
+        change = self._predict_by_covariance(dynamics, chosen, keys) if chosen.any() else None
         smoother = self._changed()
         smoother.forget({*self._keys.values(), *self._auxiliary})
         moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, carried_over)
@@ -189,7 +189,7 @@ class GraphFilter(LatestMarginals):
         graph, nodes = self._smoother.graph(), set(self._keys.values())
         return tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
 
-    def _in_moments(
+    def _predict_by_covariance(
         self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
     ) -> Callable[[SceneFactorGraph], None]:
         """Return the change of the graph that predicts the components of the `chosen` nodes (n,) by covariances."""

@@ -124,7 +124,7 @@ class IncrementalSmoother:
         self._asked(self._graph.copy(), providers)
 
     def marginalise(self, keys: Iterable[int]) -> None:
-        """Integrate variables out; what they knew of others stays."""
+        """Integrate variables out; their information on others stays."""
         graph = self._graph.copy()
         graph.marginalise(keys)
         self._graph = graph
@@ -161,7 +161,7 @@ class IncrementalSmoother:
         return joint_gaussian(self._graph, engine.linear(), layout, keys)
 
     def handed_over(self) -> IncrementalSmoother:
-        """A smoother that goes on from here with the same iSAM2; this one builds another when it is asked again."""
+        """Return a smoother that takes over the present iSAM2; this one builds another when it is needed."""
         twin = copy.copy(self)
         twin._times, self._engine = list(self._times), None
         return twin
@@ -171,7 +171,7 @@ class IncrementalSmoother:
         return self._graph.copy()
 
     def restore(self, graph: SceneFactorGraph) -> None:
-        """Continue from a snapshot; iSAM2 is built restarted."""
+        """Continue from a snapshot; iSAM2 is built anew."""
         if not isinstance(graph, SceneFactorGraph):
             raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
         self._graph, self._engine = graph.copy(), None

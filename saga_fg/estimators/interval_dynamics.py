@@ -97,7 +97,7 @@ class IntervalDynamics:
 
 @dataclass(frozen=True, eq=False)
 class ZeroInterval:
-    """No time steps: what divides two epochs at the same time."""
+    """An interval of 0 s, between two epochs at the same time."""
 
     dt: float = 0.0
     linear: bool = True

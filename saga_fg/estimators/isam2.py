@@ -8,7 +8,7 @@ of a frame do not grow. Means and covariances are read from the Bayes tree. The 
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of
 variance P costs Cholesky elimination log10(P/Q) digits, QR half as many. So small components are eliminated by QR,
 large ones by Cholesky while that leaves enough digits, and an interval that would leave fewer (Q singular, or many
-million times smaller than P) is predicted by covariances, P <- F P F^T + Q, after which iSAM2 begins restarted.
+million times smaller than P) is predicted by covariances, P <- F P F^T + Q, after which iSAM2 begins anew.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RelinearisationSettings(Settings):
-    """When factors are linearised restarted."""
+    """Settings of relinearisation."""
 
     threshold: Positive = setting(
         0.001, "linearise factors anew when a variable has moved by this many of its standard deviations"
@@ -111,7 +111,7 @@ class Engine:
         return linear
 
     def _synchronised(self, graph: SceneFactorGraph) -> bool:
-        """Tell iSAM2 what has changed in the graph, and move it to the solution; whether any factor is nonlinear."""
+        """Update iSAM2 with the changes of the graph, which moves to the solution; true where a factor is nonlinear."""
         leaving = [key for key in self.points.keys if key not in graph.variables]
         new = {key: one.dim for key, one in graph.variables.items() if key not in self.points}
         removed = self._remove_factors(graph)
@@ -134,7 +134,7 @@ class Engine:
         return any(not held.factors.linear for held in graph.groups.values())
 
     def _update_sigmas(self, graph: SceneFactorGraph, keys: set[int]) -> None:
-        """Ask for the standard deviations of variables; where everything hangs together, of the newest ones at once.
+        """Compute the standard deviations of variables; in large components, of the newest ones at once.
 
         The marginal of a single variable then costs as much as that of all.
         """
@@ -155,7 +155,7 @@ class Engine:
             start = span.stop
 
     def _remove_factors(self, graph: SceneFactorGraph) -> list[int]:
-        """Forget which factors are no more; returns their indices."""
+        """Forget factors that have left; returns their indices."""
         removed: list[int] = []
         for number, slots in list(self.slots.items()):
             held = graph.groups.get(number)
@@ -265,7 +265,7 @@ class Displacements:
         table.root[table.row[key]] = R
 
     def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
-        """The variables that are farther off than the threshold; from now on they count from here."""
+        """Variables that are farther off than the threshold; their linearisation point is reset."""
         return [key for table in self._tables.values() for key in table.moved(delta, threshold)]
 
 

@@ -96,7 +96,7 @@ class JointKalmanFilter(LatestMarginals):
 
     @property
     def auxiliary(self) -> SceneFactorGraph:
-        """These variables where they are, without factors."""
+        """The auxiliary variables with their values, without factors."""
         return self._auxiliary.graph
 
     def predict(self, transition: Transition) -> None:
@@ -123,7 +123,7 @@ class JointKalmanFilter(LatestMarginals):
             self._auxiliary = replace(self._auxiliary, labels=labels)
 
     def posterior(self) -> BlockGaussian:
-        """All that the filter knows."""
+        """The joint Gaussian."""
         return self._state
 
     def graph(self) -> SceneFactorGraph:

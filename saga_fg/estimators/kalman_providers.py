@@ -122,7 +122,7 @@ def asked(
     if new:
         base = graph.base
         bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
-        x, factors = _born(graph, x, ids, new, factors)
+        x, factors = _with_new_variables(graph, x, ids, new, factors)
         ids |= {key: key for key in new}
     increment, others, measured = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout)), []
     increment[others] = x.mean[others]
@@ -170,14 +170,14 @@ def _linear(graph: SceneFactorGraph, ids: Mapping[int, int], new: Collection[int
     return result
 
 
-def _born(
+def _with_new_variables(
     graph: SceneFactorGraph,
     x: BlockGaussian,
     ids: Mapping[int, int],
     new: Mapping[int, GraphVariable],
     factors: Sequence[Linear],
 ) -> tuple[BlockGaussian, list[Linear]]:
-    """The joint state with new variables, as the factors on them say; and the factors that are left, on the others."""
+    """Add new variables to the joint state, by the factors on them; returns also the factors left on the others."""
     mine = [factor for factor in factors if not new.keys().isdisjoint(factor[0])]
     left = [factor for factor in factors if new.keys().isdisjoint(factor[0])]
     others = list(dict.fromkeys(key for keys, _ in mine for key in keys if key not in new))

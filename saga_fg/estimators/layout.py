@@ -65,7 +65,7 @@ class Layout:
         return np.asarray(np.repeat(self.offsets[rows] - (ends - dims), dims) + np.arange(ends[-1]))
 
     def extended(self, nodes: ArrayLike, dim: int) -> Layout:
-        """With further nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
+        """Add nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
         ids = checked_ids("nodes", nodes)
         for node in ids.tolist():
             if node in self._row:

@@ -115,7 +115,7 @@ class RecordedMeasurements:
             )
 
     def linearised(self, layout: Layout, mean: FloatArray) -> LinearisedMeasurements:
-        """Around the joint state `mean` (D,) of `layout`."""
+        """Linearise around the joint state `mean` (D,) of `layout`."""
         measured = self.measured
         rows = layout.rows(measured.nodes)
         if self.linear and self.weights is None:

@@ -108,7 +108,7 @@ def recording_factors(
             leaving = layout.rows(epoch.leaving)
             stay = layout.without(leaving) if len(leaving) else layout
             at = means[k][layout.places(layout.rows(stay.nodes))]
-            resting = stay.nodes[epoch.interval.linearised(stay, at).still].tolist()
+            resting = stay.nodes[epoch.interval.linearised(stay, at).unchanged].tolist()
             now, keys = keys, {node: keys[node] for node in resting}
             then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
             native, nonlinear = interval_factors(epoch.interval, stay, at, now, then)
@@ -263,7 +263,7 @@ class Interactions:
         mean = np.concatenate([view.state(earlier[node]) for node in nodes])
         interval = IntervalDynamics(transition)
         dynamics = interval.linearised(layout, mean)
-        moved = dynamics.moved(mean) + dynamics.b
+        moved = dynamics.times(mean) + dynamics.b
         states = np.split(moved, transition.offsets[1:-1])
         new = [
             NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)

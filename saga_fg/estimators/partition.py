@@ -88,7 +88,7 @@ class Partition:
         return self.offset // self.size
 
     @cached_property
-    def homes(self) -> tuple[tuple[IntArray, IntArray, IntArray], ...]:
+    def nodes_by_group(self) -> tuple[tuple[IntArray, IntArray, IntArray], ...]:
         """For each group, the nodes in it, the rows of their components and their slots there. Only with `size`."""
         nodes = [np.flatnonzero(self.group == number) for number in range(len(self.groups))]
         return tuple((of_group, self.row[of_group], self.slot[of_group]) for of_group in nodes)
@@ -131,7 +131,7 @@ class Partition:
         return [(number, mine, at[mine]) for number, mine in zip(numbers, members, strict=True)]
 
     def joined(self, target: IntArray, source: IntArray) -> Partition:
-        """With the components of node rows target[k] and source[k] made one; itself where they are already."""
+        """Join the components of node rows target[k] and source[k]; itself where they are one already."""
         a, b = self.label[target], self.label[source]
         across = a != b
         if not across.any():
@@ -140,7 +140,7 @@ class Partition:
 
     @cached_property
     def packed(self) -> Partition:
-        """With small components of several nodes, of sizes that few others have, put together.
+        """Put small components of several nodes together whose sizes few others have.
 
         That spares a batched operation for each size. What moves alone stays alone, to the last digit.
         """
@@ -156,7 +156,7 @@ class Partition:
         return Partition(self.layout, _without_gaps(number[self.label]))
 
     def extended(self, layout: Layout) -> Partition:
-        """With the further nodes at the end of `layout`, each a component of its own."""
+        """Add the further nodes at the end of `layout`, each a component of its own."""
         return Partition(layout, np.concatenate([self.label, self.count + np.arange(len(layout) - len(self.layout))]))
 
     def restricted(self, layout: Layout, rows: IntArray) -> Partition:

@@ -1,4 +1,4 @@
-"""A record of epochs with the filter's pass over it: what the smoothers are made of.
+"""A record of epochs, with the filter over them, on which the smoothers are built.
 
 Told of the past, the filter's pass is done again from there. Where something is nonlinear or robust, everything
 recorded is linearised again at the smoothed means until they stand still, which is Gauss-Newton over the recording
@@ -41,7 +41,7 @@ _SAME_TIME = 1e-9  # s
 
 @dataclass(frozen=True)
 class GaussNewtonSettings:
-    """When the linearisation of what is nonlinear or robust is good enough."""
+    """Settings of Gauss-Newton over a recording."""
 
     max_iterations: int = setting(100, "linearisations of everything recorded at most")
     tolerance: float = setting(1e-9, "largest step of a mean, in standard deviations, at which it has converged")
@@ -69,7 +69,7 @@ class RecordingState:
 
 
 class Recording:
-    """Moments in order of time, from 0 s on. Every method checks all it is given before it changes anything.
+    """Epochs in order of time, from 0 s on. Every method checks all it is given before it changes anything.
 
     With `lazy` the filter's pass waits until somebody asks for an estimate, or something nonlinear comes that must be
     tried; nobody learns the likelihoods meanwhile.
@@ -134,7 +134,7 @@ class Recording:
 
     @property
     def layout(self) -> Layout:
-        """The nodes that are there now."""
+        """Layout of the present nodes."""
         if self._layout is None:
             leaving = self._layouts[-1].rows(self._epochs[-1].leaving)
             self._layout = self._layouts[-1].without(leaving) if len(leaving) else self._layouts[-1]

@@ -176,7 +176,7 @@ def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> floa
 
 
 def _acting_pairs(interval: IntervalDynamics) -> list[tuple[IntArray, IntArray]]:
-    """Ids of nodes and of those they listen to."""
+    """Ids of nodes and of those that act on them."""
     nodes = interval.transition.nodes
     pairs = [(nodes[blocks.target], nodes[blocks.source]) for blocks in interval.transition.F]
     for group in interval.nonlinear:

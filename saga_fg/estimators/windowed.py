@@ -61,11 +61,11 @@ class WindowedSmoother(RecordedSmoother):
 
     @property
     def bound(self) -> float:
-        """By how much the future could move what was given out; above `tolerance` only where `longest` forced it."""
+        """Largest change that later measurements could make to final epochs; forced by `longest` above `tolerance`."""
         return self._bound
 
     def final(self) -> tuple[SmoothedState, ...]:
-        """The epochs that have become final, with the covariances of their nodes: none most of the time."""
+        """Epochs that have become final, with the covariances of their nodes: none most of the time."""
         if self.time < self._next_look:
             return ()
         self._next_look = self.time + self._settings.step

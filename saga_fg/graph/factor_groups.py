@@ -1,4 +1,4 @@
-"""Factors as the running graph holds them: in groups of what was given together, each factor a row of its group.
+"""Groups of factors that were added together, each factor a row of its group.
 
 A group linearises any of its rows at a `LinearisationPoint`. GTSAM's own factors are linearised by GTSAM, one at a
 time; `ResidualFactors` all at once in NumPy. A `gtsam.CustomFactor` is

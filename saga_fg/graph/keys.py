@@ -1,4 +1,4 @@
-"""One scheme of keys: what a variable is of, which one, and when.
+"""Keys of variables: kind, id and epoch in one number.
 
     64 bits  =  letter of the kind (8)  |  id (28)  |  epoch (28)
 
@@ -80,7 +80,7 @@ def key_id(key: int) -> KeyId:
 
 
 def described(key: int) -> str:
-    """A key in words, for where nothing is known of its variable."""
+    """Describe a key whose variable is not known."""
     try:
         parts = key_id(key)
     except GraphError:

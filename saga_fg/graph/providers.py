@@ -1,4 +1,4 @@
-"""Factor providers: how anything comes into the running graph.
+"""Factor providers: the sources of variables and factors of a running graph.
 
 Once a frame each provider is asked, in the order given, what it adds: new variables, with where they are to begin with,
 and factors. What it sees is a `GraphView`, which it can read and not change; those asked after it see what it added.

@@ -7,7 +7,7 @@ leaves is marginalised with all factors on it, linearised where everything is th
 
     phi(x_b) = max over x_a of prod phi(x_a, x_b)      a: what leaves, b: its neighbours that stay
 
-so that nothing it knew of the rest is lost. The graph holds values and factors, no solver, and can be pickled if its
+so that its information on the rest is kept. The graph holds values and factors, no solver, and can be pickled if its
 factors can (a `gtsam.CustomFactor` and a lambda cannot).
 """
 
@@ -92,7 +92,7 @@ class SceneFactorGraph:
         return self._variables[key]
 
     def factors(self) -> Iterator[FactorEntry]:
-        """Every factor in words."""
+        """Describe every factor."""
         for held in self._groups.values():
             for row in held.rows.tolist():
                 mine = tuple(self._variables[key] for key in held.factors.rows[row])
@@ -158,7 +158,7 @@ class SceneFactorGraph:
                 self._fresh[self._hold(one)] = factors_there
 
     def marginalise(self, keys: Iterable[int]) -> None:
-        """Integrate variables out: they go, what they knew of the others stays."""
+        """Integrate variables out; their information on the others stays."""
         leaving = {key: self.variable(key) for key in keys}
         if not leaving:
             return
@@ -223,7 +223,7 @@ class SceneFactorGraph:
         return {one.id: one for one in every if one.kind == kind}
 
     def older_than(self, time: float) -> list[int]:
-        """Keys of the variables of moments before `time`."""
+        """Keys of the variables of epochs before `time`."""
         return [key for key, one in self._variables.items() if one.time is not None and one.time < time]
 
     def point(self) -> LinearisationPoint:

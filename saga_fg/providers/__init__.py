@@ -1,4 +1,4 @@
-"""Factor providers that come along: the vehicle's odometry, satellite fixes, inertial sensors, landmarks, what stands.
+"""Factor providers: the vehicle's odometry, satellite fixes, inertial sensors, landmarks, stationary objects.
 
 Each reads what a frame brings (`Frame.ego`) and works in the running graph wherever that is: an
 `IncrementalSmoother` in Python, the tracker, and by name in a configuration with its fields as settings,

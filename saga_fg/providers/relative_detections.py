@@ -16,7 +16,7 @@ from saga_fg.providers.start import NO_POSE
 
 @dataclass(frozen=True, eq=False)
 class RelativeDetections:
-    """Sightings of objects at this epoch, whose ids are known.
+    """Measurements of objects with known ids at this epoch.
 
     nodes (k,) ids; z (k, 3) in the vehicle's frame, m; R (k, 2, 2) in its axes, m^2; dim of the objects' states;
     position: where in them the place is

@@ -1,4 +1,4 @@
-"""The first pose of the vehicle: where it is believed to be before anything moves, with a prior."""
+"""The first pose of the vehicle, with a prior."""
 
 from __future__ import annotations
 

@@ -36,7 +36,13 @@ class StationaryObjects(Settings):
         return Additions(
             factors=[
                 ResidualFactors(
-                    np.array(rows, dtype=np.uint64), (dim,), _velocity, R, _by_velocity, robust, name="stationary object"
+                    np.array(rows, dtype=np.uint64),
+                    (dim,),
+                    _velocity,
+                    R,
+                    _by_velocity,
+                    robust,
+                    name="stationary object",
                 )
                 for dim, rows in dims.items()
             ]

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.central_differences import central_differences
+from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.kitti.calibration import Calibration, read_calibration
 from data_tools.datasets.kitti.detections import CLASS_CODES, detection_files, read_kitti_detections
 from data_tools.datasets.kitti.labels import read_kitti_labels

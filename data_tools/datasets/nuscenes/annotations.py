@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.central_differences import central_differences
+from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.nuscenes.classes import CATEGORY_TO_TRACKING_CLASS
 from data_tools.datasets.nuscenes.scenes import SceneRecord
 from data_tools.datasets.nuscenes.tables import read_table

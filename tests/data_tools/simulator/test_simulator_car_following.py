@@ -20,6 +20,7 @@ from data_tools.simulator.driver_models import (
 from data_tools.simulator.fleet import CAR, KINDS, Fleet
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import curved_road
+from data_tools.simulator.scene_layout import SceneLayout
 from data_tools.simulator.settings import DriverSettings
 from data_tools.simulator.traffic import Traffic, record_traffic
 from saga_fg.numerics.arrays import FloatArray
@@ -53,9 +54,11 @@ def queue(
     cars = fleet(count, leader_desires)
     spacing = float(equilibrium_gap(speed, drivers(1))[0]) + KINDS[CAR].size[0]
     s = 1000.0 - spacing * np.arange(count)
-    rng = np.random.default_rng(0)
-    lane = np.zeros(count, dtype=np.int64)
-    return Traffic(lanes, cars, lane, s, np.full(count, speed), settings, rng, stop_lines, slow_zones)
+    lane, trailer = np.zeros(count, dtype=np.int64), np.zeros(count)
+    layout = SceneLayout(
+        lanes, 0.0, None, cars, lane, s, np.full(count, speed), tuple(stop_lines), tuple(slow_zones), trailer
+    )
+    return Traffic(layout, settings, np.random.default_rng(0))
 
 
 @given(speed=st.floats(0.0, 13.5), lead=st.floats(-3.0, 3.0))
