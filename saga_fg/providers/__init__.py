@@ -13,6 +13,6 @@ from saga_fg.providers.lanes import Lanes
 from saga_fg.providers.odometry import Odometry
 from saga_fg.providers.relative_detections import RelativeDetections
 from saga_fg.providers.start import StartSettings
-from saga_fg.providers.stationary import Stationary
+from saga_fg.providers.stationary import StationaryObjects
 
-__all__ = ["Gps", "Imu", "Landmarks", "Lanes", "Odometry", "RelativeDetections", "StartSettings", "Stationary"]
+__all__ = ["Gps", "Imu", "Landmarks", "Lanes", "Odometry", "RelativeDetections", "StartSettings", "StationaryObjects"]
