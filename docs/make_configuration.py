@@ -9,7 +9,7 @@ from pipelines.config import TrackConfig
 from pipelines.configuration import settings_reference
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import SlamSettings
-from saga_fg.providers import Gps, Imu, Landmarks, Lanes, Odometry, Stationary
+from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry
 from saga_fg.smoothing import SmoothingSettings
 
 INTRODUCTION = """\
@@ -50,7 +50,7 @@ def configuration_page() -> str:
                        ("Limits of the service (`saga-fg serve --limits`)", StreamSettings),
                        ("The simulator (`saga-fg simulate`)", SimulatorSettings)):  # fmt: skip
         parts += [f"# {title}\n", settings_reference(cls)]
-    for cls in (Odometry, Gps, Imu, Landmarks, Lanes, Stationary):
+    for cls in (Odometry, Gps, Imu, Landmarks, LaneKeeping, StationaryObjects):
         parts += [f"# Factor provider `saga_fg.providers:{cls.__name__}`\n", settings_reference(cls)]
     return "\n".join(parts)
 

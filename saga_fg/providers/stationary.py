@@ -17,7 +17,7 @@ from saga_fg.settings import Positive, Settings, setting
 
 
 @dataclass(frozen=True)
-class Stationary(Settings):
+class StationaryObjects(Settings):
     """Holds objects of some classes near velocity zero."""
 
     classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of stationary objects")
