@@ -31,10 +31,12 @@ Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """Everything that shapes tracking."""
+    """Configuration of tracking."""
 
-    tracker: TrackerSettings = settings_group(TrackerSettings, "methods saga and kf (kf leaves the edges out)")
-    greedy: GreedySettings = settings_group(GreedySettings, "method centerpoint")
+    tracker: TrackerSettings = settings_group(
+        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges)"
+    )
+    greedy: GreedySettings = settings_group(GreedySettings, "the tracker of the method centerpoint")
     sensors: Mapping[str, Sensor] = settings_group(
         lambda: {DEFAULT: Sensor()}, "models of the sensors by name; the entry named default serves all others"
     )

@@ -36,12 +36,17 @@ class Range:
         inside = (self.low < value if self.above else self.low <= value) and value <= self.high
         return inside and (self.infinite or math.isfinite(value))
 
+    @property
+    def bounds(self) -> str:
+        """As in "a number > 0"; empty if there are none."""
+        if self.high < math.inf:
+            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+        return "" if self.low == -math.inf else f"{'>' if self.above else '>='} {self.low:g}"
+
     def __str__(self) -> str:
         """As in "expected a finite number > 0"."""
-        if self.high < math.inf:
-            return f"number {'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
-        bound = "" if self.low == -math.inf else f" {'>' if self.above else '>='} {self.low:g}"
-        return f"{'' if self.infinite else 'finite '}number{bound}"
+        finite = "" if self.infinite or self.high < math.inf else "finite "
+        return f"{finite}number {self.bounds}".rstrip()
 
 
 Finite = Annotated[float, Range()]

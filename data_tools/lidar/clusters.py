@@ -53,11 +53,11 @@ class ClusterSettings(Settings):
     """Clustering of points into boxes; the first class whose sizes fit is taken."""
 
     cell: Positive = setting(0.3, "cell of the clustering grid, m; raised: points farther apart join")
-    lowest: Positive = setting(0.25, "lowest height above the ground of clustered points, m")
-    highest: Positive = setting(2.6, "largest height above the ground of an object, m")
-    reach: Positive = setting(40.0, "largest distance from the sensor, m")
-    foot: Positive = setting(0.6, "largest height above the ground of an object's lowest point, m")
-    points: PositiveInt = setting(10, "fewest points of an object")
+    min_height: Positive = setting(0.25, "lowest height above the ground of clustered points, m")
+    max_height: Positive = setting(2.6, "largest height above the ground of an object, m")
+    max_range: Positive = setting(40.0, "largest distance from the sensor, m")
+    max_foot_height: Positive = setting(0.6, "largest height above the ground of an object's lowest point, m")
+    min_points: PositiveInt = setting(10, "fewest points of an object")
     classes: Mapping[str, ObjectSize] = settings_group(_sizes, "sizes by class")
 
 
@@ -65,13 +65,13 @@ def detect_clusters(points: FloatArray, settings: ClusterSettings | None = None)
     """Boxes of the objects on the ground in a scan (N, 3), m; in the sensor's frame, with classes and scores."""
     s = settings or ClusterSettings()
     ground = segment_ground(points)
-    near = np.hypot(points[:, 0], points[:, 1]) <= s.reach
-    above = near & (ground.height >= s.lowest)
+    near = np.hypot(points[:, 0], points[:, 1]) <= s.max_range
+    above = near & (ground.height >= s.min_height)
     points, height = points[above], ground.height[above]
     candidates = [
         _detection(points[rows], float(height[rows].max()), s)
         for rows in clusters_from_above(points, s.cell)
-        if len(rows) >= s.points and height[rows].max() <= s.highest and height[rows].min() <= s.foot
+        if len(rows) >= s.min_points and height[rows].max() <= s.max_height and height[rows].min() <= s.max_foot_height
     ]
     found = [candidate for candidate in candidates if candidate is not None]
     if not found:

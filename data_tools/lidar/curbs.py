@@ -33,10 +33,10 @@ class CurbSettings(Settings):
 
     sectors: PositiveInt = setting(180, "number of sectors around the sensor")
     spacing: Positive = setting(0.25, "spacing of the height profile, m")
-    nearest: Positive = setting(2.5, "nearest distance from the sensor, m")
-    farthest: Positive = setting(20.0, "largest distance from the sensor, limited by the spacing of the rings, m")
-    low: Positive = setting(0.05, "least step, m")
-    high: Positive = setting(0.3, "largest step, m")
+    min_range: Positive = setting(2.5, "nearest distance from the sensor, m")
+    max_range: Positive = setting(20.0, "largest distance from the sensor, limited by the spacing of the rings, m")
+    min_step: Positive = setting(0.05, "least step, m")
+    max_step: Positive = setting(0.3, "largest step, m")
 
 
 def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings | None = None) -> FloatArray:
@@ -46,21 +46,21 @@ def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings
     """
     s = settings or CurbSettings()
     distance = np.hypot(points[:, 0], points[:, 1])
-    low = (np.abs(height) <= s.high) & (distance >= s.nearest) & (distance < s.farthest)
+    low = (np.abs(height) <= s.max_step) & (distance >= s.min_range) & (distance < s.max_range)
     points, distance = points[low], distance[low]
     if not len(points):
         return np.empty((0, 3))
-    steps = int(np.ceil((s.farthest - s.nearest) / s.spacing))
+    steps = int(np.ceil((s.max_range - s.min_range) / s.spacing))
     turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     sector = (turn * s.sectors).astype(np.int64) % s.sectors
-    bin_ = sector * steps + ((distance - s.nearest) / s.spacing).astype(np.int64)
+    bin_ = sector * steps + ((distance - s.min_range) / s.spacing).astype(np.int64)
     profile = cell_order_statistics(points[:, 2], bin_, s.sectors * steps, 2).reshape(s.sectors, steps)
     found = []
     for row in np.flatnonzero(np.isfinite(profile).sum(axis=1) >= 4):
         edge = _first_step(profile[row], s)
         if edge is not None:
             angle = ((row + 0.5) / s.sectors - 0.5) * 2 * np.pi
-            out = s.nearest + (edge + 0.5) * s.spacing
+            out = s.min_range + (edge + 0.5) * s.spacing
             found.append((out * np.cos(angle), out * np.sin(angle), profile[row, edge]))
     return np.array(found).reshape(-1, 3)
 
@@ -72,7 +72,7 @@ def _first_step(profile: FloatArray, s: CurbSettings) -> int | None:
     for k in range(len(at) - 3):
         near = at[k + 1] - at[k] <= 2
         rise = z[k + 1 : k + 3].min() - z[: k + 1][-4:].mean()
-        if near and s.low <= rise <= s.high and abs(z[k] - z[max(k - 2, 0)]) < s.low / 2:
+        if near and s.min_step <= rise <= s.max_step and abs(z[k] - z[max(k - 2, 0)]) < s.min_step / 2:
             return int(at[k + 1])
     return None
 
@@ -81,10 +81,10 @@ def _first_step(profile: FloatArray, s: CurbSettings) -> int | None:
 class LineSettings(Settings):
     """Straight lines through points."""
 
-    width: Positive = setting(0.2, "largest distance of a point from its line, m")
-    gap: Positive = setting(4.0, "longest gap between points of a line, m")
-    length: Positive = setting(6.0, "least length, m")
-    points: Annotated[int, Range(3)] = setting(8, "fewest points")
+    max_offset: Positive = setting(0.2, "largest distance of a point from its line, m")
+    max_gap: Positive = setting(4.0, "longest gap between points of a line, m")
+    min_length: Positive = setting(6.0, "least length, m")
+    min_points: Annotated[int, Range(3)] = setting(8, "fewest points")
     noise: Positive = setting(0.1, "least standard deviation of a point across the line, m")
     bias: Positive = setting(0.1, "standard deviation of the error that neighbouring points share, m")
 
@@ -101,7 +101,7 @@ def straight_lines(points: FloatArray, most: int, settings: LineSettings | None 
     """At most `most` lines through points (M, 3), m, the one with the most points first."""
     s = settings or LineSettings()
     found: list[Line] = []
-    while len(found) < most and len(points) >= s.points:
+    while len(found) < most and len(points) >= s.min_points:
         chosen = _best_line(points[:, :2], s)
         if chosen is None:
             break
@@ -115,20 +115,20 @@ def _best_line(xy: FloatArray, s: LineSettings) -> BoolArray | None:
     i, j = np.triu_indices(len(xy), 1)
     apart = xy[j] - xy[i]
     length = np.linalg.norm(apart, axis=1)
-    far = length >= s.length / 2
+    far = length >= s.min_length / 2
     i, apart, length = i[far], apart[far], length[far]
     normal = np.stack([-apart[:, 1], apart[:, 0]], axis=1) / length[:, None]
     off = np.abs(normal @ xy.T - (normal * xy[i]).sum(axis=1)[:, None])
-    count = (off <= s.width).sum(axis=1)
+    count = (off <= s.max_offset).sum(axis=1)
     for line in np.argsort(-count, kind="stable")[:20]:
-        if count[line] < s.points:
+        if count[line] < s.min_points:
             return None
-        rows = np.flatnonzero(off[line] <= s.width)
+        rows = np.flatnonzero(off[line] <= s.max_offset)
         u = xy[rows] @ (apart[line] / length[line])
         order = np.argsort(u)
-        pieces = np.split(order, np.flatnonzero(np.diff(u[order]) > s.gap) + 1)
+        pieces = np.split(order, np.flatnonzero(np.diff(u[order]) > s.max_gap) + 1)
         piece = max(pieces, key=len)
-        if len(piece) >= s.points and u[piece[-1]] - u[piece[0]] >= s.length:
+        if len(piece) >= s.min_points and u[piece[-1]] - u[piece[0]] >= s.min_length:
             chosen = np.zeros(len(xy), dtype=np.bool_)
             chosen[rows[piece]] = True
             return chosen

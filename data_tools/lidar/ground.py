@@ -23,9 +23,9 @@ class GroundSettings(Settings):
     """Ground segmentation of roads and pavements."""
 
     sectors: PositiveInt = setting(60, "number of sectors of the polar grid")
-    ring: Positive = setting(1.5, "width of a ring, m")
-    reach: Positive = setting(80.0, "outer radius of the last ring, m")
-    slope: Positive = setting(0.15, "steepest rise, m per m")
+    ring_width: Positive = setting(1.5, "width of a ring, m")
+    max_range: Positive = setting(80.0, "outer radius of the last ring, m")
+    max_slope: Positive = setting(0.15, "steepest rise, m per m")
     step: Positive = setting(0.1, "change of height between rings allowed beyond the slope, m")
     clearance: Positive = setting(0.2, "largest distance of a ground point from the ground height, m")
 
@@ -45,11 +45,11 @@ def segment_ground(points: FloatArray, settings: GroundSettings | None = None) -
         return Ground(np.empty(0, dtype=np.bool_), np.empty(0))
     distance = np.hypot(points[:, 0], points[:, 1])
     sector = ((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * s.sectors).astype(np.int64) % s.sectors
-    rings = int(np.ceil(s.reach / s.ring))
-    ring = np.minimum((distance / s.ring).astype(np.int64), rings - 1)
+    rings = int(np.ceil(s.max_range / s.ring_width))
+    ring = np.minimum((distance / s.ring_width).astype(np.int64), rings - 1)
     low = cell_order_statistics(points[:, 2], sector * rings + ring, s.sectors * rings, 10).reshape(s.sectors, rings)
     ground = _ground_heights(low, s)
-    place = np.clip(distance / s.ring - 0.5, 0, rings - 1)
+    place = np.clip(distance / s.ring_width - 0.5, 0, rings - 1)
     inner = np.minimum(place.astype(np.int64), rings - 2)
     share = place - inner
     height = points[:, 2] - ((1 - share) * ground[sector, inner] + share * ground[sector, inner + 1])
@@ -58,12 +58,12 @@ def segment_ground(points: FloatArray, settings: GroundSettings | None = None) -
 
 def _ground_heights(low: FloatArray, s: GroundSettings) -> FloatArray:
     """Heights (sectors, rings) of the ground, from the innermost ring on."""
-    near = low[:, : max(int(10.0 / s.ring), 1)]
+    near = low[:, : max(int(10.0 / s.ring_width), 1)]
     start = float(np.nanmedian(near)) if np.isfinite(near).any() else float(np.nanmin(low))
     height, since = np.full(len(low), start), np.ones(len(low))
     ground = np.empty_like(low)
     for k in range(low.shape[1]):
-        fits = np.abs(low[:, k] - height) <= s.step + s.slope * s.ring * since  # False in empty cells
+        fits = np.abs(low[:, k] - height) <= s.step + s.max_slope * s.ring_width * since  # False in empty cells
         height = np.where(fits, low[:, k], height)
         since = np.where(fits, 1.0, since + 1.0)
         ground[:, k] = height

@@ -31,14 +31,14 @@ from saga_fg.settings import Positive, PositiveInt, Settings, setting
 class PlaneSettings(Settings):
     """Detection of walls and of the ground plane."""
 
-    surfel: Positive = setting(1.0, "voxel size of the surfels, m")
-    reach: Positive = setting(50.0, "largest distance from the sensor, m")
-    upright: Positive = setting(0.15, "largest z component of the normal of a wall")
-    aligned: Positive = setting(0.97, "least cosine between normals of one wall")
-    thickness: Positive = setting(0.15, "largest distance of a surfel from the plane of its wall, m")
-    gap: Positive = setting(3.0, "largest gap within a wall, m")
-    surfels: PositiveInt = setting(8, "fewest surfels of a wall")
-    length: Positive = setting(3.0, "least length of a wall, m")
+    surfel_size: Positive = setting(1.0, "voxel size of the surfels, m")
+    max_range: Positive = setting(50.0, "largest distance from the sensor, m")
+    max_tilt: Positive = setting(0.15, "largest z component of the normal of a wall")
+    min_cosine: Positive = setting(0.97, "least cosine between normals of one wall")
+    max_thickness: Positive = setting(0.15, "largest distance of a surfel from the plane of its wall, m")
+    max_gap: Positive = setting(3.0, "largest gap within a wall, m")
+    min_surfels: PositiveInt = setting(8, "fewest surfels of a wall")
+    min_length: Positive = setting(3.0, "least length of a wall, m")
     noise: Positive = setting(0.03, "standard deviation of surfels across their wall, m")
     ground_noise: Positive = setting(0.02, "standard deviation of surfels of the ground, m")
 
@@ -92,9 +92,9 @@ def fit_ground(ground: FloatArray, settings: PlaneSettings | None = None, reach:
     """The plane of the ground points (N, 3) within `reach` m; None for too few points."""
     s = settings or PlaneSettings()
     near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
-    near = near[voxel_downsample(near, s.surfel)]
+    near = near[voxel_downsample(near, s.surfel_size)]
     for _ in range(3):
-        if len(near) < 3 * s.surfels:
+        if len(near) < 3 * s.min_surfels:
             return None
         plane = fit_plane(near, s.ground_noise)
         off = np.abs(near @ plane.coefficients[:3] + plane.coefficients[3])
@@ -105,26 +105,26 @@ def fit_ground(ground: FloatArray, settings: PlaneSettings | None = None, reach:
 def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> list[Plane]:
     """The walls among points (N, 3), m, of a scan without its ground, the largest first."""
     s = settings or PlaneSettings()
-    points = points[np.hypot(points[:, 0], points[:, 1]) <= s.reach]
-    surfels = surfels_of(points, s.surfel)
-    surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= s.upright))
+    points = points[np.hypot(points[:, 0], points[:, 1]) <= s.max_range]
+    surfels = surfels_of(points, s.surfel_size)
+    surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= s.max_tilt))
     mean, normal = surfels.mean, surfels.normal
-    coplanar = np.abs(normal @ normal.T) >= s.aligned
+    coplanar = np.abs(normal @ normal.T) >= s.min_cosine
     across = np.abs(normal @ mean.T - np.einsum("ni,ni->n", normal, mean)[:, None])
-    coplanar &= (across <= s.thickness) & (s.thickness >= across.T)
+    coplanar &= (across <= s.max_thickness) & (s.max_thickness >= across.T)
     walls: list[Plane] = []
     left = np.ones(len(mean), dtype=np.bool_)
     while left.any():
         support = coplanar[:, left].sum(axis=1) * left
         best = int(support.argmax())
-        if support[best] < s.surfels:
+        if support[best] < s.min_surfels:
             break
-        rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, s.gap)
+        rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, s.max_gap)
         left[rows] = left[best] = False
-        if len(rows) < s.surfels:
+        if len(rows) < s.min_surfels:
             continue
         wall = fit_plane(mean[rows], s.noise)
-        if np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= s.length and abs(wall.coefficients[2]) <= s.upright:
+        if np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= s.min_length and abs(wall.coefficients[2]) <= s.max_tilt:
             walls.append(wall)
     return walls
 

@@ -25,14 +25,14 @@ class PoleSettings(Settings):
     """Detection of poles."""
 
     cell: Positive = setting(0.2, "cell of the clustering grid, m")
-    reach: Positive = setting(40.0, "largest distance from the sensor, m")
-    lowest: Positive = setting(0.3, "lowest height above the ground of clustered points, m")
-    height: Positive = setting(1.2, "least height from the lowest to the highest point, m")
-    width: Positive = setting(0.6, "largest horizontal extent, m")
-    points: PositiveInt = setting(8, "fewest points")
-    filled: Positive = setting(0.5, "least share of half-metre steps of the height that contain points")
-    alone: Positive = setting(0.6, "radius around the axis without other objects, m")
-    alone_share: Positive = setting(
+    max_range: Positive = setting(40.0, "largest distance from the sensor, m")
+    min_height: Positive = setting(0.3, "lowest height above the ground of clustered points, m")
+    min_length: Positive = setting(1.2, "least height from the lowest to the highest point, m")
+    max_width: Positive = setting(0.6, "largest horizontal extent, m")
+    min_points: PositiveInt = setting(8, "fewest points")
+    min_filled: Positive = setting(0.5, "least share of half-metre steps of the height that contain points")
+    clear_radius: Positive = setting(0.6, "radius around the axis without other objects, m")
+    clear_share: Positive = setting(
         0.1, "the same radius as a share of the range, against columns of walls at grazing angles"
     )
     noise: Positive = setting(0.05, "standard deviation of the axis, m")
@@ -61,7 +61,7 @@ def extract_poles(
 ) -> list[Pole]:
     """The poles among points (N, 3), m, at `height` (N,) above the ground, m, except near `walls`."""
     s = settings or PoleSettings()
-    points = points[(height >= s.lowest) & (np.hypot(points[:, 0], points[:, 1]) <= s.reach)]
+    points = points[(height >= s.min_height) & (np.hypot(points[:, 0], points[:, 1]) <= s.max_range)]
     everything = points
     points = points[~near_walls(points, walls, s.cell)]
     tree = cKDTree(everything[:, :2])
@@ -72,7 +72,7 @@ def extract_poles(
             continue
         pole = _pole(candidate, s)
         around = everything[
-            tree.query_ball_point(pole.foot[:2], max(s.alone, s.alone_share * float(np.hypot(*pole.foot[:2]))))
+            tree.query_ball_point(pole.foot[:2], max(s.clear_radius, s.clear_share * float(np.hypot(*pole.foot[:2]))))
         ]
         level = (around[:, 2] >= pole.foot[2]) & (around[:, 2] <= pole.top)
         if level.sum() <= 1.2 * len(candidate):
@@ -81,13 +81,13 @@ def extract_poles(
 
 
 def _slender(points: FloatArray, s: PoleSettings) -> bool:
-    if len(points) < s.points:
+    if len(points) < s.min_points:
         return False
     size = np.ptp(points, axis=0)
-    if max(size[0], size[1]) > s.width or size[2] < s.height:
+    if max(size[0], size[1]) > s.max_width or size[2] < s.min_length:
         return False
     steps = np.floor((points[:, 2] - points[:, 2].min()) / 0.5)
-    return bool(len(np.unique(steps)) >= s.filled * np.ceil(size[2] / 0.5))
+    return bool(len(np.unique(steps)) >= s.min_filled * np.ceil(size[2] / 0.5))
 
 
 def _pole(points: FloatArray, s: PoleSettings) -> Pole:

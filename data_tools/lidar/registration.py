@@ -42,9 +42,9 @@ class RegistrationError(SagaError):
 class RegistrationSettings(Settings):
     """Convergence criteria of the registration."""
 
-    iterations: PositiveInt = setting(30, "largest number of iterations")
-    translation: Positive = setting(1e-3, "largest translation of the last step, m")
-    rotation: Positive = setting(1e-4, "largest rotation of the last step, rad")
+    max_iterations: PositiveInt = setting(30, "largest number of iterations")
+    translation_tolerance: Positive = setting(1e-3, "largest translation of the last step, m")
+    rotation_tolerance: Positive = setting(1e-4, "largest rotation of the last step, rad")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +86,16 @@ def register(
     T = _rigid(map_T_scan)
     span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
     converged, step = False, 0
-    while not converged and step < settings.iterations:
+    while not converged and step < settings.max_iterations:
         step += 1
         rows, paired = surfels.nearest(transform_points(T, points), farthest)
         J, r, w = _linearised(points[rows], paired, T, scale)
         x = _solved(J.T @ (w[:, None] * J), -J.T @ (w * r), span)
         T = _rigid(T @ gtsam.Pose3.Expmap(x).matrix())
-        converged = bool(np.linalg.norm(x[3:]) < settings.translation and np.linalg.norm(x[:3]) < settings.rotation)
+        converged = bool(
+            np.linalg.norm(x[3:]) < settings.translation_tolerance
+            and np.linalg.norm(x[:3]) < settings.rotation_tolerance
+        )
     J, r, w = _linearised(points[rows], paired, T, scale)
     return Registration(T, _covariance(J, r, w, paired.voxel), float(np.abs(r).mean()), len(r), step, converged)
 

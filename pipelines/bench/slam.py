@@ -93,8 +93,8 @@ def _kiss(settings: OdometrySettings, timed: bool) -> Callable[[Scan, float], Fl
     except ImportError as error:
         raise MissingExtraError(f'kiss-icp cannot be imported: {error}; `pip install "saga-fg[bench]"`') from error
     chosen = config.KISSConfig()
-    chosen.mapping.voxel_size = settings.reach / 100.0
-    chosen.data.min_range, chosen.data.max_range, chosen.data.deskew = settings.nearest, settings.reach, timed
+    chosen.mapping.voxel_size = settings.max_range / 100.0
+    chosen.data.min_range, chosen.data.max_range, chosen.data.deskew = settings.min_range, settings.max_range, timed
     chosen.registration.max_num_threads = 1
     pipeline = kiss_icp.KissICP(chosen)
 
@@ -136,7 +136,7 @@ def still_clouds(
     """Points (N, 3) of each scan, in its sensor's frame, without skew if `timed`: by the motion of the poses."""
     clouds = []
     for k, scan in enumerate(scans):
-        scan = scan.within(settings.nearest, settings.reach)
+        scan = scan.within(settings.min_range, settings.max_range)
         if timed and scan.time is not None and len(scans) > 1:
             before = max(k - 1, 0)
             motion = inverse_transform(map_T_lidar[before]) @ map_T_lidar[before + 1]

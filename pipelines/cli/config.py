@@ -21,15 +21,15 @@ FIRST = {
     ),
     "smoothing": (
         "smoothing.classes.*.acceleration_noise",
-        "smoothing.joining.max_gap",
+        "smoothing.stitching.max_gap",
         "smoothing.loss",
         "smoothing.min_score",
         "sensors.*.noise.*.position",
     ),
     "slam": (
         "slam.joint.odometry.distance_noise",
-        "slam.lidar.odometry.surfel",
-        "slam.lidar.loops.distance",
+        "slam.lidar.odometry.surfel_size",
+        "slam.lidar.loops.max_distance",
         "slam.lidar.landmarks",
         "slam.lidar.loop_closures",
     ),

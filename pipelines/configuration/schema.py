@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from saga_fg.graph import FactorProvider
+from saga_fg.settings import Range, range_of
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class Setting:
     name: str
     schema: Schema
     comment: str
+    bounds: str  # of its numbers, such as "> 0"
     field: dataclasses.Field[Any]
 
     @property
@@ -98,7 +100,7 @@ def kind_of(cls: type) -> str:
 
 def settings_of(cls: type) -> tuple[Setting, ...]:
     """The fields of a settings dataclass, in order. Raises `TypeError` for a type that YAML cannot hold."""
-    hints = get_type_hints(cls)
+    hints, annotated = get_type_hints(cls), get_type_hints(cls, include_extras=True)
     result = []
     for field in dataclasses.fields(cls):
         if field.init:
@@ -106,7 +108,9 @@ def settings_of(cls: type) -> tuple[Setting, ...]:
                 schema = schema_of(hints[field.name])
             except TypeError as error:
                 raise TypeError(f"{cls.__name__}.{field.name}: {error}") from error
-            result.append(Setting(field.name, schema, field.metadata.get("comment", ""), field))
+            allowed = range_of(annotated[field.name])
+            bounds = allowed.bounds if isinstance(allowed, Range) else ""
+            result.append(Setting(field.name, schema, field.metadata.get("comment", ""), bounds, field))
     return tuple(result)
 
 

@@ -24,33 +24,37 @@ class StreamSettings(Settings):
     """Limits of a stream and of its connections. `reorder` counts on the frames' clock, other times on the wall's."""
 
     reorder: NonNegative = setting(
-        0.0, "s a frame is held back, so that frames of several sensors go in in order of time"
+        0.0, "hold frames back this long to sort those of several sensors by time, s; 0: never; higher: more delay"
     )
-    max_held: PositiveInt = setting(256, "frames held back at most; beyond, the oldest goes in")
+    max_held: PositiveInt = setting(256, "largest number of frames held back; beyond it the oldest is tracked")
     max_sensors: PositiveInt = setting(
-        1000, "sensors whose frames are numbered at most; beyond, the one silent for longest loses its number"
+        1000, "largest number of sensors whose frames are numbered; beyond it the longest silent one is forgotten"
     )
     max_seq_jump: PositiveInt = setting(
-        1_000_000, "a `seq` further than this beyond the last one of its sensor is refused; the first may be any"
+        1_000_000, "largest step of `seq` of one sensor; a frame further ahead is refused, unless it is the first"
     )
     max_detections: PositiveInt = setting(
-        500, "detections of a frame at most; one frame of so many takes up to 0.2 s, for which all clients wait"
+        500, "largest number of detections of a frame; 500 take up to 0.2 s, for which all clients wait"
     )
-    max_message: PositiveInt = setting(4 * MB, "bytes of a message at most")
-    max_failures: PositiveInt = setting(3, "internal errors of the tracker in a row that start a fresh tracker")
-    max_clients: PositiveInt = setting(256, "connections at most, fewer where the process may not open as many files")
+    max_message: PositiveInt = setting(4 * MB, "largest size of a message, bytes")
+    max_failures: PositiveInt = setting(3, "internal errors in a row after which a fresh tracker starts")
+    max_clients: PositiveInt = setting(
+        256, "largest number of connections; fewer where the process may open fewer files"
+    )
     max_unfinished: PositiveInt = setting(
-        64 * MB, "bytes of unfinished and waiting lines of all clients; beyond, the client that holds most is closed"
+        64 * MB, "largest size of unread input of all clients, bytes; beyond it the client with most is closed"
     )
     max_outbox: PositiveInt = setting(
-        8 * MB, "bytes of answers that wait for one client to read them; beyond, it is closed"
+        8 * MB, "largest size of unread answers of a client, bytes; beyond it the client is closed"
     )
     client_timeout: Positive = setting(
-        0.5, "a client whose answers pile up and that reads nothing for this long is closed, s"
+        0.5, "time after which a client that reads none of its waiting answers is closed, s"
     )
-    idle_timeout: PositiveOrInf = setting(3600.0, "a client without a message or an answer for this long is closed, s")
+    idle_timeout: PositiveOrInf = setting(
+        3600.0, "time without messages and answers after which a client is closed, s; .inf: never"
+    )
     stop_timeout: Positive = setting(
-        5.0, "time to finish after SIGTERM or SIGINT; then the process ends all the same, s"
+        5.0, "time to finish after SIGTERM or SIGINT, after which the process ends in any case, s"
     )
 
 

@@ -18,14 +18,14 @@ from saga_fg.tracking.provider_names import made_by_name, new_provider
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """Settings of `saga-fg slam simulated` and `slam kitti`."""
+    """Settings of `saga-fg slam simulated` and `saga-fg slam kitti`."""
 
     providers: tuple[str | FactorProvider, ...] = setting(
-        (), "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked at every pose"
+        (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, asked at every pose"
     )
-    landmarks: tuple[str, ...] = setting((), "detectors of landmarks of your own as MODULE:NAME, asked at every pose")
-    joint: JointSettings = settings_group(JointSettings, "simulated: vehicle and objects together")
-    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, objects among it")
+    landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
+    joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
+    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, with objects")
 
     def new_providers(self) -> list[FactorProvider]:
         """Fresh providers. Raises `InputError` for a name that cannot be resolved."""
@@ -39,9 +39,9 @@ class SlamSettings:
 
 @dataclass(frozen=True)
 class SlamConfig(TrackConfig):
-    """Everything that shapes SLAM with objects."""
+    """Configuration of SLAM with objects."""
 
-    slam: SlamSettings = settings_group(SlamSettings, "the graph")
+    slam: SlamSettings = settings_group(SlamSettings, "SLAM")
 
     def __post_init__(self) -> None:
         if self.tracker.providers:

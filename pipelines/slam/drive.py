@@ -84,7 +84,7 @@ def drive_by_poses(
     for k in range(len(scans)):
         moved = inverse_transform(poses[drive.keyframes[-1]]) @ poses[k] if k else np.eye(4)
         if k == 0 or np.linalg.norm(moved[:3, 3]) >= settings.keyframe_distance:
-            scan = scans[k].within(settings.nearest, settings.reach)
+            scan = scans[k].within(settings.min_range, settings.max_range)
             before = max(k - 1, 0)
             if scan.time is not None:
                 duration = float(scans.timestamps[before + 1] - scans.timestamps[before])

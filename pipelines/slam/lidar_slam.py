@@ -63,19 +63,25 @@ CALIBRATED = OdometryNoise(
 
 @dataclass(frozen=True)
 class LidarSlamSettings(Settings):
-    """All that shapes a run."""
+    """Settings of LiDAR SLAM."""
 
-    odometry: OdometrySettings = settings_group(OdometrySettings, "of the LiDAR")
-    observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "of landmarks in a scan")
-    mapper: MapperSettings = settings_group(lambda: MapperSettings(confirm=4), "telling landmarks apart")
-    loops: LoopSettings = settings_group(LoopSettings, "closing loops")
-    landmarks: bool = setting(True, "landmarks are nodes of the graph")
-    loop_closures: bool = setting(True, "look for loops")
-    robust_scale: Positive = setting(3.0, "of the Geman-McClure loss of loops and poles, standard deviations")
-    map_spacing: Positive = setting(0.25, "a scan is thinned to this for the accumulated map, m")
-    objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "of objects in the same graph")
-    oxts_rotation: Positive = setting(1e-3, "standard deviation of a motion by GPS/IMU between scans, rad")
-    oxts_translation: Positive = setting(0.03, "and of its translation, m")
+    odometry: OdometrySettings = settings_group(OdometrySettings, "LiDAR odometry")
+    observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "detection of landmarks in a scan")
+    mapper: MapperSettings = settings_group(lambda: MapperSettings(confirm_after=4), "association of landmarks")
+    loops: LoopSettings = settings_group(LoopSettings, "loop closures")
+    landmarks: bool = setting(True, "use landmarks as nodes of the graph")
+    loop_closures: bool = setting(True, "search for loop closures")
+    robust_scale: Positive = setting(
+        3.0, "residual from which the Geman-McClure loss discounts loops and poles, standard deviations"
+    )
+    map_spacing: Positive = setting(0.25, "spacing of the points of the accumulated map, m; higher: smaller files")
+    objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "objects in the same graph")
+    oxts_rotation: Positive = setting(
+        1e-3, "standard deviation of the rotation of a GPS/IMU increment between scans, rad"
+    )
+    oxts_translation: Positive = setting(
+        0.03, "standard deviation of the translation of a GPS/IMU increment between scans, m"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +165,7 @@ def lidar_slam(
         _trajectory(scans, drive.carried(world_T_lidar)),
         _trajectory(scans, drive.carried(np.array(online))),
         np.array([solution.marginal(pose_key(k)) for k in range(count)]),
-        observations.landmarks(solution, s.mapper.confirm),
+        observations.landmarks(solution, s.mapper.confirm_after),
         landmark_map.observations,
         [each.extent for scan in seen for each in scan],
         loops,

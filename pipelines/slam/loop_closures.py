@@ -31,17 +31,19 @@ from saga_fg.settings import (
 class LoopSettings(Settings):
     """Conditions for comparing two keyframes, and for taking them for one place."""
 
-    distance: Positive = setting(8.0, "largest distance of the two places by the present estimate, m")
-    path: Positive = setting(30.0, "least way driven between them, m")
-    every: Positive = setting(5.0, "least way between two searches, m")
-    around: Annotated[int, Range(0, 1000)] = setting(
-        4, "keyframes to either side whose scans make the map that is registered with"
+    max_distance: Positive = setting(
+        8.0, "largest distance of two keyframes that are compared, m; higher: finds loops after more drift, slower"
     )
-    surfel: Positive = setting(1.0, "voxel of that map, m")
-    spacing: Positive = setting(1.0, "a scan is thinned to this before it is registered, m")
-    overlap: Fraction = setting(0.5, "least share of the points that have a surfel")
-    residual: Positive = setting(0.3, "largest mean distance of points from their surfels, m")
-    registration: RegistrationSettings = settings_group(RegistrationSettings, "of the scan with the map")
+    min_path: Positive = setting(30.0, "least distance driven between two keyframes of a loop, m")
+    search_interval: Positive = setting(5.0, "distance driven between two searches, m")
+    map_keyframes: Annotated[int, Range(0, 1000)] = setting(
+        4, "keyframes on either side whose scans make the map for registration"
+    )
+    surfel_size: Positive = setting(1.0, "voxel size of that map, m")
+    scan_spacing: Positive = setting(1.0, "spacing of the points of a scan that is registered, m; higher: faster")
+    min_overlap: Fraction = setting(0.5, "least share of the points that have a surfel; higher: fewer, surer loops")
+    max_residual: Positive = setting(0.3, "largest mean distance of points from their surfels, m")
+    registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of the scan in the map")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +65,11 @@ def find_loops(
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
     loops, searched = [], -np.inf
     for j in range(len(clouds)):
-        earlier = np.flatnonzero(way[j] - way >= s.path)
-        if not len(earlier) or way[j] - searched < s.every:
+        earlier = np.flatnonzero(way[j] - way >= s.min_path)
+        if not len(earlier) or way[j] - searched < s.search_interval:
             continue
         distance = np.linalg.norm(places[earlier] - places[j], axis=1)
-        if distance.min() > s.distance:
+        if distance.min() > s.max_distance:
             continue
         searched = float(way[j])
         loop = _proved(clouds, world_T_lidar, int(earlier[distance.argmin()]), j, s)
@@ -80,16 +82,16 @@ def _proved(
     clouds: Sequence[FloatArray], world_T_lidar: FloatArray, i: int, j: int, s: LoopSettings
 ) -> LoopClosure | None:
     i_T_world = inverse_transform(world_T_lidar[i])
-    surfels = SurfelMap(s.surfel, reach=np.inf)
-    for k in range(max(0, i - s.around), min(j, i + s.around + 1)):
+    surfels = SurfelMap(s.surfel_size, reach=np.inf)
+    for k in range(max(0, i - s.map_keyframes), min(j, i + s.map_keyframes + 1)):
         surfels.add(transform_points(i_T_world @ world_T_lidar[k], clouds[k]), np.zeros(3))
-    points = clouds[j][voxel_downsample(clouds[j], s.spacing)]
+    points = clouds[j][voxel_downsample(clouds[j], s.scan_spacing)]
     start = i_T_world @ world_T_lidar[j]
     try:
-        rough = register(points, surfels, start, 3 * s.surfel, 1.0, s.registration)
-        found = register(points, surfels, rough.map_T_scan, s.surfel, 0.1, s.registration)
+        rough = register(points, surfels, start, 3 * s.surfel_size, 1.0, s.registration)
+        found = register(points, surfels, rough.map_T_scan, s.surfel_size, 0.1, s.registration)
     except RegistrationError:
         return None
-    if not found.converged or found.pairs < s.overlap * len(points) or found.residual > s.residual:
+    if not found.converged or found.pairs < s.min_overlap * len(points) or found.residual > s.max_residual:
         return None
     return LoopClosure(i, j, found.map_T_scan, found.covariance)

@@ -42,19 +42,23 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class OdometrySettings(Settings):
-    """Sizes for a vehicle among houses; halve `surfel` indoors."""
+    """Sizes for a vehicle among houses; halve `surfel_size` indoors."""
 
-    nearest: Positive = setting(3.0, "points nearer than this are the vehicle's own, m")
-    reach: Positive = setting(100.0, "points and surfels farther than this are left out, m")
-    surfel: Positive = setting(1.0, "voxel of the local map, m")
-    map_spacing: Positive = setting(0.25, "a scan is thinned to this before it goes into the map, m")
-    scan_spacing: Positive = setting(1.5, "and to this before it is registered, m")
-    first_deviation: Positive = setting(1.0, "of the first motion from standing still, m")
-    deviation_floor: Positive = setting(0.1, "sigma is never below this, m")
-    keyframe_distance: Positive = setting(0.5, "a scan this far from the last keyframe is the next, m")
-    keyframe_rotation: Positive = setting(0.05, "or turned by this, rad")
+    min_range: Positive = setting(3.0, "ignore nearer points, which are on the vehicle, m")
+    max_range: Positive = setting(100.0, "ignore points and surfels further away, m")
+    surfel_size: Positive = setting(1.0, "voxel size of the local map, m; usual 0.5 to 1")
+    map_spacing: Positive = setting(0.25, "spacing of the points that enter the map, m")
+    scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
+    first_deviation: Positive = setting(1.0, "standard deviation of the first motion, m")
+    deviation_floor: Positive = setting(
+        0.1, "least standard deviation of the prediction, m; higher: a wider search for pairs"
+    )
+    keyframe_distance: Positive = setting(
+        0.5, "distance from the last keyframe that makes a scan the next one, m; lower: a denser graph"
+    )
+    keyframe_rotation: Positive = setting(0.05, "rotation from the last keyframe that makes a scan the next one, rad")
     lost_deviation: Positive = setting(1.0, "standard deviation of a motion that was only predicted, m and rad")
-    registration: RegistrationSettings = settings_group(RegistrationSettings, "of a scan with the map")
+    registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of a scan in the map")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,7 @@ class LidarOdometry:
 
     def __init__(self, settings: OdometrySettings | None = None) -> None:
         self.settings = settings or OdometrySettings()
-        self._map = SurfelMap(self.settings.surfel, self.settings.reach)
+        self._map = SurfelMap(self.settings.surfel_size, self.settings.max_range)
         self._last: OdometryStep | None = None
         self._keyframe = np.eye(4)
         self._velocity = np.zeros(6)  # rad/s, m/s, in the sensor's frame
@@ -96,7 +100,7 @@ class LidarOdometry:
     def step(self, scan: Scan, timestamp: float) -> OdometryStep:
         """Place the next scan. Raises `InputError` for one that is not later than the one before."""
         s, last = self.settings, self._last
-        scan = scan.within(s.nearest, s.reach)
+        scan = scan.within(s.min_range, s.max_range)
         if scan.time is not None:
             scan = deskewed(scan, self._velocity)
         if last is None:
@@ -119,7 +123,7 @@ class LidarOdometry:
         points = scan.points[voxel_downsample(scan.points, s.scan_spacing)]
         sigma = self.deviation
         try:
-            found = register(points, self._map, predicted, s.surfel + 3 * sigma, 0.1, s.registration)
+            found = register(points, self._map, predicted, s.surfel_size + 3 * sigma, 0.1, s.registration)
         except RegistrationError as error:
             _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
             return OdometryStep(timestamp, predicted, np.eye(6) * s.lost_deviation**2, scan, False, None)

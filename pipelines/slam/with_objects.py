@@ -82,7 +82,7 @@ def with_objects(
         result,
         trajectory=Trajectory(scans.timestamps, poses),
         covariances=estimate.pose_covariances[at],
-        landmarks=known[0].landmarks(estimate.solution, s.mapper.confirm),
+        landmarks=known[0].landmarks(estimate.solution, s.mapper.confirm_after),
         world_T_lidar=estimate.world_T_ego[at],
     )
     if lag is not None:

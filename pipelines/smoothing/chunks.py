@@ -21,12 +21,12 @@ from saga_fg.types.frame import Frame
 
 @dataclass(frozen=True)
 class ChunkSettings(Settings):
-    """How a long recording is cut."""
+    """Lengths of the chunks of a long recording."""
 
-    length: Positive = setting(30.0, "of a chunk, s")
-    margin: Positive = setting(7.0, "that is smoothed with it at either end, s")
-    detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "a chunk that has so many is long enough")
-    shortest: NonNegative = setting(5.0, "and is cut then, though not shorter than this, s")
+    length: Positive = setting(30.0, "length of a chunk, s; higher: more memory")
+    margin: Positive = setting(7.0, "time smoothed beyond either end of a chunk, s")
+    detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "number of detections that ends a chunk early")
+    shortest: NonNegative = setting(5.0, "least length of a chunk that ends early, s")
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,14 @@ from saga_fg.types.sensor import Sensor
 
 @dataclass(frozen=True)
 class SmoothConfig:
-    """Everything that shapes labels: the online pass by `tracking`, the rest by `smoothing`."""
+    """Configuration of labels: the online pass in `tracking`, the rest in `smoothing`."""
 
-    tracking: TrackConfig = settings_group(TrackConfig, "the online pass: trackers and sensors")
+    tracking: TrackConfig = settings_group(TrackConfig, "online pass: trackers and sensors")
     sensors: Mapping[str, Sensor] = settings_group(
         lambda: {DEFAULT: Sensor()},
-        "the sensors' models offline, where noise weighs near against far and need not leave room for association",
+        "models of the sensors offline, with noise as measured, without margin for association",
     )
-    smoothing: SmoothingSettings = settings_group(SmoothingSettings, "what makes labels of its tracks")
+    smoothing: SmoothingSettings = settings_group(SmoothingSettings, "smoothing of its tracks to labels")
 
 
 def load_smooth_config(family: str | Path, path: Path | None = None) -> SmoothConfig:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipelines.smoothing.labelling import LabelledStates
+from pipelines.smoothing.labelling import LabelColumns, LabelledStates
 from pipelines.smoothing.object_summaries import ObjectSummaries
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing import Labels, SmoothingSettings, quality_of
-from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
-from saga_fg.types.track import Tracks
+
+_FINAL = ("size", "score", "quality")  # columns that are known at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,22 +54,13 @@ class LabelSpool:
         spans = [labelled.states.at(moment) for moment in at.tolist()]
         rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
         ids = labelled.states.id[rows].tolist()
-        mean, P = labelled.states.mean[rows], labelled.states.covariance[rows]
+        columns = replace(labelled.columns.select(rows), id=np.array([names[id_] for id_ in ids], dtype=np.int64))
         np.savez(
             self._folder / f"{self._chunks:06d}.npz",
             time=wanted,
             bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
-            id=np.array([names[id_] for id_ in ids], dtype=np.int64),
             sign=np.array([signs[id_] for id_ in ids], dtype=np.float64),
-            label=labelled.label[rows],
-            position=labelled.position[rows],
-            yaw=labelled.headings.yaw[rows],
-            yaw_variance=labelled.headings.variance[rows],
-            velocity=mean[:, 2:],
-            position_covariance=labelled.position_covariance[rows],
-            velocity_covariance=P[:, 2:, 2:],
-            coasting=labelled.coasting[rows],
-            source=labelled.source[rows],
+            **{name: column for name, column in vars(columns).items() if name not in _FINAL},
         )
         self._chunks += 1
 
@@ -90,22 +82,13 @@ class LabelSpool:
             with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as columns:
                 yield self._complete(dict(columns), self._attributes)
 
-    def _complete(
-        self, column: Mapping[str, np.ndarray], attributes: _AttributeTable
-    ) -> tuple[Scene, tuple[Labels, ...]]:
-        at = np.searchsorted(attributes.id, column["id"])
-        score, P = attributes.score[at], column["position_covariance"]
-        yaw = wrap_angle(column["yaw"] + np.pi * (column["sign"] < 0) + attributes.turn[at])
-        boxes = Boxes(column["label"], column["position"], attributes.size[at], yaw, column["velocity"])
-        quality = quality_of(score, P, self._settings.quality)
-        times = column["time"]
-        moments = []
-        for time, (a, b) in zip(times.tolist(), pairwise(column["bounds"].tolist()), strict=True):
-            rows = slice(a, b)
-            tracks = Tracks(
-                time, column["id"][rows], boxes.select(rows), score[rows], P[rows],
-                column["velocity_covariance"][rows], column["coasting"][rows],
-            )  # fmt: skip
-            moments.append(Labels(tracks, column["yaw_variance"][rows], column["source"][rows], quality[rows]))
-        scene = Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ())
-        return scene, tuple(moments)
+    def _complete(self, stored: dict[str, Any], attributes: _AttributeTable) -> tuple[Scene, tuple[Labels, ...]]:
+        times, bounds, sign = (stored.pop(name) for name in ("time", "bounds", "sign"))
+        at = np.searchsorted(attributes.id, stored["id"])
+        score = attributes.score[at]
+        quality = quality_of(score, stored["position_covariance"], self._settings.quality)
+        stored["yaw"] = wrap_angle(stored["yaw"] + np.pi * (sign < 0) + attributes.turn[at])
+        columns = LabelColumns(**stored, size=attributes.size[at], score=score, quality=quality)
+        spans = zip(times.tolist(), pairwise(bounds.tolist()), strict=True)
+        moments = tuple(columns.select(slice(a, b)).labels(time) for time, (a, b) in spans)
+        return Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ()), moments

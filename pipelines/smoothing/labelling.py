@@ -8,6 +8,7 @@ import numpy as np
 
 from pipelines.smoothing.passes import SmoothedObjects
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
 from saga_fg.smoothing import (
     Evidence,
     Headings,
@@ -32,36 +33,42 @@ HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, 
 
 
 @dataclass(frozen=True, eq=False)
-class LabelledStates:
-    """Attributes of the labels of R states: position (R, 3) in the world, size (R, 3), headings, position_covariance
-    (R, 2, 2), coasting (R,) s, label, score, source and quality (R,)."""
+class LabelColumns(Columns):
+    """Columns of R labels; positions (R, 3) in the world, other shapes and units as in `Tracks` and `Labels`."""
 
-    states: StateTable
+    id: IntArray
     label: StrArray
     position: FloatArray
     size: FloatArray
-    headings: Headings
+    yaw: FloatArray
+    yaw_variance: FloatArray
+    velocity: FloatArray
     position_covariance: FloatArray
+    velocity_covariance: FloatArray
     coasting: FloatArray
     score: FloatArray
     source: StrArray
     quality: StrArray
 
+    def labels(self, time: float) -> Labels:
+        """All rows as the labels of one moment, at `time` s."""
+        boxes = Boxes(self.label, self.position, self.size, self.yaw, self.velocity)
+        P, P_velocity = self.position_covariance, self.velocity_covariance
+        tracks = Tracks(time, self.id, boxes, self.score, P, P_velocity, self.coasting)
+        return Labels(tracks, self.yaw_variance, self.source, self.quality)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledStates:
+    """R smoothed states, their headings, and their labels as columns."""
+
+    states: StateTable
+    headings: Headings
+    columns: LabelColumns
+
     def at(self, moment: int, time: float) -> Labels:
         """The labels of a moment of the evidence, which is at `time` s."""
-        there = self.states.at(moment)
-        mean, P = self.states.mean[there], self.states.covariance[there]
-        found = Boxes(self.label[there], self.position[there], self.size[there], self.headings.yaw[there], mean[:, 2:])
-        tracks = Tracks(
-            time,
-            self.states.id[there],
-            found,
-            self.score[there],
-            self.position_covariance[there],
-            P[:, 2:, 2:],
-            self.coasting[there],
-        )
-        return Labels(tracks, self.headings.variance[there], self.source[there], self.quality[there])
+        return self.columns.select(self.states.at(moment)).labels(time)
 
 
 def label_moments(
@@ -90,15 +97,27 @@ def label_states(
     yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "position_bias")
     turning = yaw_drift**2 * duration
     turning = np.where(_is_stationary(objects), 1e-6, turning)
-    (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "motion_heading")
+    (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "min_heading_speed")
     headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
-    position = np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1)
     score = objects.score[owner]
-    source = _sources(evidence, objects, wanted)
-    quality = quality_of(score, P, settings.quality)
-    return LabelledStates(states, label, position, size[owner], headings, P, gap, score, source, quality)
+    columns = LabelColumns(
+        states.id,
+        label,
+        np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1),
+        size[owner],
+        headings.yaw,
+        headings.variance,
+        states.mean[:, 2:],
+        P,
+        states.covariance[:, 2:, 2:],
+        gap,
+        score,
+        _sources(evidence, objects, wanted),
+        quality_of(score, P, settings.quality),
+    )
+    return LabelledStates(states, headings, columns)
 
 
 def count_labels(

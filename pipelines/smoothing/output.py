@@ -1,4 +1,4 @@
-"""What a run of smoothing leaves: a folder of labels.
+"""Output of a run of smoothing: a folder of labels.
 
 labels.csv       a row per box (or .ndjson, .parquet)
 summary.json     how many boxes of each scene were observed, filled, extended and dropped
@@ -48,7 +48,7 @@ def write_labels(
 def write_streamed_labels(
     directory: str | Path, smooth: Callable[[Path], Iterable[StreamedScene]], suffix: str = ".csv"
 ) -> tuple[StreamedScene, ...]:
-    """The same of recordings that are smoothed as they are read; `smooth` is called with a folder for their spools."""
+    """Write the labels of recordings smoothed as they are read; `smooth` is called with a folder for their spools."""
     with atomic_directory(directory) as folder, TemporaryDirectory(dir=folder) as spools:
         done = tuple(smooth(Path(spools)))
         write_label_table(folder / f"labels{suffix}", chain.from_iterable(run.spool.labels() for run in done))

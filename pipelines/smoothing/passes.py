@@ -121,14 +121,14 @@ def smooth_objects(
     passes = _Passes(evidence, settings, tracker, providers)
     label, moment = evidence.boxes.label, evidence.moment
     everything = lifespans_of(track_of, label, moment)
-    ahead = max(settings.extension, settings.joining.max_gap)
+    ahead = max(settings.extension, settings.stitching.max_gap)
     states = passes.alone(everything, track_of, ahead)
-    score = evidence_scores(evidence, track_of, everything, states.within(everything), settings.prior_time)
+    score = evidence_scores(evidence, track_of, everything, states.within(everything), settings.prior_opportunity_time)
     weak = everything.select(score < TRACKLET_SHARE * settings.min_score)
     tracklets = everything.select(score >= TRACKLET_SHARE * settings.min_score)
     track_of = np.where(np.isin(track_of, tracklets.id), track_of, -1)
     states = passes.coupled(tracklets, track_of, ahead, states.select(np.isin(states.id, tracklets.id)))
-    first = stitch_tracklets(tracklets, states, passes.velocity_prior(tracklets), evidence, settings.joining)
+    first = stitch_tracklets(tracklets, states, passes.velocity_prior(tracklets), evidence, settings.stitching)
     object_of = track_of.copy()
     tracked = np.flatnonzero(track_of >= 0)
     object_of[tracked] = first[tracklets.rows_of(track_of[tracked])]
@@ -136,10 +136,12 @@ def smooth_objects(
     joined = lifespans_of(object_of, label, moment)
     states = passes.alone(joined, object_of, settings.extension)
     states = passes.coupled(joined, object_of, settings.extension, states)
-    object_of = assign_free_detections(evidence, object_of, joined, states, settings.claim, MAX_FREE_DISTANCE)
+    object_of = assign_free_detections(
+        evidence, object_of, joined, states, settings.association_gate, MAX_FREE_DISTANCE
+    )
     lifespans = lifespans_of(object_of, label, moment)
     within = states.within(lifespans)
-    score = evidence_scores(evidence, object_of, lifespans, within, settings.prior_time)
+    score = evidence_scores(evidence, object_of, lifespans, within, settings.prior_opportunity_time)
     kept = score >= settings.min_score
     object_of = np.where(np.isin(object_of, lifespans.id[kept]), object_of, -1)
     stationary = stationary_states(within, lifespans, evidence, object_of, settings.stationary, settings.classes)
@@ -187,7 +189,7 @@ class _Passes:
         return smooth_states(self.evidence, object_of, longer, self.velocity_prior(longer), self.settings.classes)
 
     def coupled(self, lifespans: Lifespans, object_of: IntArray, ahead: float, states: StateTable) -> StateTable:
-        """The same states with the edges that follow from given ones."""
+        """States as by `alone`, with the edges that follow from given states."""
         if not self.tracker.edges:
             return states
         longer = lifespans.reaching(self.evidence.times, self.settings.extension, ahead)
@@ -218,4 +220,4 @@ class _Passes:
         yaw = np.full(len(lifespans), np.nan)
         known = np.isfinite(boxes.yaw[rows])
         yaw[owner[known]] = boxes.yaw[rows[known]]
-        return SmoothedEdges.of(self.tracker.edges, self.tracker.explained_noise, lifespans, states, yaw, size[:, 0])
+        return SmoothedEdges(self.tracker.edges, self.tracker.explained_noise, lifespans, states, yaw, size[:, 0])

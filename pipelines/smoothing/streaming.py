@@ -142,7 +142,7 @@ class _Run:
             self._track(np.inf)
             self._smooth(np.inf)
             self._summaries.close(np.empty(0, dtype=np.int64))
-        self._spool.finish(self._summaries, self._config.smoothing.prior_time * self._sums.rate)
+        self._spool.finish(self._summaries, self._config.smoothing.prior_opportunity_time * self._sums.rate)
         counts = replace(self._sums.counts, objects=len(self._summaries.ids), joined=self._identities.joined)
         return StreamedScene(self._name, counts, frames, cpu + time.perf_counter() - begin, self._spool)
 
@@ -223,7 +223,7 @@ class _Run:
             self._spool.add(wanted, at, labelled, names, signs)
         begun = [(at[:1] <= gone.first) & (gone.first <= at[-1:]) for gone in objects.dropped]
         new = LabelCounts(
-            **source_counts(labelled.source[emitted]),
+            **source_counts(labelled.columns.source[emitted]),
             dropped=dropped_boxes(evidence, objects, wanted),
             dropped_objects=sum(int(each.sum()) for each in begun),
         )

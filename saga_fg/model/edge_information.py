@@ -41,8 +41,7 @@ class EdgeInformation(Settings):
         0.5, "standard deviation of the difference between the velocities of a pair, m/s; higher: edges gain less"
     )
     unseen_acceleration: NonNegative = setting(
-        0.0,
-        "growth of the velocity deviation of undetected objects, m/s^2; higher: edges out of them gain less",
+        0.0, "growth of the velocity deviation of undetected objects, m/s^2; higher: edges out of them gain less"
     )
 
     def gains(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:

@@ -63,8 +63,7 @@ class Neighbours(Settings):
         SharedVelocity, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        0.3,
-        "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6",
+        0.3, "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6"
     )
     distance_scale: PositiveOrInf = setting(8.0, "sigma of the kernel on the distance, m; .inf: no kernel")
     heading_scale: PositiveOrInf = setting(
@@ -115,8 +114,7 @@ class Following(Settings):
         CarFollowing, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        0.5,
-        "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1",
+        0.5, "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1"
     )
     max_gap: NonNegative = setting(40.0, "no edge from a leader further ahead than this, centre to centre, m")
     gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m; .inf: no kernel")

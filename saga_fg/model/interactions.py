@@ -92,8 +92,7 @@ class SharedVelocity:
 
     needs: ClassVar[Needs] = (VELOCITY, VELOCITY)
     along_heading: bool = setting(
-        False,
-        "true: turn the neighbour's velocity by the difference of headings, for queues in bends",
+        False, "true: turn the neighbour's velocity by the difference of headings, for queues in bends"
     )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:

@@ -59,8 +59,7 @@ class ConstantVelocity(Settings):
     """White noise acceleration in the plane (Bar-Shalom, Li, Kirubarajan 2001, section 6.2.2)."""
 
     acceleration_noise: NonNegative = setting(
-        1.0,
-        "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3; higher: follows detections faster",
+        1.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3; higher: follows detections faster"
     )
 
     @property

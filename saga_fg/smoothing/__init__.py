@@ -23,11 +23,11 @@ from saga_fg.smoothing.evidence import (
 from saga_fg.smoothing.labels import LabelCounts, Labels, Quality, Source, quality_of
 from saga_fg.smoothing.random_walk import scalar_readings, smooth_walks
 from saga_fg.smoothing.settings import (
-    JoiningSettings,
     OfflineClass,
     QualitySettings,
     SmoothingSettings,
     StationarySettings,
+    StitchingSettings,
 )
 from saga_fg.smoothing.states import Lifespans, StateTable, lifespans_of
 from saga_fg.smoothing.stationarity import StationaryStates, stationary_states
@@ -36,7 +36,6 @@ __all__ = [
     "Evidence",
     "EvidenceFrame",
     "Headings",
-    "JoiningSettings",
     "LabelCounts",
     "Labels",
     "Lifespans",
@@ -49,6 +48,7 @@ __all__ = [
     "StateTable",
     "StationarySettings",
     "StationaryStates",
+    "StitchingSettings",
     "assign_detections",
     "assign_free_detections",
     "constant_sizes",

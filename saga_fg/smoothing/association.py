@@ -12,7 +12,7 @@ Tracklets are stitched: an end i and a later beginning j, extended towards each 
 moment j begins with the difference d of their states. That they are one object rather than that i left unseen and j is
 new costs
 
-    1/2 d^T S^-1 d + 1/2 log |2 pi S| + miss * frames - ( -log(new_objects) + 1/2 log |2 pi V| ),   S = P_i + P_j
+    1/2 d^T S^-1 d + 1/2 log |2 pi S| + miss_cost * frames + log(new_object_density) - 1/2 log |2 pi V|,   S = P_i + P_j
 
 nats, with V the covariance of the velocity of a new object and `frames` the frames in the gap that should have shown
 it; pairs are stitched where that is negative in total. Objects are chains of tracklets that do not overlap, so that the
@@ -28,7 +28,7 @@ from scipy.optimize import linear_sum_assignment
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.settings import JoiningSettings
+from saga_fg.smoothing.settings import StitchingSettings
 from saga_fg.smoothing.states import Lifespans, StateTable
 
 
@@ -89,7 +89,7 @@ def assign_free_detections(
 
 
 def stitch_tracklets(
-    seen: Lifespans, states: StateTable, velocity_prior: FloatArray, evidence: Evidence, settings: JoiningSettings
+    seen: Lifespans, states: StateTable, velocity_prior: FloatArray, evidence: Evidence, settings: StitchingSettings
 ) -> IntArray:
     """(n,) the object of each tracklet: the id of the first tracklet of its chain.
 
@@ -106,8 +106,8 @@ def stitch_tracklets(
     d = states.mean[a] - states.mean[b]
     S = states.covariance[a] + states.covariance[b]
     d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[..., None])[..., 0])
-    cost = (d2 + _log_det(S)) / 2 + settings.miss * _opportunities_between(evidence, seen, states, end, begin)
-    cost -= _log_det(velocity_prior[begin]) / 2 - np.log(settings.new_objects)
+    cost = (d2 + _log_det(S)) / 2 + settings.miss_cost * _opportunities_between(evidence, seen, states, end, begin)
+    cost -= _log_det(velocity_prior[begin]) / 2 - np.log(settings.new_object_density)
     cost[d2 > gate(settings.gate, 4)] = np.inf
     gain = np.zeros((len(seen), len(seen)))
     gain[end, begin] = np.minimum(cost, 0.0)

@@ -103,7 +103,9 @@ def _epochs(
         if k > begin:
             graph = graph_of(k - 1, lifespans.id[present], tuple(types[i] for i in present.tolist()))
             still = stationary.at(k - 1, graph.nodes) & stationary.at(k, graph.nodes)
-            graph = replace(graph, diffusion_scale=np.where(still, stationary.settings.noise, graph.diffusion_scale))
+            graph = replace(
+                graph, diffusion_scale=np.where(still, stationary.settings.noise_scale, graph.diffusion_scale)
+            )
             transition = discretise(graph, float(evidence.times[k] - evidence.times[k - 1]))
         born = np.flatnonzero(lifespans.first == k)
         P = np.zeros((len(born), 4, 4))
@@ -114,7 +116,7 @@ def _epochs(
         measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
         pinned = lifespans.id[present][stationary.at(k, lifespans.id[present])]
         if len(pinned):
-            H, R = types[0].selector(VELOCITY), stationary.settings.velocity**2 * np.eye(2)
+            H, R = types[0].selector(VELOCITY), stationary.settings.velocity_deviation**2 * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lifespans.last[present] == k
         yield Epoch(k, transition, births, measured, lifespans.id[present[gone]])

@@ -1,13 +1,14 @@
-"""The edges of a recording, from states that know its future: the tracker's rules at smoothed estimates.
+"""Edges of a recording: the tracker's rules at smoothed estimates, which use its future too.
 
-An online edge follows from what was known when it was drawn; offline the same rules see every object where it turned
-out to be, and whether it ever moves.
+An online edge depends on the estimates of its time; offline the same rules get smoothed positions, and whether an
+object ever moves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,7 +27,7 @@ FACING = 1.0  # speed from which an object heads where it moves, m/s
 class SmoothedEdges:
     """Graphs by edge rules at smoothed states; called with a moment, the ids of the objects there and their types.
 
-    yaw (n,) and length (n,) of the lifespans' objects: what a detector says, NaN where unknown
+    yaw (n,) and length (n,) of the objects by their detections, NaN where unknown
     """
 
     rules: Sequence[EdgeRule]
@@ -35,23 +36,14 @@ class SmoothedEdges:
     states: StateTable
     yaw: FloatArray
     length: FloatArray
-    has_moved: BoolArray
 
-    @classmethod
-    def of(
-        cls,
-        rules: Sequence[EdgeRule],
-        explained_noise: float,
-        lifespans: Lifespans,
-        states: StateTable,
-        yaw: FloatArray,
-        length: FloatArray,
-    ) -> SmoothedEdges:
-        """With `has_moved` from the states."""
-        speed = np.hypot(*states.mean[:, 2:].T)
-        sigma = np.sqrt(np.trace(states.covariance[:, 2:, 2:], axis1=1, axis2=2) / 2)
-        moving = states.id[(speed > MOVING) & (speed > 3 * sigma)]
-        return cls(rules, explained_noise, lifespans, states, yaw, length, np.isin(lifespans.id, moving))
+    @cached_property
+    def has_moved(self) -> BoolArray:
+        """(n,) which objects are ever clearly in motion."""
+        speed = np.hypot(*self.states.mean[:, 2:].T)
+        sigma = np.sqrt(np.trace(self.states.covariance[:, 2:, 2:], axis1=1, axis2=2) / 2)
+        moving = self.states.id[(speed > MOVING) & (speed > 3 * sigma)]
+        return np.isin(self.lifespans.id, moving)
 
     def __call__(self, moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGraph:
         at = self.states.rows_of(np.full(len(ids), moment), ids)

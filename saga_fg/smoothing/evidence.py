@@ -88,7 +88,7 @@ def gather_evidence(
     sensors: Mapping[str, Sensor],
     classes: Mapping[str, ClassSettings],
 ) -> Evidence:
-    """The table of a recording's frames, in order of measurement.
+    """Build the table of a recording's frames, in order of measurement.
 
     wanted (M,): times at which boxes are wanted, s
     """
@@ -125,7 +125,7 @@ def gather_evidence(
 
 
 def measured_in_order(frames: Sequence[Frame], sensors: Mapping[str, Sensor]) -> list[tuple[float, Frame]]:
-    """The frames with their times of measurement (s), in that order: offline, no frame is late."""
+    """Sort frames by their times of measurement (s), which are returned with them: offline, no frame is late."""
     timed = [(frame.timestamp + sensor_model(sensors, frame.sensor).time_offset, frame) for frame in frames]
     return sorted(timed, key=lambda pair: pair[0])
 
@@ -141,15 +141,15 @@ def _origin(frames: Sequence[Frame]) -> FloatArray:
 
 
 def evidence_scores(
-    evidence: Evidence, object_of: IntArray, lifespans: Lifespans, states: StateTable, prior_time: float
+    evidence: Evidence, object_of: IntArray, lifespans: Lifespans, states: StateTable, prior_opportunity_time: float
 ) -> FloatArray:
-    """(n,) scores in [0, 1). prior_time: of the prior's opportunities at the rate of this recording's frames, s."""
+    """(n,) scores in [0, 1). prior_opportunity_time: of missed opportunities that every object starts with, s."""
     rows = np.flatnonzero(object_of >= 0)
     owner = lifespans.rows_of(object_of[rows])
     total = np.bincount(owner, evidence.probability[rows], minlength=len(lifespans))
     seen = np.bincount(owner, minlength=len(lifespans))
     count = np.maximum(opportunities(evidence, lifespans, states), seen)
-    return np.asarray(total / (count + prior_time * frame_rate(evidence)))
+    return np.asarray(total / (count + prior_opportunity_time * frame_rate(evidence)))
 
 
 def opportunities(evidence: Evidence, lifespans: Lifespans, states: StateTable) -> IntArray:

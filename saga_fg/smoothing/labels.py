@@ -1,4 +1,4 @@
-"""What offline smoothing says of one moment: tracks, and for each box where it comes from and how good it is."""
+"""The labels of one moment: tracks, and the source and quality of each box."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Labels:
 
 @dataclass(frozen=True)
 class LabelCounts:
-    """How many boxes of a recording were observed, filled and extended, and how many went with their objects; objects
-    kept, objects dropped, and tracklets that were joined to another."""
+    """Numbers of boxes of a recording that were observed, filled and extended, and dropped with their objects; of
+    objects kept and dropped, and of tracklets stitched to another."""
 
     observed: int = 0
     filled: int = 0
@@ -69,7 +69,7 @@ class LabelCounts:
 
     @classmethod
     def sum(cls, counts: Iterable[LabelCounts]) -> Self:
-        """Of several recordings together."""
+        """Add up several recordings."""
         parts = list(counts)
         return cls(*(sum(getattr(part, name) for part in parts) for name in cls.__dataclass_fields__))
 

@@ -24,18 +24,24 @@ from saga_fg.types.by_class import DEFAULT
 
 @dataclass(frozen=True)
 class OfflineClass(Settings):
-    """How objects of one class are smoothed."""
+    """Smoothing of the objects of one class."""
 
-    acceleration_noise: Positive = setting(1.0, "spectral density of the acceleration, m^2/s^3")
+    acceleration_noise: Positive = setting(
+        1.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 2; lower: smoother paths"
+    )
     position_bias: NonNegative = setting(
-        0.1, "standard deviation of the part of a detector's position errors that lasts over a track, m"
+        0.1, "standard deviation of the error that all detections of one object share, m"
     )
-    motion_heading: Positive = setting(2.0, "speed from which the direction of motion tells the heading, m/s")
-    stand_speed: NonNegative = setting(0.5, "smoothed speed below which an object may stand, m/s")
-    stand_drift: NonNegative = setting(
-        0.5, "how far measured positions may drift from the beginning to the end of a stand, m"
+    min_heading_speed: Positive = setting(2.0, "speed from which the direction of motion gives the heading, m/s")
+    stationary_speed: NonNegative = setting(
+        0.5, "smoothed speed below which an object may be stationary, m/s; usual 0.1 to 1"
     )
-    yaw_drift: NonNegative = setting(0.2, "how fast the heading changes, standard deviation after one second, rad")
+    stationary_drift: NonNegative = setting(
+        0.5, "largest drift of the measured positions while an object is stationary, m; usual 0.1 to 1"
+    )
+    yaw_drift: NonNegative = setting(
+        0.2, "standard deviation of the change of heading in one second, rad; lower: smoother headings"
+    )
 
     @property
     def motion(self) -> ConstantVelocity:
@@ -44,60 +50,72 @@ class OfflineClass(Settings):
 
 
 @dataclass(frozen=True)
-class JoiningSettings(Settings):
+class StitchingSettings(Settings):
     """When two tracklets are one object."""
 
-    max_gap: NonNegative = setting(3.0, "longest time between the end of one and the beginning of the other, s")
-    new_objects: Positive = setting(0.005, "how densely objects appear that were not there before, per m^2")
-    miss: NonNegative = setting(0.3, "cost of a frame in the gap that should have shown the object, nats")
-    gate: Fraction = setting(0.999, "share of true pairs that the chi-square gate lets through")
+    max_gap: NonNegative = setting(
+        3.0, "longest gap between two tracklets of one object, s; higher: more links, right and wrong"
+    )
+    new_object_density: Positive = setting(0.005, "density of objects that appear anew, 1/m^2; higher: fewer links")
+    miss_cost: NonNegative = setting(
+        0.3, "cost of a frame in the gap that should have shown the object, nats; higher: fewer links"
+    )
+    gate: Fraction = setting(0.999, "gate probability: share of true links inside the chi-square gate")
 
 
 @dataclass(frozen=True)
 class StationarySettings(Settings):
-    """Objects that stand still (see the classes for how slow that is), and how firmly they are pinned."""
+    """Intervals in which objects are stationary, and how firmly they are held."""
 
-    min_time: NonNegative = setting(1.0, "shortest time it stands, s")
-    velocity: Positive = setting(0.02, "standard deviation of its velocity meanwhile, m/s")
-    noise: Positive = setting(1e-4, "factor on the process noise meanwhile")
+    min_time: NonNegative = setting(1.0, "shortest stationary interval, s")
+    velocity_deviation: Positive = setting(0.02, "standard deviation of the velocity while stationary, m/s")
+    noise_scale: Positive = setting(1e-4, "factor on the process noise while stationary")
 
 
 @dataclass(frozen=True)
 class QualitySettings(Settings):
-    """The classes of quality of a box: the first whose conditions it fulfils, else low."""
+    """Quality of a box: the first class whose conditions it meets, else low."""
 
     high_score: Fraction = setting(0.5, "least score of a box of high quality")
-    high_deviation: PositiveOrInf = setting(0.3, "largest standard deviation of its position in any direction, m")
+    high_deviation: PositiveOrInf = setting(
+        0.3, "largest standard deviation of the position of a box of high quality, m"
+    )
     medium_score: Fraction = setting(0.2, "least score of a box of medium quality")
-    medium_deviation: PositiveOrInf = setting(0.8, "largest standard deviation of its position in any direction, m")
+    medium_deviation: PositiveOrInf = setting(
+        0.8, "largest standard deviation of the position of a box of medium quality, m"
+    )
 
 
 @dataclass(frozen=True)
 class SmoothingSettings(Settings):
-    """Everything that turns online tracks into labels."""
+    """All settings that turn online tracks into labels."""
 
     classes: Mapping[str, OfflineClass] = settings_group(
-        lambda: {DEFAULT: OfflineClass()}, "by class; the entry named default serves all others"
+        lambda: {DEFAULT: OfflineClass()}, "settings by class of object; the entry named default serves all others"
     )
-    joining: JoiningSettings = settings_group(JoiningSettings, "joining of tracklets across gaps")
-    stationary: StationarySettings = settings_group(StationarySettings, "objects that stand still")
+    stitching: StitchingSettings = settings_group(StitchingSettings, "linking of tracklets across gaps")
+    stationary: StationarySettings = settings_group(StationarySettings, "stationary objects")
     loss: Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"] = setting(
         "huber", "robust loss of the detections"
     )
-    loss_scale: Positive = setting(2.0, "residual from which the loss differs from a square, standard deviations")
+    loss_scale: Positive = setting(
+        2.0, "residual from which the loss departs from a square, standard deviations; lower: outliers count less"
+    )
     providers: tuple[str | FactorProvider, ...] = setting(
-        (),
-        "factor providers as MODULE:NAME, or with settings as {kind: MODULE:NAME, ...}, asked once a moment for the "
-        "final states, made anew every time",
+        (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, for the final states"
     )
     reweightings: NonNegativeInt = setting(
-        1, "times the weights of the loss, and the edges, are found again at the final states"
+        1, "repetitions of loss weights and edges at the final states; usual 1 to 3; higher: slower"
     )
-    extension: NonNegative = setting(1.5, "how far before its birth and after its end an object is looked for, s")
-    prior_time: NonNegative = setting(1.0, "looks without a detection that every object starts with, as a time, s")
-    min_score: Fraction = setting(0.02, "objects of a lower score are dropped")
-    quality: QualitySettings = settings_group(QualitySettings, "classes of quality of a box")
-    claim: Fraction = setting(0.95, "share of true pairs let through by the gate of detections nobody had claimed")
+    extension: NonNegative = setting(
+        1.5, "time before the first and after the last detection in which an object is searched, s"
+    )
+    prior_opportunity_time: NonNegative = setting(
+        1.0, "missed opportunities that each object starts with, as a time, s; higher: short tracks score less"
+    )
+    min_score: Fraction = setting(0.02, "drop objects of a lower score; higher: fewer false objects, more misses")
+    quality: QualitySettings = settings_group(QualitySettings, "quality classes of boxes")
+    association_gate: Fraction = setting(0.95, "gate probability for detections that no track was matched to")
 
     @property
     def robust(self) -> Robust | None:

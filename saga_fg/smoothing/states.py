@@ -27,7 +27,7 @@ class Lifespans(Columns):
         return np.searchsorted(self.id, ids)
 
     def reaching(self, times: FloatArray, back: float, ahead: float) -> Self:
-        """The same, beginning up to `back` s earlier and ending up to `ahead` s later; times (K,) s, of all moments."""
+        """Extend to up to `back` s earlier and `ahead` s later; times (K,) s, of all moments."""
         first = np.searchsorted(times, times[self.first] - back)
         last = np.searchsorted(times, times[self.last] + ahead, side="right") - 1
         return replace(self, first=np.minimum(first, self.first), last=np.maximum(last, self.last))
@@ -63,7 +63,7 @@ class StateTable(Columns):
 
     @classmethod
     def of_moments(cls, parts: Sequence[tuple[int, IntArray, FloatArray, FloatArray]]) -> Self:
-        """From (moment, ids, means, covariances) of each moment in order."""
+        """Build from (moment, ids, means, covariances) of each moment in order."""
         if not parts:
             return cls(*(np.empty(0, dtype=np.int64),) * 2, np.empty((0, 4)), np.empty((0, 4, 4)))
         moment = np.repeat([k for k, *_ in parts], [len(ids) for _, ids, *_ in parts])

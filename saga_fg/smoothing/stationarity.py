@@ -1,11 +1,11 @@
 r"""Stationary objects, recognised from smoothed states and their detections.
 
-A run of moments is a halt if the smoothed speed stays below the class's `stand_speed` for at least `min_time`, and the
+A run of moments is a halt if the smoothed speed stays below `stationary_speed` for at least `min_time`, and the
 positions measured meanwhile do not drift: with the weighted regression
 
     z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2
 
-the drift |u*| T over its duration T is below the class's `stand_drift`. A parked vehicle is stationary all its life.
+the drift |u*| T over its duration T is below `stationary_drift`. A parked vehicle is stationary all its life.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def stationary_states(
     order = np.lexsort((states.moment, states.id))
     ids, moments = states.id[order], states.moment[order]
     label = lifespans.label[lifespans.rows_of(ids)]
-    stand_speed, max_drift = class_values(classes, OfflineClass, label, "stand_speed", "stand_drift")
-    slow = np.hypot(*states.mean[order, 2:].T) <= stand_speed
+    max_speed, max_drift = class_values(classes, OfflineClass, label, "stationary_speed", "stationary_drift")
+    slow = np.hypot(*states.mean[order, 2:].T) <= max_speed
     begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
     ends = np.flatnonzero(slow & np.concatenate([(ids[1:] != ids[:-1]) | ~slow[1:], [True]]))
     times = evidence.times

@@ -80,11 +80,11 @@ class Clock:
         return Clock(max(self.newest, timestamp), accepted, step)
 
     def _doubts_far(self, max_jump: float) -> bool:
-        """Whether the doubtful frame is further away than `max_jump`."""
+        """Return True if the doubtful frame is further away than `max_jump`."""
         return self.doubtful is not None and abs(self.doubtful[1] - self.newest) > max_jump
 
     def _agrees(self, timestamp: float, max_jump: float) -> bool:
-        """Whether a time fits the doubtful one: close to it, or the next of a slow stream, whose steps are alike."""
+        """Return True if a time supports the doubtful one: close to it, or the next of a slow stream of equal steps."""
         if self.doubtful is None or not self._doubts_far(max_jump):
             return False
         step = timestamp - self.doubtful[1]

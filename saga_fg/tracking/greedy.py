@@ -28,7 +28,7 @@ NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 a
 
 @dataclass(frozen=True, eq=False)
 class _Memory(Columns):
-    """n tracks: where they were last seen, and the place and time from which their velocity is measured."""
+    """n tracks at their latest detection, and the position and time from which their velocity is measured."""
 
     id: IntArray
     label: StrArray
@@ -44,7 +44,7 @@ class _Memory(Columns):
 
 @dataclass(frozen=True, eq=False)
 class GreedySnapshot:
-    """A greedy tracker at one moment: its tracks, the id of the next one, its clock, its verdict on the latest time."""
+    """A greedy tracker at one time: its tracks, the id of the next one, its clock, its verdict on the latest frame."""
 
     memory: _Memory
     next_id: int
@@ -131,15 +131,15 @@ class GreedyTracker:
 
     @property
     def max_jump(self) -> float:
-        """How far from the newest frame another has to be confirmed, s."""
+        """Distance from the newest frame from which another has to be confirmed, s."""
         return self.settings.clock.max_jump
 
     def snapshot(self) -> GreedySnapshot:
-        """All that the tracker knows, as a value."""
+        """Everything that the tracker knows, as a value."""
         return GreedySnapshot(self._memory, self._next_id, self._clock, self.time_verdict)
 
     def restore(self, snapshot: GreedySnapshot) -> None:
-        """Go on from where a tracker of the same settings was."""
+        """Continue from a snapshot of a tracker of the same settings."""
         self._memory, self._next_id, self._clock = snapshot.memory, snapshot.next_id, snapshot.clock
         self.time_verdict = snapshot.time_verdict
 

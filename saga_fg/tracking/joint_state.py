@@ -178,7 +178,7 @@ class JointTrackState:
 
     @property
     def empty(self) -> bool:
-        """Whether there is neither a track nor any other variable."""
+        """True without any track or other variable."""
         estimator = self.estimator
         others = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
         return len(estimator.nodes) + len(others) == 0

@@ -53,7 +53,7 @@ class Passages(Columns):
 
 
 class SpeedPrior(NamedTuple):
-    """Of k new tracks, each (k,): probability of being stationary; if moving, their speed ahead, and its variance."""
+    """Prior of k new tracks, each (k,): probability of being stationary; if moving, speed ahead, and its variance."""
 
     stationary: FloatArray
     speed: FloatArray

@@ -26,7 +26,7 @@ SHORT = replace(street(), duration=2.0)
 
 def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None:
     scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
-    settings = JointSettings(rounds=1, keyframe_period=0.15)
+    settings = JointSettings(passes=1, keyframe_period=0.15)
     config = load_config("simulated")
     told: list[JointBench] = []
     result = bench_joint(scenes, config, [0], settings, poles=True, so_far=told.append)

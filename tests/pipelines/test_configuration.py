@@ -264,6 +264,8 @@ def test_the_reference_names_every_key_with_default_type_and_meaning() -> None:
     text = settings_reference(WholeSettings)
     assert "A settings tree with one of everything." in text
     assert '| `mode` | `hungarian` | `greedy` or `"off"` or `hungarian` | how to assign |' in text
-    assert "## `classes.<name>.gate`" in text
-    assert "## `rules[] (kind: following_rule)`" in text
+    assert "## `classes.<name>`" in text
+    assert "`classes.<name>.gate`: the same keys and defaults as `gate`." in text
+    assert "## `rules[]`, kind `following_rule`" in text
+    assert "`chosen`, kind `distance`: the same keys and defaults as `rules[]`, kind `distance`." in text
     assert "| `lifetime` | `null` | number, or `null` | s without detection until a track ends; null: never |" in text

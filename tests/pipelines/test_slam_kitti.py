@@ -91,7 +91,7 @@ def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
     scans = SimulatedScans(0, world_T_lidar=poses)
     clouds = [scans[k].points for k in range(len(scans))]
     drift = np.array([yaw_transform(y=0.02 * k) for k in range(len(poses))])
-    (loop, *others) = find_loops(clouds, drift @ poses, LoopSettings(path=20.0))
+    (loop, *others) = find_loops(clouds, drift @ poses, LoopSettings(min_path=20.0))
     truth = inverse_transform(poses[loop.first]) @ poses[loop.second]
     assert np.linalg.norm((inverse_transform(truth) @ loop.first_T_second)[:3, 3]) < 0.6  # scans are skewed here
     assert loop.second - loop.first > 5
@@ -140,6 +140,6 @@ def test_a_wall_is_drawn_where_it_was_seen() -> None:
 
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match="overlap: expected a number from 0 to 1"):
-        LoopSettings(overlap=2.0)
+        LoopSettings(min_overlap=2.0)
     with pytest.raises(InputError, match="map_spacing: expected"):
         LidarSlamSettings(map_spacing=0.0)

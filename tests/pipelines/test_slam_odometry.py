@@ -74,8 +74,8 @@ def test_time_runs_forwards_and_settings_are_checked() -> None:
     odometry.step(scan, 1.0)
     with pytest.raises(InputError, match=r"timestamp: expected one after 1\.0"):
         odometry.step(scan, 1.0)
-    with pytest.raises(InputError, match="surfel: expected"):
-        OdometrySettings(surfel=0.0)
+    with pytest.raises(InputError, match="surfel_size: expected"):
+        OdometrySettings(surfel_size=0.0)
 
 
 def test_the_benchmark_measures_both_on_the_same_scans() -> None:

@@ -52,12 +52,12 @@ def estimate_jointly(
     path = odometry.path(start)
     slow = SlowErrors.at_start(settings)
     estimate = None
-    for _ in range(settings.rounds):
+    for _ in range(settings.passes):
         tracker = new_tracker()
         lanes = LaneKeeping(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
         record = record_epochs(frames, path, odometry, tracker, settings.motion_noise)
         stationary = stationary_probabilities(record, path, slow, settings)
-        seen = nearest_landmarks(landmarks, path, settings.landmark_reach)
+        seen = nearest_landmarks(landmarks, path, settings.max_landmark_distance)
         first = [None] if estimate is None else []
         estimate = _solved(record, path, [*first, stationary], lanes, [seen, *new_providers()], settings)
         estimate = replace(estimate, observations=seen)

@@ -142,7 +142,7 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray], setting
         names, here, there = np.intersect1d(now.objects.id, before.objects.id, return_indices=True)
         p = np.minimum(p_now[here], p_before[there])
         dt = now.time - before.time
-        variances = np.array([settings.standing_drift**2 * dt] * 2 + [settings.standing_speed**2] * 2)
+        variances = np.array([settings.stationary_drift**2 * dt] * 2 + [settings.stationary_speed**2] * 2)
         for row in np.flatnonzero(p > _LIKELY).tolist():
             name, node_type = int(names[row]), now.objects.types[int(here[row])]
             keys = object_key(before.epoch, name), object_key(now.epoch, name)

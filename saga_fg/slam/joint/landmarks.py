@@ -90,7 +90,7 @@ class WindowLandmarks:
         covariance = solution.covariance([landmark_key(number)])
         count = self._count[number]
         state = self._state(number, solution.values)
-        return Landmark(number, self._kinds[number], state, covariance, count, count >= self._settings.confirm)
+        return Landmark(number, self._kinds[number], state, covariance, count, count >= self._settings.confirm_after)
 
     def _state(self, number: int, values: gtsam.Values) -> object:
         return self._kinds[number].variable.read(values, landmark_key(number))

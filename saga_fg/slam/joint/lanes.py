@@ -91,7 +91,7 @@ class LaneKeeping:
     @property
     def rounds(self) -> int:
         """Number of assignments to make; 0 without lanes."""
-        return 0 if self._settings is None or not self._lanes else self._settings.rounds
+        return 0 if self._settings is None or not self._lanes else self._settings.passes
 
     def add_maps(self, *maps: RoadMap | None) -> None:
         """Add maps of frames, most of which bring the same one."""
@@ -167,13 +167,13 @@ def assign_lanes(
     n = np.stack([-t[..., 1], t[..., 0]], axis=-1)
     along, across = np.einsum("jmi,mi->jm", t, velocity), np.einsum("jmi,mi->jm", n, velocity)
     deviation = np.array([lane.deviation for lane in lanes])[:, None]
-    S = settings.spread**2 + deviation**2 + np.einsum("jmi,mik,jmk->jm", n, _shift(place, world_T_ego, P), n)
+    S = settings.offset_deviation**2 + deviation**2 + np.einsum("jmi,mik,jmk->jm", n, _shift(place, world_T_ego, P), n)
     off = np.stack([one.e for one in at])
     there = np.stack([on_it(lane.centre, one.s) for lane, one in zip(lanes, at, strict=True)]) & (along > 0)
     q = np.where(there, np.exp(-(off**2) / (2 * S)) / np.sqrt(2 * math.pi * S), 0.0)
-    beside = settings.elsewhere / np.array([lane.width for lane in lanes])[:, None]
+    beside = settings.off_lane_share / np.array([lane.width for lane in lanes])[:, None]
     likely = q / (q.sum(axis=0) + beside)
-    drift = settings.drift**2 + along**2 * P[2, 2]
+    drift = settings.lateral_speed_scale**2 + along**2 * P[2, 2]
     p = likely * (1 - stationary[rows]) * np.exp(-(across**2) / (2 * drift))
     found = []
     for column, j in enumerate(np.argmax(likely, axis=0).tolist()):
@@ -193,8 +193,8 @@ def lane_factors(record: Record, kept: Sequence[LaneAssignment], settings: LaneS
         for now in record
         for name, node_type in zip(now.objects.id, now.objects.types, strict=True)
     }
-    step = np.median(np.diff(sorted(times.values()))) if len(times) > 1 else settings.memory
-    variance = settings.spread**2 * max(1.0, 2 * settings.memory / float(step))
+    step = np.median(np.diff(sorted(times.values()))) if len(times) > 1 else settings.offset_time
+    variance = settings.offset_deviation**2 * max(1.0, 2 * settings.offset_time / float(step))
     present = [one for one in kept if (one.epoch, one.name) in types and one.probability > 1e-6]
     factors: list[Linearisable] = []
     for node_type, mine in by_type([types[one.epoch, one.name] for one in present]):
@@ -208,7 +208,7 @@ def lane_factors(record: Record, kept: Sequence[LaneAssignment], settings: LaneS
                 1,
                 node_type.dim,
                 (x, y),
-                robust=Robust("cauchy", _LEAVING * settings.spread / math.sqrt(variance)),
+                robust=Robust("cauchy", _LEAVING * settings.offset_deviation / math.sqrt(variance)),
             )
         )
     return factors

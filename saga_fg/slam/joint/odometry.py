@@ -28,18 +28,16 @@ from saga_fg.settings import Positive, Settings, setting
 class OdometryNoise(Settings):
     """Noise of an odometry: standard deviations."""
 
-    turn_noise: Positive = setting(0.01, "heading, rad after one second")
-    tilt_noise: Positive = setting(0.001, "roll and pitch, which gravity tells, rad after one second")
-    distance_noise: Positive = setting(0.03, "translation, m after one metre")
-    time_noise: Positive = setting(0.01, "translation, m after one second")
-    scale: Positive = setting(0.02, "scale of distances at the start")
-    scale_drift: Positive = setting(0.002, "change of the scale after one second")
-    bias: Positive = setting(0.005, "bias of the yaw rate at the start, rad/s")
-    bias_drift: Positive = setting(0.0005, "change of the bias after one second, rad/s")
-    course: Positive = setting(
-        0.01, "direction of travel against the axes in which objects are seen, at the start, rad"
-    )
-    course_drift: Positive = setting(0.0003, "change of that after one second, rad")
+    turn_noise: Positive = setting(0.01, "standard deviation of the heading after one second, rad")
+    tilt_noise: Positive = setting(0.001, "standard deviation of roll and pitch after one second, rad")
+    distance_noise: Positive = setting(0.03, "standard deviation of the translation after one metre, m")
+    time_noise: Positive = setting(0.01, "standard deviation of the translation after one second, m")
+    scale: Positive = setting(0.02, "standard deviation of the scale of distances at the start")
+    scale_drift: Positive = setting(0.002, "random walk of the scale in one second")
+    bias: Positive = setting(0.005, "standard deviation of the yaw-rate bias at the start, rad/s")
+    bias_drift: Positive = setting(0.0005, "random walk of the yaw-rate bias in one second, rad/s")
+    course: Positive = setting(0.01, "standard deviation of the course against the sensor axes at the start, rad")
+    course_drift: Positive = setting(0.0003, "random walk of that course in one second, rad")
 
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
         """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.

@@ -14,8 +14,8 @@ speed u of its class (`moving_speed`). By Bayes, with a share q of stationary ob
 
 Where T is short, S and S + (u T)^2 are nearly equal, and P is about one half; so it is for slow classes far away.
 
-Online the window ends now, T is short, and creeping queues look parked: q is `online_standing_share`, and the last term
-of S, errors of the heading, counts across the line of sight only.
+Online the window ends now, T is short, and creeping queues look parked: q is `online_stationary_share`, and the last
+term of S, errors of the heading, counts across the line of sight only.
 """
 
 from __future__ import annotations
@@ -95,16 +95,16 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
     n = len(seen.object)
     if n == 0:
         return np.empty(0)
-    far = 4 * (seen.time.max() - seen.time.min() + settings.standing_window)  # puts objects apart on one axis
+    far = 4 * (seen.time.max() - seen.time.min() + settings.stationary_window)  # puts objects apart on one axis
     axis = seen.time - seen.time.min() + far * np.unique(seen.object, return_inverse=True)[1]
-    low = np.searchsorted(axis, axis - settings.standing_window / 2, "left")
-    high = np.searchsorted(axis, axis + settings.standing_window / 2, "right")
+    low = np.searchsorted(axis, axis - settings.stationary_window / 2, "left")
+    high = np.searchsorted(axis, axis + settings.stationary_window / 2, "right")
     start = np.searchsorted(seen.object, seen.object, "left")
     end = np.searchsorted(seen.object, seen.object, "right")
     # at the ends of its lifespan the window is shifted into it
-    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.standing_window, "left"), low)
+    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.stationary_window, "left"), low)
     low = np.maximum(low, start)
-    high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.standing_window, "right"), high)
+    high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.stationary_window, "right"), high)
     high = np.minimum(high, end)
     middle = (low + high) // 2
     n1, n2 = middle - low, high - middle
@@ -125,7 +125,7 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
     d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across
     S = np.stack([S if online else S + turned, S + turned])
     M = S + (seen.speed * T) ** 2
-    q = settings.online_standing_share if online else 0.5
+    q = settings.online_stationary_share if online else 0.5
     odds = np.log(q / (1 - q)) + (np.log(M / S) - d2 * (1 / S - 1 / M)).sum(axis=0) / 2  # log
     p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
     return np.where(n1 > 0, p, 0.0)

@@ -48,15 +48,15 @@ class MapperSettings(Settings):
     """Association, merging and confirmation of landmarks."""
 
     gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        0.999, "share of the true pairs that the gate of association lets through"
+        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
     )
-    merge: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        1 - 1e-6, "the same of merging; near to 1, as what begins a duplicate is an outlier"
+    merge_gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
+        1 - 1e-6, "gate probability of merging duplicates; near 1, since an outlier starts a duplicate"
     )
     smooth_every: Annotated[int, Range(1, 10**9)] = setting(
-        100, "observations between two smoothings of the whole graph"
+        100, "observations between two smoothings of the whole graph; higher: faster, later corrections"
     )
-    confirm: Annotated[int, Range(1, 10**9)] = setting(2, "observations that make a landmark certain")
+    confirm_after: Annotated[int, Range(1, 10**9)] = setting(2, "observations that confirm a landmark")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class LandmarkMapper:
             self._smoothed[last] = chunk
             self._waiting, self._seen = [], {}
             self._read()
-        while merged := duplicates(self.ekf, self.settings.merge, self._seen_together()):
+        while merged := duplicates(self.ekf, self.settings.merge_gate, self._seen_together()):
             changed = {
                 last: {row: [(merged.get(n, n), z) for n, z in now] for row, now in chunk.items()}
                 for last, chunk in self._smoothed.items()
@@ -182,7 +182,7 @@ class LandmarkMapper:
         ]
         poses = np.stack([_pose(solver, row) for row in range(self._poses)])
         return LandmarkMap(
-            poses, LandmarkObservations(seen, {}).landmarks(solver.solve(), self.settings.confirm), observations
+            poses, LandmarkObservations(seen, {}).landmarks(solver.solve(), self.settings.confirm_after), observations
         )
 
     def _read(self) -> None:

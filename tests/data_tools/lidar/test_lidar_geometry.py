@@ -176,7 +176,7 @@ def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
     squares = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        settings = LineSettings(noise=0.05, bias=0.05, width=0.3)
+        settings = LineSettings(noise=0.05, bias=0.05, max_offset=0.3)
         points = np.column_stack([np.arange(-8.0, 9.0, 0.5), np.full(34, 4.0), np.full(34, -1.7)])
         points[:, 1] += rng.normal(0, 0.1, 34) + np.interp(points[:, 0], [-8, 8.5], rng.normal(0, settings.bias, 2))
         stray = np.column_stack([rng.uniform(-8, 8, 12), rng.uniform(-10, 0, 12), np.full(12, -1.7)])
@@ -187,7 +187,7 @@ def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
     assert 0.5 < np.mean(squares) < 1.5
     assert straight_lines(np.empty((0, 3)), 2) == []
     with pytest.raises(InputError, match="points"):
-        LineSettings(points=2)  # which every line fits
+        LineSettings(min_points=2)  # which every line fits
     assert straight_lines(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
 
 

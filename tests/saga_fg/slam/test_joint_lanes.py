@@ -26,7 +26,7 @@ from saga_fg.types.road_map import Lane, RoadMap
 RADIUS = 200.0  # m of the bend
 ASIDE = 0.15  # m that the left lane lies to the left of where the map has it
 POOR = OdometryNoise(bias=0.02)
-SETTINGS = JointSettings(POOR, rounds=1)
+SETTINGS = JointSettings(POOR, passes=1)
 
 
 def on_bend(s: FloatArray, d: FloatArray) -> FloatArray:
@@ -128,7 +128,9 @@ def test_a_vehicle_keeps_the_lane_that_it_surely_drives_along() -> None:
     assert set(found(0.05, np.array([2]))) == {2}
 
 
-@pytest.mark.parametrize(("field", "value"), [("spread", 0.0), ("memory", -1.0), ("rounds", 0), ("elsewhere", 0.0)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("offset_deviation", 0.0), ("offset_time", -1.0), ("passes", 0), ("off_lane_share", 0.0)]
+)
 def test_settings_that_cannot_be_are_refused(field: str, value: float) -> None:
     with pytest.raises(InputError, match=field):
         LaneSettings(**{field: value})

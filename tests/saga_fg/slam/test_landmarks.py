@@ -154,7 +154,7 @@ def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.O
     planes = [gtsam.OrientedPlane3(wall / np.linalg.norm(wall[:3])) for wall in walls]
     true = [gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.array([9.0, 0.0, 1.5]))]
     turn = 2 * np.pi / 30
-    mapper = LandmarkMapper(true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(smooth_every=200, confirm=5))
+    mapper = LandmarkMapper(true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(smooth_every=200, confirm_after=5))
     for _ in range(60):
         observations = []
         for x, y in poles:

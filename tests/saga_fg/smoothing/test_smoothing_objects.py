@@ -11,12 +11,12 @@ from saga_fg.model.node import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
-    JoiningSettings,
     Lifespans,
     OfflineClass,
     SmoothedEdges,
     StateTable,
     StationarySettings,
+    StitchingSettings,
     assign_free_detections,
     evidence_scores,
     frame_rate,
@@ -57,11 +57,11 @@ def line(first: int, last: int, start: tuple[float, float], velocity: tuple[floa
     return path
 
 
-def joined(paths: dict[int, FloatArray], settings: JoiningSettings | None = None) -> dict[int, int]:
+def joined(paths: dict[int, FloatArray], settings: StitchingSettings | None = None) -> dict[int, int]:
     evidence, numbers = gathered(paths)
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
     prior = np.tile(25.0 * np.eye(2), (len(lifespans), 1, 1))
-    settings = settings or JoiningSettings()
+    settings = settings or StitchingSettings()
     longer = lifespans.reaching(evidence.times, 1.0, settings.max_gap)
     states = smooth_states(evidence, numbers, longer, prior, CLASSES)
     return dict(
@@ -86,7 +86,7 @@ def test_what_moves_otherwise_or_comes_too_late_is_new() -> None:
     paths = {0: line(0, 6, (0, 0), (5, 0)), 1: line(9, 19, (0, 30), (5, 0))}
     assert joined(paths) == {0: 0, 1: 1}
     paths = {0: line(0, 6, (0, 0), (5, 0)), 1: line(12, 19, (0, 0), (5, 0))}
-    assert joined(paths, JoiningSettings(max_gap=1.0)) == {0: 0, 1: 1}
+    assert joined(paths, StitchingSettings(max_gap=1.0)) == {0: 0, 1: 1}
 
 
 def test_an_object_claims_detections_before_its_birth_but_not_those_of_others() -> None:
@@ -119,7 +119,7 @@ def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior() -> 
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
     assert frame_rate(evidence) == pytest.approx(2.0)
-    score = evidence_scores(evidence, numbers, lifespans, states, prior_time=1.0)
+    score = evidence_scores(evidence, numbers, lifespans, states, prior_opportunity_time=1.0)
     assert score.tolist() == pytest.approx([8.0 / 12.0, 0.8 / 3.0])
 
 
@@ -143,7 +143,7 @@ def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own() -> 
     mean = np.array([[0.0, 0.0, 10.0, 0.0], [20.0, 0.0, 10.0, 0.0]])
     states = StateTable.of_moments([(0, np.array([1, 2]), mean, np.tile(0.01 * np.eye(4), (2, 1, 1)))])
     rules = (Following(interaction=SharedVelocity()),)
-    edges = SmoothedEdges.of(rules, 0.0, lifespans, states, np.zeros(3), np.full(3, 4.5))
+    edges = SmoothedEdges(rules, 0.0, lifespans, states, np.zeros(3), np.full(3, 4.5))
     graph = edges(0, np.array([5, 2, 1]), (NodeType("object", CLASSES["default"].motion),) * 3)
     assert sorted(graph.nodes.tolist()) == [1, 2, 5]
     (group,) = graph.edges

@@ -87,7 +87,7 @@ def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
     V, n = np.tile(25 * np.eye(2), (4, 1, 1)), len(lifespans)
     alone = smooth_states(evidence, object_of, lifespans, V, CLASSES)
     rules = (Neighbours(min_speed=0.2, classes=("pedestrian",)),)
-    edges = SmoothedEdges.of(rules, 0.0, lifespans, alone, np.full(n, np.nan), np.full(n, 0.5))
+    edges = SmoothedEdges(rules, 0.0, lifespans, alone, np.full(n, np.nan), np.full(n, 0.5))
     moments = np.arange(len(evidence.times))
     stands = StationaryStates(StationarySettings(), moments, np.full(len(moments), 2))
     weight = np.where(object_of == 1, 0.5, 1.0)
