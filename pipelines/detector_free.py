@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_tools.lidar import ClusterSettings, detect_clusters
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Annotations, Scene

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from data_tools.datasets.parts import Parts
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
-    from data_tools.lidar.scan_sequence import ScanSequence
+    from data_tools.lidar.scan import ScanSequence
     from saga_fg.numerics.arrays import FloatArray
     from saga_fg.smoothing import Labels
     from saga_fg.types.dataset import Dataset, Scene

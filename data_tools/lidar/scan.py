@@ -1,9 +1,9 @@
-"""One sweep of a LiDAR."""
+"""One sweep of a LiDAR, and sequences of sweeps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -49,3 +49,21 @@ class Scan:
         """The points at distances from `nearest` to `farthest` m, without echoes of the vehicle itself."""
         square = np.einsum("ni,ni->n", self.points, self.points)
         return self.select((square >= nearest**2) & (square <= farthest**2))
+
+
+class ScanSequence(Protocol):
+    """K recorded scans in order of time, each read on access; `data_tools.datasets.kitti.KittiScans` is one.
+
+    timestamps   (K,) s
+    world_T_ego  (K, 4, 4) reference poses of the vehicle
+    ego_T_lidar  (4, 4) pose of the sensor on the vehicle
+    """
+
+    @property
+    def timestamps(self) -> FloatArray: ...
+    @property
+    def world_T_ego(self) -> FloatArray: ...
+    @property
+    def ego_T_lidar(self) -> FloatArray: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, row: int) -> Scan: ...

@@ -29,7 +29,7 @@ from saga_fg.types.dataset import Annotations
 
 
 class FoundBoxes(Protocol):
-    """N boxes with identities at one moment: a tracker's `Tracks`, or the rows of a `TrackTable`."""
+    """N boxes with identities in one frame: a tracker's `Tracks`, or rows of a result file."""
 
     @property
     def id(self) -> IntArray | StrArray: ...

@@ -40,7 +40,7 @@ class SceneMetricSettings:
 
     gate: float = setting(2.0, "largest horizontal distance of a matched pair, m")
     same_label: bool = setting(True, "match objects and tracks of the same class only")
-    cap: float = setting(5.0, "error charged for a hidden object whose track is lost or far away, m")
+    cap: float = setting(5.0, "largest carried error, also that of a hidden object whose track is lost, m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""How drivers follow and change lanes: the Intelligent Driver Model (IDM) and MOBIL.
+"""Driver models of car following and lane changes: the Intelligent Driver Model (IDM) and MOBIL.
 
 IDM (Treiber, Hennecke, Helbing 2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4):
 

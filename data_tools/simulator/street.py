@@ -70,7 +70,7 @@ def scans(
 
 
 class SimulatedScans:
-    """Scans of a drive along the street of a seed: `data_tools.lidar.scan_sequence.ScanSequence` with the true poses.
+    """Scans of a drive along the street of a seed: `data_tools.lidar.scan.ScanSequence` with the true poses.
 
     world_T_lidar  (K, 4, 4), K >= 2, true poses; None for a drive of `count` scans
     kerbs          pavements with kerbs on both sides

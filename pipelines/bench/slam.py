@@ -24,7 +24,7 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory, TrajectoryErrors, trajectory_errors
 from pipelines.process import one_thread
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import constant_velocity, deskewed
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray

@@ -26,7 +26,7 @@ import numpy as np
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.lidar_slam import LidarSlam

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from data_tools.lidar import voxel_downsample
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory
 from factors import Robust, between_factor
 from pipelines.slam.drive import LEAST, Drive, drive_by_lidar, drive_by_poses

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers

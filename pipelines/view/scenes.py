@@ -31,7 +31,7 @@ import numpy as np
 
 from data_tools.datasets.source import DatasetSource
 from data_tools.lidar import voxel_downsample
-from data_tools.lidar.scan_sequence import ScanSequence
+from data_tools.lidar.scan import ScanSequence
 from data_tools.metrics import SceneBoxes
 from pipelines.report.results import result_scenes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections

@@ -1,11 +1,11 @@
 """KITTI 3D multi-object tracking metrics, averaged over recall: sAMOTA, AMOTA, AMOTP and the CLEAR metrics.
 
-True and found boxes of a class are matched frame by frame: as many pairs of at least the wanted 3D IoU as possible, and
+True and found boxes of a class are matched frame by frame: as many pairs with the required 3D IoU as possible, and
 among those the largest sum of IoU. Thresholds on the mean score of a track are set where the recall comes nearest to
 1/40, 2/40, ...; with the counts at each (objects gt that count, misses FN, false alarms FP, switches IDS)
 
     MOTA   = 1 - (FN + FP + IDS) / gt
-    sMOTA  = min(1, max(0, 1 - (FN + FP + IDS - (1 - r) gt) / (r gt)))         r: the wanted recall
+    sMOTA  = min(1, max(0, 1 - (FN + FP + IDS - (1 - r) gt) / (r gt)))         r: the target recall
     MOTP   = mean 3D IoU of the pairs
     sAMOTA, AMOTA, AMOTP: sums of sMOTA, MOTA, MOTP over the thresholds that are reached, divided by 40
 
@@ -161,21 +161,21 @@ def _thresholds(
 ) -> tuple[FloatArray, FloatArray]:
     """Score thresholds and the recalls they are for, from the pairs of the run with all tracks.
 
-    Of the matched scores, in descending order, the n-th is the threshold that gives recall n / to_find; it is taken
-    when the next one would come no nearer to the recall that is wanted. The first one is dropped: it stands for 0.
+    The n-th of the matched scores, in descending order, is the threshold of recall n / to_find; it is taken if the next
+    one is no nearer to the target recall. The first threshold is dropped, its target is recall 0.
     """
     found_at_all = np.zeros(len(true), dtype=np.bool_)
     found_at_all[candidates.row[chosen]] = True
     to_find = len(true) - int((true.exempt & ~found_at_all).sum())
     matched = np.sort(score[candidates.column[chosen]])[::-1].tolist()
-    thresholds, recalls, wanted = [], [], 0.0
+    thresholds, recalls, target = [], [], 0.0
     for n, value in enumerate(matched):
         here, following = (n + 1) / to_find, (n + 2) / to_find
-        if n + 1 < len(matched) and following - wanted < wanted - here:
+        if n + 1 < len(matched) and following - target < target - here:
             continue
         thresholds.append(value)
-        recalls.append(wanted)
-        wanted += 1 / RECALLS
+        recalls.append(target)
+        target += 1 / RECALLS
     return np.array(thresholds[1:]), np.array(recalls[1:])
 
 

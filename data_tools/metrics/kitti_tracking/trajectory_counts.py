@@ -49,9 +49,9 @@ def trajectory_counts(track: IntArray, identity: IntArray, exempt: BoolArray) ->
     memory = np.where(counts | first, track, -1)
     last = np.where(first, -1, np.take_along_axis(memory, source, axis=0))
 
-    judged = counts & ~first & matched
-    switch = judged & (last >= 0) & (last != track) & (before >= 0)
-    fragment = judged & (before != track) & (final | (last >= 0) & (after >= 0))
+    evaluated = counts & ~first & matched
+    switch = evaluated & (last >= 0) & (last != track) & (before >= 0)
+    fragment = evaluated & (before != track) & (final | (last >= 0) & (after >= 0))
 
     counted = np.add.reduceat(counts[:, 0], start, dtype=np.int64)
     tracked = np.add.reduceat(matched & (counts | first), start, axis=0, dtype=np.int64)

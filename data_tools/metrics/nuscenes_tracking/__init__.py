@@ -4,9 +4,9 @@ from data_tools.metrics.nuscenes_tracking.class_metrics import NuScenesClassMetr
 from data_tools.metrics.nuscenes_tracking.evaluation import (
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
+    NuScenesTrackingSettings,
     nuscenes_tracking_metrics,
 )
-from data_tools.metrics.nuscenes_tracking.settings import NuScenesTrackingSettings
 
 __all__ = [
     "NuScenesClassMetrics",

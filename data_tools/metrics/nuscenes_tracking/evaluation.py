@@ -18,12 +18,38 @@ import numpy as np
 from data_tools.metrics.nuscenes_tracking.class_metrics import NuScenesClassMetrics, RecallCurves
 from data_tools.metrics.nuscenes_tracking.coverage import track_coverage
 from data_tools.metrics.nuscenes_tracking.scored_boxes import scored_boxes
-from data_tools.metrics.nuscenes_tracking.settings import NuScenesTrackingSettings
 from data_tools.metrics.nuscenes_tracking.sweep import Rows, Sweep, candidate_pairs, sweep
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.settings import setting, settings_group
 from saga_fg.types.boxes import Boxes
+
+CLASS_RANGE = {
+    "bicycle": 40.0,
+    "bus": 50.0,
+    "car": 50.0,
+    "motorcycle": 40.0,
+    "pedestrian": 40.0,
+    "trailer": 50.0,
+    "truck": 50.0,
+}
+
+
+@dataclass(frozen=True)
+class NuScenesTrackingSettings:
+    """Settings of the nuScenes tracking metrics; the defaults are the official ones."""
+
+    class_range: Mapping[str, float] = settings_group(
+        lambda: dict(CLASS_RANGE), "classes scored, and the distance from the vehicle up to which they are, m"
+    )
+    gate: float = setting(2.0, "distance from which a pair cannot match, m")
+    min_recall: float = setting(0.1, "lowest recall of the sweep")
+    thresholds: int = setting(40, "number of recall values in the sweep")
+    worst_motp: float = setting(2.0, "MOTP of a recall that is not reached, m")
+    worst_faf: float = setting(500.0, "reported for a class that is never matched, false alarms per 100 frames")
+    worst_duration: float = setting(20.0, "initialisation and gap duration of a class that is never matched, s")
+    sample_period: float = setting(0.5, "time thin one frame counts in TID and LGD, s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,16 +111,16 @@ def nuscenes_tracking_metrics(
     pairs = candidate_pairs(true, found, settings.gate)
     everything = sweep(true, found, pairs, np.full((len(class_range), 1), -np.inf))
     recalls = np.linspace(settings.min_recall, 1, settings.thresholds).round(12)
-    wanted = np.stack(
+    thresholds = np.stack(
         [_thresholds(true, found, everything, label, recalls) for label in range(len(class_range))]
     ).reshape(len(class_range), settings.thresholds)
-    matched = sweep(true, found, pairs, _without_repeats(wanted))
+    matched = sweep(true, found, pairs, _without_repeats(thresholds))
     per_class, curves = {}, {}
     for label, name in enumerate(class_range):
         if (true.boxes.label == label).any():
-            columns = _columns(true, found, matched, wanted[label], label, settings)
+            columns = _columns(true, found, matched, thresholds[label], label, settings)
             per_class[name] = _summary(columns, settings)
-            curves[name] = _curves(columns, recalls[::-1], wanted[label])
+            curves[name] = _curves(columns, recalls[::-1], thresholds[label])
         else:
             per_class[name] = NuScenesClassMetrics.undefined()
     return NuScenesTrackingMetrics(NuScenesClassMetrics.over_classes(per_class.values()), per_class, curves)

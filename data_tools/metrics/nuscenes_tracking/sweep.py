@@ -121,12 +121,12 @@ def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Swee
     return Sweep(partner, switched, total.reshape(classes, T))
 
 
-def _first_of_each(wanted: BoolArray, found: IntArray) -> BoolArray:
-    """The first of the wanted (P, T) on each found row (P,); the rows are sorted."""
+def _first_of_each(previous: BoolArray, found: IntArray) -> BoolArray:
+    """The first previous pair (P, T) of each found row (P,); the rows are sorted."""
     start = np.flatnonzero(np.diff(found, prepend=-1))
-    count = np.cumsum(wanted, axis=0, dtype=np.int32)
-    before = (count[start] - wanted[start])[np.repeat(np.arange(len(start)), np.diff(start, append=len(found)))]
-    return np.asarray(wanted & (count - before == 1))
+    count = np.cumsum(previous, axis=0, dtype=np.int32)
+    before = (count[start] - previous[start])[np.repeat(np.arange(len(start)), np.diff(start, append=len(found)))]
+    return np.asarray(previous & (count - before == 1))
 
 
 def _used(kept: BoolArray, row: IntArray) -> BoolArray:
