@@ -70,7 +70,7 @@ class KittiObjects(Columns):
 
 
 def has_box(objects: KittiObjects) -> BoolArray:
-    """Which objects (N,) have a 3D box; `DontCare` regions and results of image trackers have none."""
+    """Mask (N,) of the objects with a 3D box; `DontCare` regions and results of image trackers have none."""
     return np.asarray((objects.type != "DontCare") & (objects.boxes.location > _NO_BOX).all(axis=1))
 
 

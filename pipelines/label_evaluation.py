@@ -55,14 +55,14 @@ class LabelEvaluation:
     consistency: Mapping[str, SelfConsistency]
 
     def tables(self) -> list[FigureTable]:
-        """For people."""
+        """Tables for people."""
         tables = [] if not self.curves else [_recall_table(self.curves), *map(_group_table, self._groups())]
         if self.same:
             tables.append(_calibration_table(self.same[2.0]))
         return [*tables, _consistency_table(self.consistency)]
 
     def figures(self) -> dict[str, Any]:
-        """For programs."""
+        """Figures for programs."""
         return {
             "scenes": self.scenes,
             "precision_recall": {
@@ -107,7 +107,7 @@ def evaluate_labels(
 ) -> LabelEvaluation:
     """Judge a table of labels by the dataset it was made of; the online tracks are made anew, as `config` says.
 
-    The scenes judged are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
+    The scenes are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
     scenes and moments that the dataset does not have.
     """
     rows = read_label_table(table)
@@ -188,7 +188,7 @@ def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
 
 
 def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
-    """The same with moments from `first` on and ids that name the scene."""
+    """Boxes with frames counted from `first` on and ids that name the scene."""
     names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
     return replace(table, frame=table.frame + first, id=names)
 

@@ -46,7 +46,7 @@ class TrackedScene:
 
     @property
     def frames(self) -> int:
-        """How many frames were taken in."""
+        """Number of frames that were taken in."""
         return len(self.milliseconds)
 
     @property

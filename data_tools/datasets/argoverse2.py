@@ -155,7 +155,7 @@ def _pyarrow() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class ArgoverseSource(AnnotatedSource):
-    """Argoverse 2 sensor logs: annotated boxes and poses, ten a second. Needs the extra [parquet]."""
+    """Argoverse 2 sensor logs, annotated ten times a second; needs the extra [parquet]."""
 
     name = "argoverse2"
     family = "nuscenes"

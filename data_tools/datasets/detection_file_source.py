@@ -1,4 +1,4 @@
-"""Tables of detections of one's own as a dataset of the command."""
+"""Tables of detections as a dataset of the command."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from saga_fg.types.dataset import Dataset, Scene
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionFileSource(DatasetSource):
-    """Your own detections: a table with one a row.
+    """Your own detections: a table with a row for each.
 
     The columns timestamp (s), x and y (m) are needed; label, score, sensor, size, heading and more are used where they
     are there (see docs/formats.md).
@@ -32,6 +32,7 @@ class DetectionFileSource(DatasetSource):
         "Table of detections: .csv, .ndjson, .jsonl or .npz. In parallel: several of them, patterns, URLs, or lists of "
         "such in a .txt file.",
         None,
+        metavar="TABLE",
         required=(*TRACKING, "learn interactions"),
         argument=True,
     )
@@ -97,6 +98,6 @@ class DetectionFilePart:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
-        """With the digest of the file."""
+        """Open with the digest of the file."""
         with local_copy(self.url) as path:
             yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path))

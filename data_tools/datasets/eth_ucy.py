@@ -79,7 +79,7 @@ class EthUcy:
 
 @dataclass(frozen=True, kw_only=True)
 class EthUcySource(AnnotatedSource):
-    """ETH walking pedestrians: annotated positions on the ground plane, every 0.4 s."""
+    """ETH/UCY walking pedestrians, annotated every 0.4 s."""
 
     name = "eth_ucy"
     example = "--dataroot data/eth_ucy --scenes hotel"

@@ -69,7 +69,7 @@ class HeldScene:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
-        """With the digests of all that the scene holds, but for its ground truth."""
+        """Open with the digests of everything in the scene but its ground truth."""
         yield OpenedPart(scene_digests(self.held), lambda: self)
 
 

@@ -130,7 +130,7 @@ class DatasetSource(ABC):
 
     @property
     def tracks_suffix(self) -> str:
-        """In parallel: suffix of the result of a part."""
+        """Suffix of the result of one part, in parallel runs."""
         return ".csv"
 
     @abstractmethod
@@ -138,7 +138,7 @@ class DatasetSource(ABC):
         """The chosen recordings, for the length of a block; with ground truth if there is some and it is wanted."""
 
     def restricted(self, scenes: Collection[str]) -> Self:
-        """The same recordings, of which these scenes alone need be opened."""
+        """Recordings of these scenes alone; a dataset may open more than these."""
         return self
 
     def input_files(self) -> tuple[Path, ...]:
@@ -154,7 +154,7 @@ class DatasetSource(ABC):
             yield Parts(dataset.scenes, (HeldScene(dataset.scene(name)) for name in dataset.scenes), dataset)
 
     def stream(self) -> AbstractContextManager[Iterator[Scene]] | None:
-        """The recordings as successive scenes of the same name, to smooth them as they are read; None where held."""
+        """Recordings as successive parts of scenes, to smooth them while they are read; None to hold each in memory."""
         return None
 
     def scans(self, scenes: Collection[str]) -> Mapping[str, ScanSequence]:
@@ -172,19 +172,19 @@ class DatasetSource(ABC):
         return
 
     def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
-        """In parallel: write the result of a part to folder/tracks/STEM.*."""
+        """Write the result of one part of a parallel run to folder/tracks/STEM.*."""
         self.write_tracks(folder / "tracks" / f"{stem}{self.tracks_suffix}", dataset, scenes)
 
     def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
-        """In parallel: write the labels of a part to folder/*/STEM.*."""
+        """Write the labels of one part of a parallel run to folder/*/STEM.*."""
         self.write_labels(folder, dataset, scenes)
 
     def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        """In parallel: make `merged` of the results of all parts."""
+        """Join the results of all parts of a parallel run to the file `merged`."""
         return
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        """In parallel: make `merged` of the labels of all parts."""
+        """Join the labels of all parts of a parallel run to the file `merged`."""
         return
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:

@@ -4,7 +4,7 @@
     LANDMARK i l x y P11 P12 P22                             tree l in the frame of pose i, m
 
 P is the upper triangle of a covariance (by size; the file calls it noise). Poses and trees share one numbering. The
-odometry must be one chain, each row starting at the pose where the one before ended; sightings follow the row that
+odometry must be one chain, each row starting at the pose where the one before ended; observations follow the row that
 leads to their pose.
 """
 
@@ -25,11 +25,11 @@ _LANDMARK = ("x", "y", "P11", "P12", "P22")
 
 
 @dataclass(frozen=True, eq=False)
-class TreeSightings:
+class TreeObservations:
     """A drive of N + 1 poses past trees.
 
     a_T_b                (N, 3, 3) increments; odometry_covariance (N, 3, 3) of (x, y, heading)
-    pose                 (M,) index from 0 of the pose of each sighting, not decreasing
+    pose                 (M,) index from 0 of the pose of each observation, not decreasing
     place                (M, 2) m, in the frame of that pose; covariance (M, 2, 2)
     tree                 (M,) which tree the file says it is: for evaluation alone
     """
@@ -42,10 +42,10 @@ class TreeSightings:
     tree: IntArray
 
 
-def read_victoria_park(path: str | Path) -> TreeSightings:
-    """Read the file. Raises `InputError` naming the line of a broken record, or of a sighting from an unknown pose."""
+def read_victoria_park(path: str | Path) -> TreeObservations:
+    """Read the file. Raises `InputError` naming the line of a broken record, or an observation from an unknown pose."""
     file = Path(path)
-    odometry, sightings = _records(file)
+    odometry, observations = _records(file)
     first, second = (odometry.integers(column, name, 0) for column, name in ((0, "i"), (1, "j")))
     broken = np.flatnonzero(first[1:] != second[:-1])
     if len(broken):
@@ -55,22 +55,22 @@ def read_victoria_park(path: str | Path) -> TreeSightings:
     order = np.argsort(chain, kind="stable")
     if len(np.unique(chain)) != len(chain):
         raise InputError(f"{file}: expected every pose once in the chain of odometry")
-    named = sightings.integers(0, "i", 0)
+    named = observations.integers(0, "i", 0)
     found = np.minimum(np.searchsorted(chain[order], named), len(chain) - 1)
     pose = order[found]
     if (chain[pose] != named).any():
         row = int(np.argmax(chain[pose] != named))
-        raise sightings.fault(row, f"i: there is no pose {named[row]} in the odometry")
+        raise observations.fault(row, f"i: there is no pose {named[row]} in the odometry")
     steps = odometry.numbers(slice(2, 11), _ODOMETRY)
-    seen = sightings.numbers(slice(2, 7), _LANDMARK)
+    seen = observations.numbers(slice(2, 7), _LANDMARK)
     turn = np.argsort(pose, kind="stable")
-    return TreeSightings(
+    return TreeObservations(
         _increments(steps[:, :3]),
         _covariances(odometry, steps[:, 3:], 3),
         pose[turn].astype(np.int64),
         seen[turn, :2],
-        _covariances(sightings, seen[:, 2:], 2)[turn],
-        sightings.integers(1, "l", 0)[turn],
+        _covariances(observations, seen[:, 2:], 2)[turn],
+        observations.integers(1, "l", 0)[turn],
     )
 
 

@@ -33,7 +33,7 @@ def error_tables(errors: LabelErrors) -> list[FigureTable]:
 
 
 def error_json(errors: LabelErrors) -> dict[str, Any]:
-    """The same for programs."""
+    """Errors and calibration by class, for programs."""
     classes = errors_by_class(errors)
     fits = {name: calibration(e) for name, e in classes.items()}
     return {

@@ -1,6 +1,6 @@
 """Tracks scored against the ground truth of their scenes: CLEAR figures and RMSE at every moment, hidden objects too.
 
-Datasets without an official evaluation of their own are judged by it.
+It serves datasets that have no official evaluation.
 """
 
 from __future__ import annotations

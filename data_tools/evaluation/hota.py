@@ -1,6 +1,6 @@
 """HOTA, CLEAR and Identity figures of a result, class by class, in the plane (2D) and in space (3D).
 
-These metrics judge one set of tracks, without a sweep over scores. The tracks judged are those whose mean score reaches
+These metrics judge one set of tracks, without a sweep over scores. The tracks scored are those whose mean score reaches
 the class's threshold of best MOTA, as published figures choose them too.
 """
 
@@ -26,7 +26,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class HotaRow:
-    """One class at one similarity: `overlap` is 2D, 3D or image; `threshold`: least mean score of the tracks judged."""
+    """One class at one similarity: `overlap` is 2D, 3D or image; `threshold`: least mean score of its tracks."""
 
     label: str
     overlap: str
@@ -38,14 +38,14 @@ def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[st
     """Judge (truth, found) of all scenes for the classes of `thresholds`. Raises `MissingExtraError` w/o trackeval."""
     rows = []
     for label, threshold in thresholds.items():
-        judged = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
+        scored = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
         for overlap, similarity in SIMILARITIES.items():
-            rows.append(HotaRow(label, overlap, threshold, hota_metrics(judged, label, similarity)))
+            rows.append(HotaRow(label, overlap, threshold, hota_metrics(scored, label, similarity)))
     return rows
 
 
 def hota_table(rows: Sequence[HotaRow]) -> FigureTable:
-    """For people; in percent, as these figures are published."""
+    """Table for people, in percent as such figures are published."""
     return FigureTable(
         "HOTA, CLEAR and Identity, in %; pairs from an overlap of 0.5 on count for CLEAR and Identity",
         _COLUMNS,
@@ -54,7 +54,7 @@ def hota_table(rows: Sequence[HotaRow]) -> FigureTable:
 
 
 def hota_json(rows: Sequence[HotaRow]) -> dict[str, Any]:
-    """For programs: by class, then overlap."""
+    """Figures for programs, by class and overlap."""
     result: dict[str, Any] = {}
     for row in rows:
         result.setdefault(row.label, {"threshold": row.threshold})[row.overlap] = row.figures

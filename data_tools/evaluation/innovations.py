@@ -1,4 +1,4 @@
-"""How well innovations fit their covariances, by class (NIS): the tracks and the noise of the detections together.
+"""Innovations and their covariances by class (NIS): the tracks and the noise of the detections together.
 
 The squared distance in sigmas of a track and the detection it took has 2 degrees of freedom: its mean is 2 if both
 covariances are right. What lies outside the gate is never matched, which lowers the mean by little.
@@ -19,13 +19,13 @@ _COLUMNS = ("class", "matches", "NIS / 2", "median", "in 50 %", "in 90 %", "in 9
 
 
 def innovation_table(by_class: Mapping[str, FloatArray]) -> FigureTable:
-    """For people."""
+    """Table for people."""
     title = "Innovations: NIS / 2 and median are 1 if the covariances of tracks and detections are right"
     return FigureTable(title, _COLUMNS, tuple((label, *_cells(values)) for label, values in by_class.items()))
 
 
 def innovation_json(by_class: Mapping[str, FloatArray]) -> dict[str, Any]:
-    """For programs."""
+    """Figures for programs."""
     return {
         label: {"matches": len(values), "nis": values.mean() / 2, "median": _median(values), "held": coverages(values)}
         for label, values in by_class.items()

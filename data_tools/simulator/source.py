@@ -18,7 +18,7 @@ from saga_fg.types.dataset import Dataset
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedSource(DatasetSource):
-    """Simulated traffic, whose truth is known: hidden objects are scored as well."""
+    """Simulated traffic, whose ground truth has the hidden objects too."""
 
     name = "simulated"
     family = "simulated"
@@ -51,7 +51,7 @@ class SimulatedScene:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
-        """With the digest of what the scene is made from."""
+        """Open with the digest of the settings, seed and name."""
         made_from = f"{self.source.simulator or SimulatorSettings()!r} {self.source.seed} {self.name}"
         yield OpenedPart({"simulator": hashlib.sha256(made_from.encode()).hexdigest()}, self._read)
 

@@ -47,8 +47,8 @@ class EstimatorBenchSettings:
     """How much is measured."""
 
     sizes: tuple[int, ...] = setting((10, 50, 100, 300, 1000), "numbers of nodes")
-    frames: int = setting(20, "frames of each case that are counted, at most")
-    seconds: float = setting(30.0, "no more frames after so many seconds of a case")
+    frames: int = setting(20, "largest number of frames that are timed in each case")
+    seconds: float = setting(30.0, "time after which a case ends early, s")
     batch_frames: int = setting(200, "frames of the recording that the batch smoothers solve; 0 for none")
     batch_nodes: int = setting(100, "nodes of that recording")
     soak_frames: int = setting(10_000, "frames of the endurance run; 0 for none")

@@ -51,7 +51,7 @@ class HostileBenchSettings(Settings):
     messages: PositiveInt = setting(20_000, "messages in all, a fifth of them valid frames of two good clients")
     objects: PositiveInt = setting(50, "objects in each valid frame")
     pace: Positive = setting(50.0, "frames a good client sends in a second; their own clocks show 10 a second")
-    seed: int = setting(0, "of messages and mishaps")
+    seed: int = setting(0, "seed of messages and faults")
 
     @property
     def frames(self) -> int:

@@ -40,7 +40,7 @@ class ServiceBenchSettings(Settings):
     objects: PositiveInt = setting(50, "objects in each")
     malformed: Annotated[float, Range(0.0, 0.5)] = setting(0.01, "share of messages that are broken")
     late: Annotated[float, Range(0.0, 0.5)] = setting(0.05, "share of frames that come after younger ones")
-    seed: int = setting(0, "of objects and mishaps")
+    seed: int = setting(0, "seed of objects and faults")
 
 
 @dataclass(frozen=True)

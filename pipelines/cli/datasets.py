@@ -145,7 +145,7 @@ def _settings(source: Source) -> dict[str, type[Any]]:
 
 
 def _described(parameter: inspect.Parameter, text: str | None) -> inspect.Parameter:
-    """The same option with another help."""
+    """Option with another help."""
     kind, info = get_args(parameter.annotation)
     other = copy(info)
     other.help = text

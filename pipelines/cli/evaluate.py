@@ -28,7 +28,7 @@ def _evaluate(
         Path | None,
         typer.Argument(help="Result of any tracker, as `saga-fg track` writes it; left out, one is made and scored."),
     ] = None,
-    method: how.MethodOption | None = None,
+    method: how.MethodOrNone = None,
     estimator: how.EstimatorOption = None,
     lag: how.LagOption = None,
     association: how.AssociationOption = None,
@@ -49,7 +49,7 @@ def _evaluate(
 ) -> None:
     """Score tracks against the ground truth: by the dataset's official metrics or CLEAR, and by errors at the labels.
 
-    Errors are judged on the labels that the detections match, where these are given and the metrics are official.
+    Where detections are given and the metrics are official, errors are those at the labels that detections match.
     """
     from data_tools.files.atomic_files import atomic_directory
     from data_tools.plots import png
@@ -104,8 +104,8 @@ def _evaluate_labels(
 ) -> None:
     """Judge labels beside the online tracks and the detections: recall, errors on the same boxes, calibration.
 
-    The scenes judged are those in the table. Where there is no ground truth: how smooth the labels are and how well
-    they agree with the detections.
+    The scenes are those in the table. Without ground truth, the figures say how smooth the labels are and how well they
+    agree with the detections.
     """
     import numpy as np
 

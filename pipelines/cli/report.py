@@ -21,10 +21,7 @@ def _report(
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")],
     verbose: options.Verbose = False,
 ) -> None:
-    """Make a page of a tracking result: beside the ground truth with figures where there is some.
-
-    Detections are shown where they are given.
-    """
+    """Make a page of a tracking result: a player, charts, and figures where there is ground truth."""
     from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.report import report_page, result_report
     from saga_fg.errors import InputError

@@ -1,4 +1,4 @@
-"""How the command talks: results on stdout; progress, warnings and one-line errors on stderr.
+"""Output of the command: results on stdout; progress, warnings and one-line errors on stderr.
 
 Exit codes: 0 done, 2 wrong arguments or input (`SagaError`), 130 interrupted, 143 terminated (`main`); anything else is
 a bug and a traceback.
@@ -35,7 +35,7 @@ def error_console() -> Console:
 
 
 def _factor_error() -> type[Exception]:
-    """What factors raise; where none were imported, none can have been raised."""
+    """Exception of `factors`, `SagaError` while that package is not imported."""
     raised: type[Exception] = getattr(sys.modules.get("factors.errors"), "FactorError", SagaError)
     return raised
 
@@ -69,7 +69,7 @@ def new_command() -> typer.Typer:
 
 
 class _ConsoleHandler(logging.Handler):
-    """Log lines above the progress bar, as they are: neither wrapped nor coloured."""
+    """Log lines above the progress bar, neither wrapped nor coloured."""
 
     def emit(self, record: logging.LogRecord) -> None:
         error_console().print(self.format(record), markup=False, highlight=False, soft_wrap=True)

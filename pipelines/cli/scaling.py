@@ -1,4 +1,4 @@
-"""Running a command over many scenes at once: the options, the run, and what is said of it."""
+"""Parallel runs of a command: the options, the run, and its report."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RayAddress = Annotated[
 
 
 def at_scale(workers: int | None, ray: str | None) -> bool:
-    """Whether the scenes are to be done in parallel."""
+    """True if scenes are to be done in parallel."""
     return workers is not None or ray is not None
 
 

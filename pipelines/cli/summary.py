@@ -27,7 +27,7 @@ class Summary:
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
-        """The same runs, counted."""
+        """Pass runs on and count them."""
         for run in runs:
             self.scenes += 1
             self.frames += run.frames

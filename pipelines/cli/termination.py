@@ -33,7 +33,7 @@ class Terminated(BaseException):
 
 
 def raise_on_sigterm() -> None:
-    """From now on, SIGTERM raises `Terminated` in the main thread, which has to be the caller's.
+    """Make SIGTERM raise `Terminated` in the main thread, which has to be the caller's.
 
     Where that is swallowed, as in a finaliser, it is raised again.
     """
@@ -56,7 +56,7 @@ def raise_on_sigterm() -> None:
 
 
 def ignore_sigterm() -> None:
-    """From now on, SIGTERM has no effect: the process is about to end by itself."""
+    """Ignore SIGTERM: the process is about to end by itself."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_IGN)
 

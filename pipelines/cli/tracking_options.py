@@ -13,13 +13,12 @@ from saga_fg.tracking import AssociationName, EstimatorName
 if TYPE_CHECKING:
     from pipelines.config import Method, TrackConfig
 
-MethodOption = Annotated[
-    Literal["saga", "kf", "centerpoint"],
-    typer.Option(
-        "--method",
-        help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
-    ),
-]
+_METHOD = typer.Option(
+    "--method",
+    help="saga: graph-aware Kalman filter; kf: the same without edges; centerpoint: greedy nearest centre.",
+)
+MethodOption = Annotated[Literal["saga", "kf", "centerpoint"], _METHOD]
+MethodOrNone = Annotated[Literal["saga", "kf", "centerpoint"] | None, _METHOD]
 
 EstimatorOption = Annotated[
     EstimatorName | None,
@@ -95,7 +94,7 @@ def _estimator_fits(method: str, estimator: str | None, lag: float | None, confi
 
 
 def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
-    """Where the journal goes, if one is wanted. Raises `InputError` where none can be kept."""
+    """Path of the journal, None if none is wanted. Raises `InputError` where none can be kept."""
     from pipelines.explaining import journal_of
 
     if explain and at_scale:

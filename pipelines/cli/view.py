@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli import options
-from pipelines.cli.datasets import dataset_commands
+from pipelines.cli.datasets import Source, dataset_commands
 from pipelines.cli.reporting import working
 
 if TYPE_CHECKING:
@@ -48,7 +48,14 @@ def _view(
     _show(result, save, lambda: result_views(source, result, spacing), slam)
 
 
-_commands = dataset_commands("view", _view, ("view {result}", "view {result} --save tracks.mcap"))
+def _texts(source: Source) -> dict[str, str | None]:
+    """Options of datasets without LiDAR scans."""
+    from data_tools.datasets.source import DatasetSource
+
+    return {"spacing": None} if source.scans is DatasetSource.scans else {}
+
+
+_commands = dataset_commands("view", _view, ("view {result}", "view {result} --save tracks.mcap"), _texts)
 view_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 
 

@@ -87,7 +87,7 @@ def _section_lines(
 
 def _comment(item: Setting) -> str:
     schema = item.schema.value if isinstance(item.schema, Nullable) else item.schema
-    if not isinstance(schema, Choice):
+    if not isinstance(schema, Choice) or all(f"{option}:" in item.comment for option in schema.options):
         return item.comment
     return f"{item.comment} ({' | '.join(scalar_text(option) for option in schema.options)})"
 

@@ -1,4 +1,4 @@
-"""What was learned, as a piece of configuration for `--config`: YAML that holds nothing else."""
+"""Learned settings as a piece of configuration for `--config`: YAML that holds nothing else."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from saga_fg.learning import Trajectories
 
 
 def trajectories(source: DatasetSource, with_truth: bool) -> dict[str, Trajectories]:
-    """Those of the ground truth by recording, or what the classical tracker makes of the detections.
+    """Trajectories by recording: of the ground truth, or of the classical tracker on the detections.
 
     Raises `InputError` for what cannot be read.
     """

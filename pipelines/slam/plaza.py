@@ -42,15 +42,15 @@ class PlazaSettings(Settings):
     """Noise of odometry and ranges."""
 
     distance_noise: Positive = setting(0.05, "standard deviation of the distance of a step, as a share of it")
-    least_noise: Positive = setting(0.005, "m, of a step's distance, and sideways, at least")
-    turn_noise: Positive = setting(0.01, "rad, of a step's heading change")
-    range_noise: Positive = setting(0.5, "m, standard deviation of a range")
-    robust: Positive = setting(2.0, "standard deviations beyond which ranges get less weight (Cauchy)")
-    scale_noise: Positive = setting(0.1, "standard deviation of the radio's scale before anything is measured")
-    offset_noise: Positive = setting(1.0, "m, the same of its offset")
-    beginning: Positive = setting(100.0, "m driven before the beacons are placed")
+    least_noise: Positive = setting(0.005, "least standard deviation of a step, ahead and sideways, m")
+    turn_noise: Positive = setting(0.01, "standard deviation of the heading change of a step, rad")
+    range_noise: Positive = setting(0.5, "standard deviation of a range, m")
+    robust: Positive = setting(2.0, "residual from which the Cauchy loss discounts a range, standard deviations")
+    scale_noise: Positive = setting(0.1, "standard deviation of the scale of the radio at the start")
+    offset_noise: Positive = setting(1.0, "standard deviation of the offset of the radio at the start, m")
+    beginning: Positive = setting(100.0, "distance driven before the beacons are placed, m")
     growth: Annotated[float, Range(1.01, 100.0)] = setting(
-        1.3, "by which each part of the drive is longer than the one before"
+        1.3, "ratio of the lengths of two successive parts of the drive"
     )
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from data_tools.datasets.victoria_park import TreeSightings
+from data_tools.datasets.victoria_park import TreeObservations
 from pipelines.tracking import Progress
 from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.settings import Range, Settings, setting, settings_group
@@ -45,7 +45,9 @@ class ParkMap:
     log_evidence: dict[float, float]
 
 
-def map_park(drive: TreeSightings, settings: ParkSettings | None = None, progress: Progress | None = None) -> ParkMap:
+def map_park(
+    drive: TreeObservations, settings: ParkSettings | None = None, progress: Progress | None = None
+) -> ParkMap:
     """Map the trees of a drive, one pose after the other."""
     settings = settings or ParkSettings()
     scales = settings.odometry_scales
@@ -58,7 +60,7 @@ def map_park(drive: TreeSightings, settings: ParkSettings | None = None, progres
 
 
 def _driven(
-    drive: TreeSightings,
+    drive: TreeObservations,
     scale: float,
     settings: ParkSettings,
     poses: int | None,

@@ -38,10 +38,10 @@ class RelinearisationSettings(Settings):
     """Settings of relinearisation."""
 
     threshold: Positive = setting(
-        0.001, "linearise factors anew when a variable has moved by this many of its standard deviations"
+        0.001, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
     )
     max_iterations: Annotated[int, Range(1, 1000)] = setting(
-        25, "linearisations in a frame, before Levenberg-Marquardt solves the whole graph"
+        25, "largest number of linearisations in a frame, before Levenberg-Marquardt takes over"
     )
 
 

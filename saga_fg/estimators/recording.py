@@ -43,8 +43,8 @@ _SAME_TIME = 1e-9  # s
 class GaussNewtonSettings:
     """Settings of Gauss-Newton over a recording."""
 
-    max_iterations: int = setting(100, "linearisations of everything recorded at most")
-    tolerance: float = setting(1e-9, "largest step of a mean, in standard deviations, at which it has converged")
+    max_iterations: int = setting(100, "largest number of linearisations of the whole recording")
+    tolerance: float = setting(1e-9, "largest step of a mean at convergence, standard deviations")
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:

@@ -29,12 +29,12 @@ _SURE = 5.0  # standard deviations
 class WindowSettings(Settings):
     """Settings of the sliding window."""
 
-    step: Positive = setting(5.0, "s from one look at what has become final to the next")
+    step: Positive = setting(5.0, "time between two searches for final epochs, s; higher: faster, more memory")
     tolerance: Positive = setting(
-        1e-3, "by which a final mean may differ from that of the batch smoother, m (m/s, ...)"
+        1e-3, "largest difference of a final mean from the batch smoother, m (m/s, ...); lower: a longer window"
     )
-    longest: Positive = setting(60.0, "s after which an epoch is taken as final in any case, which bounds the memory")
-    late: NonNegative = setting(0.0, "s by which measurements may come late: so much longer everything has to wait")
+    longest: Positive = setting(60.0, "epochs older than this are final in any case, s; bounds the memory")
+    late: NonNegative = setting(0.0, "largest delay of a measurement, s; higher: a longer window")
 
     def __post_init__(self) -> None:
         super().__post_init__()

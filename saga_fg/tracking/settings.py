@@ -246,7 +246,7 @@ class TrackerSettings(Settings):
         lambda: None, "lights, stop lines, lanes and walls in world coordinates; null: those that frames bring along"
     )
     estimator: EstimatorName = setting(
-        "kalman", "estimator of the joint state: kalman (fastest), isam2 (whole past), fixed-lag (window that smooths)"
+        "kalman", "kalman: fastest; isam2: graph of the whole past; fixed-lag: graph of a window, which smooths"
     )
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, of saga_fg.providers or your own"
@@ -262,7 +262,9 @@ class TrackerSettings(Settings):
     traffic_flow_prior: TrafficFlowSettings = settings_group(
         TrafficFlowSettings, "speed of new tracks from the traffic around them"
     )
-    stationarity: StationaritySettings = settings_group(StationaritySettings, "whether objects are stationary or move")
+    stationarity: StationaritySettings = settings_group(
+        StationaritySettings, "estimation of which objects are stationary"
+    )
     report_speed_deviation_below: PositiveOrInf = setting(
         math.inf, "first report a track when its velocity is known to this standard deviation, m/s; .inf: at once"
     )

@@ -1,4 +1,4 @@
-"""Anyone's own detections in, tracks out, as plain tables: CSV, newline-delimited JSON, NumPy arrays.
+"""Detections in and tracks out, as plain tables: CSV, newline-delimited JSON, NumPy arrays.
 
 One row per detection. The same columns in every format; only the first three are required:
 

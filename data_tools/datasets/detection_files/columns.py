@@ -42,7 +42,7 @@ class RawTable:
         return InputError(f"{self.path}: {self.where(row)}: {what}")
 
     def present(self, name: str) -> BoolArray:
-        """Which rows (N,) give a value for a column."""
+        """Rows (N,) that have a value in a column, as a mask."""
         if name not in self.columns:
             return np.zeros(self.length, dtype=bool)
         values = self.columns[name]

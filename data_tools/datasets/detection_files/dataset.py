@@ -69,7 +69,7 @@ class DetectionFile:
 
     @property
     def with_poses(self) -> bool:
-        """Whether the table says where the vehicle was."""
+        """True if the table has poses of the vehicle."""
         return self._rows.pose is not None
 
     def _poses(self, rows: IntArray, moment: IntArray, count: int) -> FloatArray | None:

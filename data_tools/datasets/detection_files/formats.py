@@ -45,7 +45,7 @@ def read_raw_table(path: Path, layout: Layout | None = None) -> RawTable:
 
 
 def read_raw_parts(path: Path, layout: Layout | None = None, rows: int = 50_000) -> Iterator[RawTable]:
-    """The same in parts of about `rows` rows, in their order; rows of one scene and time stay together.
+    """Read a table in parts of about `rows` rows, in their order; rows of one scene and time stay together.
 
     A file without rows is one empty part, a NumPy archive is one part. Columns that nobody gives in a part are missing
     from it.

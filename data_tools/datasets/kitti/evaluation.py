@@ -47,7 +47,7 @@ def evaluate_kitti(
     with_hota: bool = False,
     innovations: Mapping[str, FloatArray] | None = None,
 ) -> Evaluation:
-    """Score the tracks of the sequences that were read; errors are judged at the labels that their detections match.
+    """Score the tracks of the sequences that were read; errors are those at the labels that their detections match.
 
     innovations  of the journal of the run, by class, to be among the figures
 
@@ -80,9 +80,9 @@ def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[s
     """Judge the tracks that reach the threshold of their class. Raises `MissingExtraError` without trackeval."""
     rows = []
     for label, threshold in thresholds.items():
-        judged = [replace(each, found=_surer_lines(each.found, label, threshold)) for each in sequences]
+        scored = [replace(each, found=_surer_lines(each.found, label, threshold)) for each in sequences]
         for overlap, similarity in SIMILARITIES.items():
-            rows.append(HotaRow(label, overlap, threshold, kitti_hota_metrics(judged, label, similarity)))
+            rows.append(HotaRow(label, overlap, threshold, kitti_hota_metrics(scored, label, similarity)))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""What a box in the camera frame looks like in the image: its 2D box and its observation angle.
+"""Boxes of the camera frame in the image: 2D boxes and observation angles.
 
 The 2D box encloses the projection of the twelve edges, cut at a plane just before the camera, and is clipped to the
 image. The observation angle is alpha = rotation_y - atan2(x, z). Pixels count from 0.

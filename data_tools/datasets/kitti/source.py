@@ -34,7 +34,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class KittiSource(DatasetSource):
-    """KITTI tracking sequences; results are the official text, one file a sequence, beside them tracks.csv in full."""
+    """KITTI tracking sequences.
+
+    Results are the benchmark's text, one file a sequence, and beside them tracks.csv with velocities and covariances.
+    """
 
     name = "kitti"
     family = "kitti"
@@ -130,7 +133,7 @@ class KittiPart:
 
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
-        """With the digests of its text files."""
+        """Open with the digests of its text files."""
         with self.source.open() as dataset:
             files = dataset.files(self.name)
             yield OpenedPart({f"{path.parent.name}/{path.name}": file_digest(path) for path in files}, lambda: dataset)

@@ -75,7 +75,7 @@ class NuScenes:
 
     @property
     def meta(self) -> ResultMeta:
-        """What the detection files say they rest on, together."""
+        """Sensors and data that the detection files use, together."""
         return ResultMeta.union(*(result.meta for result in self._results.values()))
 
     def split(self, name: str) -> tuple[str, ...]:

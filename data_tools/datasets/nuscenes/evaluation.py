@@ -35,7 +35,7 @@ _COLUMNS = (
 def evaluate_nuscenes(
     scored: Mapping[str, ScoredScene], with_hota: bool = False, innovations: Mapping[str, FloatArray] | None = None
 ) -> Evaluation:
-    """Score the tracks of the scenes that were read; errors are judged at the labels that their detections match.
+    """Score the tracks of the scenes that were read; errors are those at the labels that their detections match.
 
     innovations  of the journal of the run, by class, to be among the figures
 

@@ -14,7 +14,7 @@ from saga_fg.errors import InputError
 
 @dataclass(frozen=True)
 class ResultMeta:
-    """What a result rests on: the official `meta` of a result file."""
+    """Sensors and data that a result uses: the official `meta` of a result file."""
 
     use_camera: bool = False
     use_lidar: bool = False
@@ -24,7 +24,7 @@ class ResultMeta:
 
     @classmethod
     def union(cls, *metas: ResultMeta) -> Self:
-        """What several results together rest on."""
+        """Everything that several results use together."""
         return cls(**{f.name: any(getattr(meta, f.name) for meta in metas) for f in fields(cls)})
 
 

@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class NuScenesSource(DatasetSource):
-    """nuScenes recordings; detections are official detection-result JSON, one file a sensor, results official JSON.
+    """nuScenes recordings.
 
-    The official figures equal those of the development kit, which need not be installed.
+    Detections are official detection-result JSON, one file a sensor; results are official tracking-result JSON. The
+    official figures equal those of the development kit, which need not be installed.
     """
 
     name = "nuscenes"

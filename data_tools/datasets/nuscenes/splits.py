@@ -1,4 +1,4 @@
-"""Which scenes make up a split.
+"""Scenes of the splits.
 
 The tables do not say it. The official splits are lists of scenes published with the development kit
 (https://github.com/nutonomy/nuscenes-devkit, `utils/splits.py`); scene names are numbered, and of the scenes of
