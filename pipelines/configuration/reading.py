@@ -45,7 +45,7 @@ def load_settings(cls: type[T], path: Path, base: T | None = None) -> T:
 def read_settings(cls: type[T], text: str, source: str = "configuration", base: T | None = None) -> T:
     """The settings of a YAML text; `source` is the name that errors give to it."""
     try:
-        data = yaml.load(text, Loader=_Loader)
+        data = _Loader(text).get_single_data()
         return cast(T, _read(Section((cls,)), {} if data is None else data, cls() if base is None else base, ""))
     except InputError as error:
         raise InputError(f"{source}: {error}") from error

@@ -28,7 +28,7 @@ from saga_fg.model.node import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.graph_states import Epoch, states_in_graph
+from saga_fg.smoothing.graph_states import RecordingEpoch, states_in_graph
 from saga_fg.smoothing.settings import OfflineClass
 from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.smoothing.stationarity import StationaryStates
@@ -92,7 +92,7 @@ def _epochs(
     graph_of: GraphOf,
     weight: FloatArray,
     stationary: StationaryStates,
-) -> Iterator[Epoch]:
+) -> Iterator[RecordingEpoch]:
     """Everything from the first moment of an object to the last one."""
     start = _first_positions(evidence, object_of, lifespans)
     present = np.empty(0, dtype=np.int64)
@@ -119,11 +119,11 @@ def _epochs(
             H, R = types[0].selector(VELOCITY), stationary.settings.velocity_deviation**2 * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lifespans.last[present] == k
-        yield Epoch(k, transition, births, measured, lifespans.id[present[gone]])
+        yield RecordingEpoch(k, transition, births, measured, lifespans.id[present[gone]])
         present = present[~gone]
 
 
-def _smoothed(epochs: Iterable[Epoch], smoother: BatchSmoother | WindowedSmoother) -> StateTable:
+def _smoothed(epochs: Iterable[RecordingEpoch], smoother: BatchSmoother | WindowedSmoother) -> StateTable:
     """By recursions over the joint state, in NumPy."""
     states: list[SmoothedState] = []
     begin = 0

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Epoch:
+class RecordingEpoch:
     """A moment of the recording: how objects got here, who is new, what is measured, and ids of who goes afterwards."""
 
     moment: int
@@ -50,7 +50,7 @@ class _At:
 
 
 def states_in_graph(
-    epochs: Sequence[Epoch],
+    epochs: Sequence[RecordingEpoch],
     start: StateTable,
     evidence: Evidence,
     labels: Mapping[int, str],

@@ -44,7 +44,7 @@ from saga_fg.types.overlap import paired_giou_3d
 LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
 
 
-class Candidates(NamedTuple):
+class CandidatePairs(NamedTuple):
     """K pairs that may be matched.
 
     track, detection  (K,) rows
@@ -60,8 +60,8 @@ class Candidates(NamedTuple):
     d2: FloatArray
     gain: FloatArray
 
-    def select(self, rows: IntArray) -> Candidates:
-        return Candidates._make(column[rows] for column in self)
+    def select(self, rows: IntArray) -> CandidatePairs:
+        return CandidatePairs._make(column[rows] for column in self)
 
 
 def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
@@ -121,7 +121,7 @@ def candidates(
     settings: TrackerSettings,
     clutter_area: float,
     evidence: ClassEvidence | None = None,
-) -> Candidates:
+) -> CandidatePairs:
     """The pairs of one class, or group, that are inside its gate; the arguments are those of `match`."""
     (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
     same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
@@ -137,13 +137,13 @@ def candidates(
     d2, log_det = mahalanobis_of_pairs(innovation, S)
     of_class = 0.0 if evidence is None else evidence.costs(t, d)
     inside = (d2 + of_class < gates[t]).nonzero()[0]
-    found = Candidates(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
+    found = CandidatePairs(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
     found = found._replace(gain=found.gain - _overlap(found, predicted, measurements.boxes, giou_weight))
     unmatched = _unmatched(found, expected, measurements.probability, of_detection, settings.association, clutter_area)
     return found._replace(gain=found.gain - unmatched)
 
 
-def _overlap(found: Candidates, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:
+def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:
     """(K,) gain by the overlap of the boxes; weight (n,) of each track's class."""
     if not weight.any():
         return np.zeros(len(found.track))
@@ -151,7 +151,7 @@ def _overlap(found: Candidates, predicted: Boxes, detected: Boxes, weight: Float
 
 
 def _unmatched(
-    found: Candidates,
+    found: CandidatePairs,
     expected: FloatArray,
     probability: FloatArray,
     of_detection: IntArray,

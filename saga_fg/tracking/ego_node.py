@@ -22,9 +22,8 @@ from saga_fg.model.interactions import POSITION, NodeTable
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.tracking.box_filter import MOVING
-from saga_fg.tracking.ego_pose import RelativePositions
 from saga_fg.tracking.joint_state import JointTrackState
-from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.kinematics import Kinematics, RelativePositions
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
 from saga_fg.types.by_class import class_settings

@@ -10,19 +10,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
-from saga_fg.graph import FactorProvider
+from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.node import Motion, NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
+from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
-from saga_fg.tracking.ego_pose import RelativePositions, local_pose
-from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.kinematics import Kinematics, RelativePositions
 from saga_fg.tracking.names import EstimatorName
 from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
 from saga_fg.types.frame import Frame
@@ -186,8 +187,8 @@ class JointTrackState:
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
         if isinstance(self.estimator, JointKalmanFilter):
-            return local_pose(self.estimator.auxiliary)
-        return local_pose(self.estimator.graph()) if isinstance(self.estimator, GraphFilter) else None
+            return _local_pose(self.estimator.auxiliary)
+        return _local_pose(self.estimator.graph()) if isinstance(self.estimator, GraphFilter) else None
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """The estimates of all tracks; `ids` must be in the order of the last call until the state changes."""
@@ -272,3 +273,12 @@ class JointTrackState:
             return [(types[0], np.arange(len(label)))]
         of_row = np.array(kind, dtype=np.int64)[index]
         return [(types[kind.index(k)], np.flatnonzero(of_row == k)) for k in range(len(number))]
+
+
+def _local_pose(graph: SceneFactorGraph) -> FloatArray | None:
+    """The vehicle's present pose (4, 4), counted from the graph's origin; None where no provider has added one."""
+    key = key_of(EGO_POSE, 0, graph.epoch) if graph.epoch >= 0 else -1
+    if key not in graph.variables:
+        return None
+    pose = graph.state(key)
+    return pose.matrix() if isinstance(pose, gtsam.Pose3) else yaw_transform(pose.x(), pose.y(), 0.0, pose.theta())

@@ -1,12 +1,15 @@
-"""Positions and velocities of tracks with their covariances, whatever else their states hold."""
+"""Positions and velocities with their covariances: of tracks, and positions seen from a vehicle."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 
 
@@ -45,3 +48,17 @@ class Kinematics(NamedTuple):
             & (velocity_variance <= MAX_SPEED**2)
         )
         return np.asarray(within.all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePositions(Columns):
+    """m positions (m, 3) in the vehicle's frame, m, with covariances (m, 2, 2) in its axes, m^2."""
+
+    z: FloatArray
+    R: FloatArray
+
+    @classmethod
+    def of(cls, world_T_ego: FloatArray, position: FloatArray, R: FloatArray) -> RelativePositions:
+        """Transform positions (m, 3) and covariances (m, 2, 2) in the world into the frame of a pose."""
+        turn = world_T_ego[:2, :2]
+        return cls(transform_points(inverse_transform(world_T_ego), position), turn.T @ R @ turn)

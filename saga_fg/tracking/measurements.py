@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.tracking.ego_pose import RelativePositions
+from saga_fg.tracking.kinematics import RelativePositions
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values

@@ -1,4 +1,4 @@
-"""The simulator's scenes of more than cars: lights, cones, trailers and riders do what they are there for."""
+"""The simulator's scenarios: lights, cones, trailers and cyclists."""
 
 from __future__ import annotations
 
