@@ -16,7 +16,7 @@ from saga_fg.learning.gaps import GapSettings, sample_gaps
 from saga_fg.learning.independent_filter import FilteredTrajectories, filter_independently
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.by_class import DEFAULT, class_numbers
 
 ACCELERATION_NOISE = tuple(np.geomspace(0.003, 3.0, 7).tolist())  # m^2/s^3
 POSITION_NOISE = (0.01, 0.02, 0.05, 0.1, 0.2)  # m
@@ -62,5 +62,5 @@ class FilterNoise:
 
     def filtered(self, trajectories: Trajectories) -> FilteredTrajectories:
         """The trajectories, filtered with this noise."""
-        noise = [self.acceleration_noise.get(c, self.acceleration_noise[DEFAULT]) for c in trajectories.label.tolist()]
-        return filter_independently(trajectories, np.array(noise), self.position_noise)
+        noise = class_numbers(self.acceleration_noise, float, trajectories.label)
+        return filter_independently(trajectories, noise, self.position_noise)

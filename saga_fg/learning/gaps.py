@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.learning.independent_filter import FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -72,7 +73,7 @@ def gap_moments(trajectories: Trajectories, settings: GapSettings) -> tuple[IntA
     stride = max(1, round(settings.step / dt))
     spacing = max(1, round(settings.spacing / dt))
     steps = max(1, round(settings.longest / (stride * dt)))
-    return np.arange(0, len(trajectories) - 1, spacing), stride, steps
+    return np.arange(0, max(len(trajectories) - 1, 1), spacing), stride, steps
 
 
 def gap_ends(trajectories: Trajectories, settings: GapSettings) -> FloatArray:
@@ -93,8 +94,10 @@ def sample_gaps(
     settings: GapSettings | None = None,
     recording: int = 0,
 ) -> GapSample:
-    """All gaps of objects of some classes; neighbours may be of any."""
+    """All gaps of objects of some classes; neighbours may be of any. Raises `InputError` for an empty recording."""
     settings = settings or GapSettings()
+    if len(trajectories) == 0:
+        raise InputError("trajectories: expected at least one moment")
     starts, stride, steps = gap_moments(trajectories, settings)
     K, M = len(trajectories), settings.neighbours
     seen = np.isfinite(filtered.mean[..., 0])
@@ -107,8 +110,6 @@ def sample_gaps(
         known = seen[at[1:]] & inside[1:, None]
         enough = np.nan_to_num(filtered.followed[k], nan=-1.0) >= settings.followed - 1e-6
         rows = np.flatnonzero(target & enough & known.any(axis=0))
-        if len(rows) == 0:
-            continue
         position = filtered.mean[k, :, :2]
         distance = np.hypot(*np.moveaxis(position[None] - position[rows, None], -1, 0))
         distance = np.where(np.isfinite(distance) & (distance <= settings.reach), distance, np.inf)
@@ -140,33 +141,9 @@ def sample_gaps(
                 np.where(there, trajectories.label[near], ""),
             ]
         )
-    if not parts:
-        return _empty(steps, M)
     return GapSample(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _padded(columns: IntArray, M: int) -> IntArray:
     """(W, n <= M) with zeros up to M columns."""
     return np.pad(columns, ((0, 0), (0, M - columns.shape[1])))
-
-
-def _empty(S: int, M: int) -> GapSample:
-    none, text = np.empty(0, dtype=np.int64), np.empty(0, dtype="U64")
-    one, pair = np.empty(0), np.empty((0, S, M))
-    return GapSample(
-        moment=none,
-        row=none,
-        recording=none,
-        label=text,
-        mean=np.empty((0, 4)),
-        P=np.empty((0, 4, 4)),
-        heading=one,
-        has_moved=one,
-        dt=np.empty((0, S)),
-        measured=np.empty((0, S, 2)),
-        other_mean=np.empty((0, S, M, 4)),
-        other_heading=pair,
-        other_moved=pair,
-        other_seen=pair,
-        other_label=np.empty((0, M), dtype="U64"),
-    )

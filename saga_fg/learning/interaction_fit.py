@@ -25,7 +25,7 @@ from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedCourse
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.by_class import DEFAULT, class_numbers
 
 Rule = Following | Neighbours
 BOUNDS: Mapping[str, tuple[float, float]] = {
@@ -145,7 +145,7 @@ def couple_rules(
 
 def predict_with(sample: GapSample, fitted: FittedInteractions) -> GapPrediction:
     """Coast through gaps with fitted interactions."""
-    noise = np.array([fitted.acceleration_noise.get(c, fitted.acceleration_noise[DEFAULT]) for c in sample.label])
+    noise = class_numbers(fitted.acceleration_noise, float, sample.label)
     return predict_gaps(sample, couple_rules(fitted.rules, sample), noise, fitted.explained_noise)
 
 

@@ -13,7 +13,7 @@ from saga_fg.numerics.arrays import BoolArray, IntArray
 class Columns:
     """For dataclasses whose fields are arrays (n, ...), or other tables, row by row of the same n things.
 
-    A field that is a tuple is of the whole table, and the same in every selection.
+    A field that is neither belongs to the whole table, and is the same in every selection.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -27,9 +27,11 @@ class Columns:
         chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
         for name in self.__dataclass_fields__:
             column = getattr(self, name)
-            if not isinstance(column, tuple):
-                column = column.select(index) if isinstance(column, Columns) else column[index]
-            object.__setattr__(chosen, name, column)
+            if isinstance(column, Columns):
+                column = column.select(index)
+            elif isinstance(column, np.ndarray):  # anything else belongs to the whole table
+                column = column[index]
+            vars(chosen)[name] = column
         return chosen
 
     @classmethod

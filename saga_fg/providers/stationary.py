@@ -1,6 +1,6 @@
-"""Stationary objects: v ~ N(0, deviation^2 / dt), robust, so that one which drives off is let go.
+"""Stationary objects: v ~ N(0, deviation^2 / dt), robust, so that an object which drives off is given up.
 
-The variance shrinks with the length of the interval, so that a second says the same however often sensors speak.
+The variance shrinks with the length of the interval, so that a second has the same weight at any rate of frames.
 """
 
 from __future__ import annotations
@@ -36,7 +36,13 @@ class StationaryObjects(Settings):
         return Additions(
             factors=[
                 ResidualFactors(
-                    np.array(rows, dtype=np.uint64), (dim,), _velocity, R, _by_velocity, robust, name="standing object"
+                    np.array(rows, dtype=np.uint64),
+                    (dim,),
+                    _velocity,
+                    R,
+                    _by_velocity,
+                    robust,
+                    name="stationary object",
                 )
                 for dim, rows in dims.items()
             ]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_ids
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids
+from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
 
 
@@ -29,7 +30,7 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
+class Tracks(Columns):
     """All tracks of one moment, as columns, in world coordinates.
 
     timestamp            s
@@ -90,17 +91,3 @@ class Tracks:
 
     def __iter__(self) -> Iterator[Track]:
         return (self[row] for row in range(len(self)))
-
-    def select(self, rows: BoolArray | IntArray | slice | Sequence[int]) -> Self:
-        """The tracks of a mask, of row indices or of a slice."""
-        boxes = self.boxes.select(rows)
-        i = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        return type(self)(
-            self.timestamp,
-            self.id[i],
-            boxes,
-            self.score[i],
-            self.position_covariance[i],
-            self.velocity_covariance[i],
-            self.coasting[i],
-        )

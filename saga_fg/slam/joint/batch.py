@@ -20,7 +20,7 @@ from saga_fg.slam.joint.graph import Record, stationary_factors
 from saga_fg.slam.joint.landmarks import Observations, nearest_landmarks
 from saga_fg.slam.joint.lanes import LaneKeeping
 from saga_fg.slam.joint.odometry import OdometryIncrements
-from saga_fg.slam.joint.providers import StationaryObjects, VehicleAndObjects
+from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects
 from saga_fg.slam.joint.record import record_epochs
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
@@ -97,7 +97,7 @@ def _solved(
     for now in record:
         graph.advance(now.time)
         ask_all([epochs, *providers], graph)
-    name = StationaryObjects.name
+    name = StationaryPairs.name
     for probabilities in stationary:
         if probabilities is not None:
             graph.add_factors(name, stationary_factors(record, probabilities, settings), name)

@@ -70,7 +70,7 @@ class VehicleAndObjects:
         return Additions(new, factors)
 
 
-class StationaryObjects:
+class StationaryPairs:
     """Add factors of stationary objects for every two epochs, replaced where the probabilities have changed."""
 
     name = "stationary objects"
@@ -81,7 +81,7 @@ class StationaryObjects:
         self._record: Record = ()
         self._now: Sequence[FloatArray] = ()
 
-    def with_probabilities(self, record: Record, stationary: Sequence[FloatArray]) -> StationaryObjects:
+    def with_probabilities(self, record: Record, stationary: Sequence[FloatArray]) -> StationaryPairs:
         """With the probabilities (n,) of the objects of each epoch of the window."""
         self._record, self._now = list(record), stationary
         return self

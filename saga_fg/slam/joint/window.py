@@ -18,7 +18,7 @@ from saga_fg.graph import FactorProvider, GraphError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint.graph import error_key, object_key
-from saga_fg.slam.joint.providers import StationaryObjects, VehicleAndObjects
+from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects
 from saga_fg.slam.joint.record import RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
@@ -32,7 +32,7 @@ class Window:
     def __init__(self, settings: JointSettings, providers: Sequence[FactorProvider] = ()) -> None:
         relinearisation = RelinearisationSettings(_THRESHOLD, settings.max_iterations)
         self._settings, self._smoother = settings, IncrementalSmoother(providers, None, relinearisation)
-        self._stationary = StationaryObjects(settings)
+        self._stationary = StationaryPairs(settings)
         self.record: list[RecordedEpoch] = []
 
     @property
@@ -62,7 +62,7 @@ class Window:
         try:
             self._smoother.step(now.time, [new, given, *self._smoother.providers])
         except GraphError:
-            self._stationary = StationaryObjects(self._settings)  # whose factors are unknown now
+            self._stationary = StationaryPairs(self._settings)  # whose factors are unknown now
             raise
         self.record = record
         return self._smoother.solution()
