@@ -57,11 +57,11 @@ def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings
     profile = cell_order_statistics(points[:, 2], bin_, s.sectors * steps, 2).reshape(s.sectors, steps)
     found = []
     for row in np.flatnonzero(np.isfinite(profile).sum(axis=1) >= 4):
-        edge = _first_step(profile[row], s)
-        if edge is not None:
+        step = _first_step(profile[row], s)
+        if step is not None:
             angle = ((row + 0.5) / s.sectors - 0.5) * 2 * np.pi
-            out = s.min_range + (edge + 0.5) * s.spacing
-            found.append((out * np.cos(angle), out * np.sin(angle), profile[row, edge]))
+            out = s.min_range + (step + 0.5) * s.spacing
+            found.append((out * np.cos(angle), out * np.sin(angle), profile[row, step]))
     return np.array(found).reshape(-1, 3)
 
 

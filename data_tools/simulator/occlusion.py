@@ -53,10 +53,10 @@ def visible_share(viewpoint: FloatArray, boxes: Boxes, targets: IntArray, rays: 
     enters, leaves = _crossing(angle[target], centre[other], boxes.yaw[other], boxes.size[other])
     r = own[target]
     rise = boxes.size[other, 2] - viewpoint[2]
-    edge = np.where(rise[:, None] < 0, leaves, enters)
+    rim = np.where(rise[:, None] < 0, leaves, enters)
     hides = (enters < r) & np.isfinite(enters)
     with np.errstate(invalid="ignore"):
-        shadow = np.where(hides, viewpoint[2] + rise[:, None] * r / np.maximum(edge, 0.1), 0.0)
+        shadow = np.where(hides, viewpoint[2] + rise[:, None] * r / np.maximum(rim, 0.1), 0.0)
     highest = np.zeros((len(targets), rays))
     np.maximum.at(highest, target, shadow)
     height = boxes.size[targets, 2][:, None]

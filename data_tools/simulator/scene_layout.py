@@ -40,7 +40,7 @@ class SceneLayout:
     trailer: FloatArray
 
     @property
-    def edges(self) -> tuple[float, float]:
+    def borders(self) -> tuple[float, float]:
         """Offsets d of the outer borders of all traffic, m: right (negative), left."""
         half = abs(self.lanes.offset[1] - self.lanes.offset[0]) / 2
         outermost = self.lanes.offset.min() - self.lanes.approach

@@ -45,7 +45,7 @@ class DriverSettings(Settings):
     noise_time: Positive = setting(3.0, "correlation time of the random acceleration, s")
     politeness: NonNegative = setting(0.3, "weight of the new follower's loss in the decision to change lanes")
     change_threshold: NonNegative = setting(0.3, "lowest gain in acceleration for which a driver changes lanes, m/s^2")
-    safe_deceleration: NonNegative = setting(3.0, "hardest braking a lane change may cause, m/s^2")
+    safe_deceleration: NonNegative = setting(3.0, "largest deceleration that a lane change may cause, m/s^2")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, sample_sizes
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import Road
+from data_tools.simulator.scene_layout import SceneLayout
 from data_tools.simulator.settings import RoadworkSettings, SurroundingSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
@@ -30,24 +31,13 @@ class Surroundings:
 
 
 def sample_surroundings(
-    road: Road,
-    edges: tuple[float, float],
-    hedge: float | None,
-    window: tuple[float, float],
-    walkable: tuple[bool, bool],
-    settings: SurroundingSettings,
-    rng: np.random.Generator,
+    layout: SceneLayout, window: tuple[float, float], settings: SurroundingSettings, rng: np.random.Generator
 ) -> Surroundings:
-    """Random surroundings of the road for s within `window`, m.
-
-    edges     offsets d of the outermost lanes' outer borders, m: right (negative) and left (positive)
-    hedge     offset of the hedge between the directions, or None
-    walkable  parking and a pavement on the right, on the left
-    """
-    parked, occluders, pavements = [], [], []
-    for side, edge, walk in zip((-1.0, 1.0), edges, walkable, strict=True):
-        border = abs(edge) + 0.3
-        if walk:
+    """Random surroundings of the road for s within `window`, m; no parking and no pavement beside an ending lane."""
+    road, parked, occluders, pavements = layout.lanes.road, [], [], []
+    for side, offset in zip((-1.0, 1.0), layout.borders, strict=True):
+        border = abs(offset) + 0.3
+        if side > 0 or layout.lanes.ending < 0:
             if rng.random() < settings.parking_probability:
                 parked.append(_parked(road, side * (border + PARKING_WIDTH / 2), side, window, settings, rng))
                 border += PARKING_WIDTH
@@ -57,7 +47,7 @@ def sample_surroundings(
         depth = 10.0
         intervals = _intervals(window, settings.building_length, settings.building_gap, rng)
         occluders.append(_row(road, intervals, side * (border + depth / 2), depth, 9.0, "building"))
-    if hedge is not None:
+    if layout.hedge is not None:
         intervals = _intervals(window, settings.hedge_length, settings.hedge_gap, rng)
         pieces = [
             piece
@@ -66,7 +56,7 @@ def sample_surroundings(
                 np.linspace(start, end, int(np.ceil((end - start) / SEGMENT)) + 1), 2
             )
         ]
-        occluders.append(_row(road, np.array(pieces), hedge, 1.0, settings.hedge_height, "hedge"))
+        occluders.append(_row(road, np.array(pieces), layout.hedge, 1.0, settings.hedge_height, "hedge"))
     return Surroundings(Boxes.concatenate(parked), Boxes.concatenate(occluders), pavements)
 
 

@@ -78,22 +78,17 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     history = simulate_traffic(layout, settings, streams[1])
     vehicles, trailers = split_trailers(vehicle_trajectories(layout, history), layout.lanes, history, layout.trailer)
     ego = choose_ego(layout, history, streams[2])
-    around = sample_surroundings(
-        layout.lanes.road,
-        layout.edges,
-        layout.hedge,
-        (layout.focus + SURROUNDED[0], layout.focus + SURROUNDED[1]),
-        (layout.lanes.ending < 0, True),
-        settings.surroundings,
-        streams[3],
-    )
+    surrounded = (layout.focus + SURROUNDED[0], layout.focus + SURROUNDED[1])
+    around = sample_surroundings(layout, surrounded, settings.surroundings, streams[3])
     populated = (layout.focus + POPULATED[0], layout.focus + POPULATED[1])
     people = simulate_pedestrians(
         layout.lanes.road, around.pavements, populated, history.time, settings.pedestrians, streams[4]
     )
     parked = static_objects(_ids("parked", len(around.parked)), around.parked, history.time)
     others = vehicles.select(np.delete(np.arange(len(vehicles)), ego))
-    riders = simulate_cyclists(layout.lanes.road, layout.edges, populated, history.time, settings.cyclists, streams[5])
+    riders = simulate_cyclists(
+        layout.lanes.road, layout.borders, populated, history.time, settings.cyclists, streams[5]
+    )
     boxes = sample_cones(layout.lanes, settings.roadworks, streams[6])
     cones = static_objects(_ids("cone", len(boxes)), boxes, history.time)
     signals = signals_of(layout.lanes, layout.stop_lines, settings.lights)

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -30,9 +30,6 @@ from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
 from saga_fg.tracking import TimeVerdict
 
-if TYPE_CHECKING:
-    from pipelines.serving.state_keeper import StateKeeper
-
 log = logging.getLogger(__name__)
 
 Client = TypeVar("Client")
@@ -43,6 +40,18 @@ COUNTED = (
     *("messages", "frames", "out_of_order", "late", "unconfirmed", "repeats", "refused", "jumps"),
     *("failures", "restarts"),
 )
+
+
+class StateSaver(Protocol):
+    """Keeper of the stream's state on the disk, `pipelines.serving.state_keeper.StateKeeper`."""
+
+    def save(self) -> bool:
+        """Write the state; return True if it is on the disk now."""
+        ...
+
+    def status(self) -> dict[str, Any]:
+        """Return the age of the file and the latest error."""
+        ...
 
 
 class StreamedTracker(OnlineTracker, Protocol):
@@ -90,7 +99,7 @@ class StreamTracker(Generic[Client]):
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # ms
-        self.keeper: StateKeeper | None = None
+        self.keeper: StateSaver | None = None
         self.version = 0  # grows whenever there is something new to keep
         self._new_tracker = new_tracker
         self._tracker = new_tracker()

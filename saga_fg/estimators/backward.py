@@ -36,7 +36,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian, block_product, joint_block
 from saga_fg.estimators.correction import Gain, solve_lower
 from saga_fg.estimators.epoch import FilterStep
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped, zeros
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -103,12 +103,12 @@ class SmoothedCovariance:
 class MarginalCovariances:
     """The covariances of single nodes of one epoch: for each size of states, its rows and blocks (k, d, d)."""
 
-    layout: Layout
+    layout: StateLayout
     own: dict[int, FloatArray]
     place: IntArray  # (n,) of each node among those of its size
 
     @staticmethod
-    def of(layout: Layout, blocks: Callable[[IntArray], FloatArray]) -> MarginalCovariances:
+    def of(layout: StateLayout, blocks: Callable[[IntArray], FloatArray]) -> MarginalCovariances:
         """Marginals of all nodes; blocks: of rows whose states have equal size."""
         own, place = {}, np.empty(len(layout), dtype=np.int64)
         for d in np.unique(layout.dims).tolist():
@@ -171,7 +171,7 @@ def _swept(
         after_partition = partition
         if step.carried < len(partition.layout):
             carried = np.arange(step.carried)
-            layout = Layout(partition.layout.nodes[carried], partition.layout.dims[carried])
+            layout = StateLayout(partition.layout.nodes[carried], partition.layout.dims[carried])
             after_partition = partition.restricted(layout, carried)
         after = _moved(N, partition, after_partition)
 

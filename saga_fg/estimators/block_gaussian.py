@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -27,10 +27,10 @@ class BlockGaussian:
     @staticmethod
     def empty() -> BlockGaussian:
         """Gaussian of no node."""
-        return BlockGaussian(Partition.apart(Layout()), np.empty(0), ())
+        return BlockGaussian(Partition.apart(StateLayout()), np.empty(0), ())
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> StateLayout:
         return self.partition.layout
 
     def over(self, partition: Partition) -> BlockGaussian:
@@ -40,7 +40,7 @@ class BlockGaussian:
         rows = np.arange(len(self.layout))
         return BlockGaussian(partition, self.mean, regrouped(self.blocks, self.partition, partition, rows))
 
-    def extended(self, layout: Layout, means: FloatArray, covariances: FloatArray) -> BlockGaussian:
+    def extended(self, layout: StateLayout, means: FloatArray, covariances: FloatArray) -> BlockGaussian:
         """Add the further nodes of `layout`, independent of all others: means (k, d), covariances (k, d, d)."""
         if len(means) == 0:
             return self
@@ -149,7 +149,7 @@ def joint_block(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> 
     """The block of all nodes at `rows`, in this order, of any sizes: (D', D')."""
     if len(rows) == 0:
         return np.empty((0, 0))
-    some = Layout(np.arange(len(rows)), partition.layout.dims[rows])
+    some = StateLayout(np.arange(len(rows)), partition.layout.dims[rows])
     joint: FloatArray = regrouped(blocks, partition, Partition(some, np.zeros(len(rows), dtype=np.int64)), rows)[0][0]
     return joint
 

@@ -28,7 +28,7 @@ from factors.gaussian import native_factor
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import rank
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -57,7 +57,7 @@ class BlockVariables:
         partition = _divided(components, dynamics)
         return BlockVariables(partition, first_key + np.arange(partition.count), origin, scale)
 
-    def extended(self, layout: Layout, means: FloatArray, scale: FloatArray, first_key: int) -> BlockVariables:
+    def extended(self, layout: StateLayout, means: FloatArray, scale: FloatArray, first_key: int) -> BlockVariables:
         """Add the further nodes of `layout`, each a variable of its own."""
         partition = self.partition.extended(layout)
         keys = np.concatenate([self.keys, first_key + np.arange(partition.count - len(self.keys))])
@@ -267,7 +267,7 @@ def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:
     return Partition(layout, np.unique(label * (part.max() + 1) + part, return_inverse=True)[1].astype(np.int64))
 
 
-def _neighbours_together(layout: Layout, dynamics: Dynamics | None) -> IntArray:
+def _neighbours_together(layout: StateLayout, dynamics: Dynamics | None) -> IntArray:
     """Order the nodes so that those that interact are close (reverse Cuthill-McKee)."""
     if dynamics is None:
         return np.arange(len(layout))

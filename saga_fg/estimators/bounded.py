@@ -38,7 +38,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
@@ -225,7 +225,7 @@ def _conditional(gain: Gain, cluster: IntArray, owned: BoolArray) -> float:
 
 def _single(dims: IntArray, label: IntArray) -> Partition:
     """A partition of nodes of these sizes by any labels."""
-    return Partition(Layout(np.arange(len(dims)), dims), np.unique(label, return_inverse=True)[1].astype(np.int64))
+    return Partition(StateLayout(np.arange(len(dims)), dims), np.unique(label, return_inverse=True)[1].astype(np.int64))
 
 
 def gathered(x: BlockGaussian, partition: Partition, source: IntArray) -> BlockGaussian:

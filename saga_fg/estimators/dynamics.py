@@ -15,7 +15,7 @@ import scipy.sparse
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition
 from saga_fg.estimators.protocol import require_kind
 from saga_fg.model.transition import Blocks, Transition
@@ -29,13 +29,13 @@ class Dynamics:
     """x <- F x + b + q, q ~ N(0, Q) over the nodes of `layout` in its order; see
     `saga_fg.model.transition.Transition`."""
 
-    layout: Layout
+    layout: StateLayout
     F: tuple[Blocks, ...]
     b: FloatArray
     Q: tuple[Blocks, ...]
 
     @staticmethod
-    def of(transition: Transition, layout: Layout) -> Dynamics:
+    def of(transition: Transition, layout: StateLayout) -> Dynamics:
         """Dynamics of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
         require_kind("transition", transition, Transition)
         rows = layout.rows(transition.nodes)
@@ -49,7 +49,7 @@ class Dynamics:
         b[layout.places(rows)] = transition.b
         return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
 
-    def with_static(self, layout: Layout, others: IntArray) -> Dynamics:
+    def with_static(self, layout: StateLayout, others: IntArray) -> Dynamics:
         """Extend to `layout`, which has further nodes at the rows `others`: these stay as they are."""
         rows, b = np.delete(np.arange(len(layout)), others), np.zeros(layout.size)
         b[layout.places(rows)] = self.b
@@ -70,7 +70,7 @@ class Dynamics:
         some = self.only(rows)
         where = np.full(len(self.layout), -1)
         where[rows] = np.arange(len(rows))
-        layout = Layout(self.layout.nodes[rows], self.layout.dims[rows])
+        layout = StateLayout(self.layout.nodes[rows], self.layout.dims[rows])
         return Dynamics(layout, _renamed(some.F, where), self.b[self.layout.places(rows)], _renamed(some.Q, where))
 
     def times(self, x: FloatArray) -> FloatArray:
@@ -254,7 +254,7 @@ class PredictionSummary:
         return PredictionSummary(dynamics.joined(x.partition), mean, np.sqrt(variances), ratio)
 
 
-def identity(layout: Layout, rows: IntArray) -> tuple[Blocks, ...]:
+def identity(layout: StateLayout, rows: IntArray) -> tuple[Blocks, ...]:
     """Blocks of the nodes at `rows` that stay as they are."""
     alike = [rows[layout.dims[rows] == d] for d in np.unique(layout.dims[rows])]
     return tuple(Blocks(k, k, np.tile(np.eye(layout.dims[k[0]]), (len(k), 1, 1))) for k in alike)

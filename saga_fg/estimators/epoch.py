@@ -16,7 +16,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct
 from saga_fg.estimators.dynamics import Dynamics, predict
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -68,7 +68,7 @@ class FilterStep:
     dynamics: Dynamics | None = None
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> StateLayout:
         """All nodes of the epoch, with those that leave afterwards."""
         return self.filtered.layout
 
@@ -107,7 +107,7 @@ class FilterStep:
         return replace(self, dynamics=dynamics), predict(dynamics.separated(x), dynamics)
 
 
-def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> list[FloatArray]:
+def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[StateLayout]) -> list[FloatArray]:
     """Joint means of every epoch by the dynamics alone, without measurements."""
     means, mean = [], prior.mean
     for epoch, layout in zip(epochs, layouts, strict=True):

@@ -18,7 +18,7 @@ from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
-from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
@@ -36,7 +36,7 @@ class GraphState:
     until providers are asked again."""
 
     graph: SceneFactorGraph
-    layout: Layout
+    layout: StateLayout
     keys: Mapping[int, int]
     auxiliary: tuple[int, ...]
 
@@ -58,7 +58,7 @@ class GraphFilter(LatestMarginals):
         self._relinearised = relinearised or bool(providers)
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
-        self._layout = Layout()
+        self._layout = StateLayout()
         self._keys: Mapping[int, int] = {}
         self._auxiliary: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._posterior: BlockGaussian | None = None  # until the graph changes

@@ -25,7 +25,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.joint_gaussian import joint_gaussian
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
@@ -155,7 +155,7 @@ class IncrementalSmoother:
             LinearisationPoint(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged
         )
 
-    def joint_gaussian(self, layout: Layout, keys: Sequence[int]) -> BlockGaussian:
+    def joint_gaussian(self, layout: StateLayout, keys: Sequence[int]) -> BlockGaussian:
         """The joint Gaussian of variables by components, as `saga_fg.estimators.joint_gaussian` has it."""
         engine = self._ready()
         return joint_gaussian(self._graph, engine.linear(), layout, keys)

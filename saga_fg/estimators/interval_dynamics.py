@@ -25,7 +25,7 @@ from factors import ResidualFactors
 from factors.validation import KeyArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.dynamics import Dynamics, identity
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.node import NodeType, NonlinearMotion
@@ -55,12 +55,12 @@ class IntervalDynamics:
         """The nonlinear dynamics of the transition's graph."""
         return nonlinear_dynamics(self.transition)
 
-    def nonlinear_rows(self, layout: Layout) -> list[tuple[NonlinearDynamics, IntArray]]:
+    def nonlinear_rows(self, layout: StateLayout) -> list[tuple[NonlinearDynamics, IntArray]]:
         """Nonlinear dynamics with their rows (n, 1 + k) of `layout`."""
         place = layout.rows(self.transition.nodes)
         return [(group, place[group.rows]) for group in self.nonlinear]
 
-    def check(self, layout: Layout) -> None:
+    def check(self, layout: StateLayout) -> None:
         """Raise `InputError` or `UnknownNodeError` unless it is about exactly the nodes of `layout`, each once."""
         Dynamics.of(self.transition, layout)
 
@@ -70,7 +70,7 @@ class IntervalDynamics:
         first, rest = discretise(graph, dt), discretise(graph.after(dt), self.transition.dt - dt)
         return IntervalDynamics(first), IntervalDynamics(rest)
 
-    def linearised(self, layout: Layout, mean: FloatArray) -> Dynamics:
+    def linearised(self, layout: StateLayout, mean: FloatArray) -> Dynamics:
         """The linear dynamics over the nodes of `layout`, nonlinear ones linearised at the joint state `mean`."""
         linear = Dynamics.of(self.transition, layout)
         if self.linear:
@@ -102,7 +102,7 @@ class ZeroInterval:
     dt: float = 0.0
     linear: bool = True
 
-    def linearised(self, layout: Layout, mean: FloatArray) -> Dynamics:
+    def linearised(self, layout: StateLayout, mean: FloatArray) -> Dynamics:
         """The identity."""
         return Dynamics(layout, identity(layout, np.arange(len(layout))), np.zeros(len(mean)), ())
 

@@ -27,7 +27,7 @@ from saga_fg.estimators.correction import innovation_likelihood, posterior_likel
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
 from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
 from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.partition import Partition
@@ -62,7 +62,7 @@ class _State:
     before  the Gaussian before the `epochs`: the last interval, and the present
     """
 
-    live: Layout
+    live: StateLayout
     tree: BayesTree | None
     x: BlockGaussian | None
     before: BlockGaussian

@@ -21,7 +21,7 @@ from factors.marginal import Elimination
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.graph.messages import solver_error, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -33,7 +33,7 @@ _LIMIT_WIDE = 1e6  # the same by Cholesky
 
 
 def joint_gaussian(
-    graph: SceneFactorGraph, linear: gtsam.GaussianFactorGraph, layout: Layout, keys: Sequence[int]
+    graph: SceneFactorGraph, linear: gtsam.GaussianFactorGraph, layout: StateLayout, keys: Sequence[int]
 ) -> BlockGaussian:
     """The joint Gaussian of variables, whose ids in `layout` are those of nodes or their keys.
 

@@ -29,7 +29,7 @@ from saga_fg.estimators.correction import WhitenedFactor, correct_whitened
 from saga_fg.estimators.dynamics import Dynamics, identity, predict
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import replace_by_prior
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.keys import node_kind
@@ -59,7 +59,7 @@ class AuxiliaryVariables:
     graph: SceneFactorGraph = field(default_factory=SceneFactorGraph)
     labels: Mapping[int, str] = field(default_factory=dict)
 
-    def rows(self, layout: Layout) -> IntArray:
+    def rows(self, layout: StateLayout) -> IntArray:
         """Rows of the auxiliary variables in the joint state."""
         known = self.graph.variables
         every = enumerate(layout.nodes.tolist()) if known else ()

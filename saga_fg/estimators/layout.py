@@ -13,7 +13,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covar
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class StateLayout:
     """Ids of the nodes (n,) in order, the sizes of their states (n,), and their places in the joint state (n + 1,)."""
 
     nodes: IntArray = ()  # type: ignore[assignment]  # arrays from construction on
@@ -64,18 +64,18 @@ class Layout:
         ends = np.cumsum(dims)
         return np.asarray(np.repeat(self.offsets[rows] - (ends - dims), dims) + np.arange(ends[-1]))
 
-    def extended(self, nodes: ArrayLike, dim: int) -> Layout:
+    def extended(self, nodes: ArrayLike, dim: int) -> StateLayout:
         """Add nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
         ids = checked_ids("nodes", nodes)
         for node in ids.tolist():
             if node in self._row:
                 raise InputError(f"node {node} is in the estimator already")
-        return Layout(np.concatenate([self.nodes, ids]), np.concatenate([self.dims, np.full(len(ids), dim)]))
+        return StateLayout(np.concatenate([self.nodes, ids]), np.concatenate([self.dims, np.full(len(ids), dim)]))
 
-    def without(self, rows: IntArray) -> Layout:
+    def without(self, rows: IntArray) -> StateLayout:
         keep = np.ones(len(self), dtype=bool)
         keep[rows] = False
-        return Layout(self.nodes[keep], self.dims[keep])
+        return StateLayout(self.nodes[keep], self.dims[keep])
 
 
 def checked_prior(nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ import numpy as np
 from factors import FactorError, MeasurementModel, Robust
 from saga_fg.errors import InputError
 from saga_fg.estimators.graduated import GraduatedNonConvexity
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.protocol import Measurements, require_kind
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -106,7 +106,7 @@ class RecordedMeasurements:
         measured = self.measured
         return int(measured.H.shape[2]) if isinstance(measured, Measurements) else measured.model.state_dim
 
-    def check(self, layout: Layout) -> None:
+    def check(self, layout: StateLayout) -> None:
         """Raise `UnknownNodeError` or `InputError` unless the nodes are in `layout` and of the right size."""
         span = layout.spans(layout.rows(self.measured.nodes))
         if len(span) and span.shape[1] != self.state_dim:
@@ -114,7 +114,7 @@ class RecordedMeasurements:
                 f"H: expected {span.shape[1]} columns, the size of the nodes' states, got {self.state_dim}"
             )
 
-    def linearised(self, layout: Layout, mean: FloatArray) -> LinearisedMeasurements:
+    def linearised(self, layout: StateLayout, mean: FloatArray) -> LinearisedMeasurements:
         """Linearise around the joint state `mean` (D,) of `layout`."""
         measured = self.measured
         rows = layout.rows(measured.nodes)
@@ -127,12 +127,12 @@ class RecordedMeasurements:
         root = np.sqrt(self.weights_at(layout, mean))
         return LinearisedMeasurements(rows, root[:, None] * z, root[:, None, None] * H, measured.R)
 
-    def distances(self, layout: Layout, mean: FloatArray) -> FloatArray:
+    def distances(self, layout: StateLayout, mean: FloatArray) -> FloatArray:
         """(m,) distances || z - h(x) ||_R of the residuals at the joint state `mean`, in standard deviations."""
         residual, _ = self._residual(mean[layout.spans(layout.rows(self.measured.nodes))])
         return _distances(residual, self.measured.R)
 
-    def weights_at(self, layout: Layout, mean: FloatArray) -> FloatArray:
+    def weights_at(self, layout: StateLayout, mean: FloatArray) -> FloatArray:
         """(m,) the weight of each measurement at the joint state `mean`."""
         if self.weights is not None:
             return self.weights

@@ -32,7 +32,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.keys import node_key, node_kind
@@ -60,7 +60,7 @@ def prior_graph(x: BlockGaussian, time: float) -> SceneFactorGraph:
 
 
 def recording_graph(
-    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[Layout], means: Sequence[FloatArray]
+    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[StateLayout], means: Sequence[FloatArray]
 ) -> SceneFactorGraph:
     """The graph of `epochs` after `prior`; layouts and smoothed means of each epoch's joint state.
 
@@ -85,7 +85,7 @@ def recording_graph(
 
 
 def recording_factors(
-    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[Layout], means: Sequence[FloatArray]
+    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[StateLayout], means: Sequence[FloatArray]
 ) -> list[EpochFactors]:
     """The factors epoch by epoch, nonlinear ones and noise at the means. Raises `FactorError`, as the graph."""
     result: list[EpochFactors] = []
@@ -158,7 +158,7 @@ def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
 
 def interval_factors(
     interval: IntervalDynamics | ZeroInterval,
-    layout: Layout,
+    layout: StateLayout,
     mean: FloatArray,
     keys: dict[int, int],
     next_keys: dict[int, int],
@@ -259,7 +259,7 @@ class Interactions:
             return Additions()
         earlier = self.earlier or {node: node_key(node, view.epoch - 1) for node in nodes}
         now = {node: node_key(node, view.epoch) for node in nodes}
-        layout = Layout(nodes, transition.graph.dims)
+        layout = StateLayout(nodes, transition.graph.dims)
         mean = np.concatenate([view.state(earlier[node]) for node in nodes])
         interval = IntervalDynamics(transition)
         dynamics = interval.linearised(layout, mean)

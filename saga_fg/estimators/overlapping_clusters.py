@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -54,7 +54,7 @@ class OverlappingClusters:
     stale    (M,) for how many steps the node has been out of reach
     """
 
-    layout: Layout
+    layout: StateLayout
     owner: IntArray
     cluster: IntArray
     node: IntArray
@@ -63,12 +63,12 @@ class OverlappingClusters:
     @staticmethod
     def empty() -> OverlappingClusters:
         none = np.empty(0, dtype=np.int64)
-        return OverlappingClusters(Layout(), none, none, none, none)
+        return OverlappingClusters(StateLayout(), none, none, none, none)
 
     @cached_property
     def partition(self) -> Partition:
         """The partition of the copies into clusters."""
-        return Partition(Layout(np.arange(len(self.node)), self.layout.dims[self.node]), self.cluster)
+        return Partition(StateLayout(np.arange(len(self.node)), self.layout.dims[self.node]), self.cluster)
 
     @cached_property
     def owned_copy(self) -> IntArray:
@@ -96,7 +96,7 @@ class OverlappingClusters:
         first = np.repeat(np.cumsum(count[rows]) - count[rows], count[rows])
         return which, order[np.repeat(start[rows], count[rows]) + np.arange(len(which)) - first]
 
-    def extended(self, layout: Layout) -> tuple[OverlappingClusters, IntArray]:
+    def extended(self, layout: StateLayout) -> tuple[OverlappingClusters, IntArray]:
         """Add the further nodes of `layout`, each in a cluster of its own; and the old copy of each, -1: new."""
         old, new = len(self.layout), np.arange(len(self.layout), len(layout))
         alone = int(self.owner.max(initial=-1)) + 1 + np.arange(len(new))

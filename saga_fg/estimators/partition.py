@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _FEW = 4  # components of a size that are not worth a batched operation of their own
@@ -31,11 +31,11 @@ class Partition:
     label   (n,) component of every node, numbered from 0 without gaps
     """
 
-    layout: Layout
+    layout: StateLayout
     label: IntArray
 
     @staticmethod
-    def apart(layout: Layout) -> Partition:
+    def apart(layout: StateLayout) -> Partition:
         """Every node a component of its own."""
         return Partition(layout, np.arange(len(layout)))
 
@@ -155,11 +155,11 @@ class Partition:
         number[chosen] = chosen.min()
         return Partition(self.layout, _without_gaps(number[self.label]))
 
-    def extended(self, layout: Layout) -> Partition:
+    def extended(self, layout: StateLayout) -> Partition:
         """Add the further nodes at the end of `layout`, each a component of its own."""
         return Partition(layout, np.concatenate([self.label, self.count + np.arange(len(layout) - len(self.layout))]))
 
-    def restricted(self, layout: Layout, rows: IntArray) -> Partition:
+    def restricted(self, layout: StateLayout, rows: IntArray) -> Partition:
         """Partition of the nodes at `rows` alone, which are those of `layout`."""
         return Partition(layout, _without_gaps(self.label[rows]))
 

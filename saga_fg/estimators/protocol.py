@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
@@ -151,7 +151,7 @@ class LatestMarginals:
         raise NotImplementedError
 
 
-def live_rows(x: BlockGaussian, live: Layout, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
+def live_rows(x: BlockGaussian, live: StateLayout, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
     """A Gaussian that may have nodes that have left since, and which of its rows are `nodes`."""
     rows = live.rows(nodes)
     return x, rows if len(live) == len(x.layout) else x.layout.rows(live.nodes[rows])

@@ -12,7 +12,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
 from saga_fg.estimators.recording import Recording
@@ -29,7 +29,7 @@ class SmoothedState:
     """
 
     time: float
-    layout: Layout
+    layout: StateLayout
     state: FloatArray
     P: SmoothedCovariance | MarginalCovariances | None = None
 

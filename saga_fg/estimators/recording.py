@@ -26,7 +26,7 @@ from saga_fg.estimators.backward import (
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.layout import Layout, checked_prior
+from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.protocol import require_kind
@@ -63,7 +63,7 @@ class RecordingState:
 
     prior: BlockGaussian
     epochs: tuple[Epoch, ...]
-    layouts: tuple[Layout, ...]
+    layouts: tuple[StateLayout, ...]
     steps: tuple[FilterStep, ...]
     converged: bool
 
@@ -78,7 +78,7 @@ class Recording:
     def __init__(self, settings: GaussNewtonSettings | None = None, lazy: bool = False) -> None:
         self._settings = settings or GaussNewtonSettings()
         self._lazy = lazy
-        self._layout: Layout | None = None
+        self._layout: StateLayout | None = None
         self._means: list[FloatArray] | None = None
         self._covariances: list[SmoothedCovariance] | None = None
         self._marginals: list[MarginalCovariances] | None = None
@@ -122,7 +122,7 @@ class Recording:
         return not self._nonlinear
 
     @property
-    def layouts(self) -> Sequence[Layout]:
+    def layouts(self) -> Sequence[StateLayout]:
         """Layout of each epoch's nodes, with those that leave afterwards."""
         return self._layouts
 
@@ -133,7 +133,7 @@ class Recording:
         return self._steps
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> StateLayout:
         """Layout of the present nodes."""
         if self._layout is None:
             leaving = self._layouts[-1].rows(self._epochs[-1].leaving)
@@ -297,7 +297,7 @@ class Recording:
         self._converged &= interval.linear or not self._lazy
         self._changed()
 
-    def _epoch_at(self, time: float) -> tuple[int, list[Epoch], list[Layout]]:
+    def _epoch_at(self, time: float) -> tuple[int, list[Epoch], list[StateLayout]]:
         """The epoch of `time`, with epochs and layouts in which it is, an interval split if need be."""
         epochs, layouts = list(self._epochs), list(self._layouts)
         time = float(checked("time", time, ()))

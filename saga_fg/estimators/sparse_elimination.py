@@ -32,7 +32,7 @@ from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.graph_solution import NoSolution, tree_covariances
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import recording_factors
 from saga_fg.estimators.recording import Recording
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -79,7 +79,7 @@ class SparseSolution:
         solved = [np.concatenate([np.empty(0), *(values.atVector(key) for key in own.values())]) for own in keys]
         return SparseSolution(solved, keys, dims, tree)
 
-    def covariances(self, layouts: Sequence[Layout]) -> list[MarginalCovariances]:
+    def covariances(self, layouts: Sequence[StateLayout]) -> list[MarginalCovariances]:
         """Marginals of all nodes, by epoch."""
         if self.known is None:
             blocks = tree_covariances(self.tree, self.dims)
@@ -90,7 +90,9 @@ class SparseSolution:
         return self.known
 
 
-def _blocks_of(blocks: Mapping[int, FloatArray], keys: Mapping[int, int], layout: Layout, rows: IntArray) -> FloatArray:
+def _blocks_of(
+    blocks: Mapping[int, FloatArray], keys: Mapping[int, int], layout: StateLayout, rows: IntArray
+) -> FloatArray:
     return np.array([blocks[keys[node]] for node in layout.nodes[rows].tolist()])
 
 
@@ -141,7 +143,7 @@ def _mixed(values: gtsam.Values, step: gtsam.VectorValues, accelerated: Anderson
     return mixed
 
 
-def cheapest_order(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> Order:
+def cheapest_order(epochs: Sequence[Epoch], layouts: Sequence[StateLayout]) -> Order:
     """The order that would take least time."""
     estimates: dict[Order, float] = {"time": _seconds_in_time(epochs, layouts)}
     if estimates["time"] > _WORTH_A_LOOK:
@@ -156,7 +158,7 @@ def cheapest_order(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> Order:
     return min(estimates, key=lambda name: estimates[name])
 
 
-def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> float:
+def _seconds_in_time(epochs: Sequence[Epoch], layouts: Sequence[StateLayout]) -> float:
     """Seconds of filter and smoother over components joined through all epochs."""
     nodes = np.unique(np.concatenate([layout.nodes for layout in layouts]))
     a, b = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
@@ -207,7 +209,7 @@ def _symbolic(factors: Sequence[Sequence[int]]) -> gtsam.SymbolicFactorGraph:
     return graph
 
 
-def _structure(epochs: Sequence[Epoch], layouts: Sequence[Layout]) -> tuple[list[list[int]], IntArray]:
+def _structure(epochs: Sequence[Epoch], layouts: Sequence[StateLayout]) -> tuple[list[list[int]], IntArray]:
     """Keys of the states of each interaction, counted through the nodes of all epochs; and their sizes."""
     first = np.concatenate([[0], np.cumsum([len(layout) for layout in layouts])]).tolist()
     factors: list[list[int]] = [[key] for key in range(first[1])]  # what was known before

@@ -21,7 +21,7 @@ LARGEST = _FOR_ALL_TIME - 1  # id or epoch
 
 
 @dataclass(frozen=True)
-class Kind:
+class VariableKind:
     """A kind of variable: its name, and the letter (A-Z, a-z) by which keys tell it from other kinds."""
 
     name: str
@@ -32,13 +32,13 @@ class Kind:
             raise GraphError(f"kind {self.name!r}: expected one letter from A to Z or a to z, got {self.letter!r}")
 
 
-OBJECT = Kind("object", "o")
-EGO_POSE = Kind("ego pose", "x")
-EGO_VELOCITY = Kind("ego velocity", "v")
-EGO_BIAS = Kind("ego bias", "b")  # of accelerometers and gyroscopes
-EGO_ERROR = Kind("ego error", "e")  # slow errors of the odometry
-LANDMARK = Kind("landmark", "l")
-MAP_NODE = Kind("map node", "m")
+OBJECT = VariableKind("object", "o")
+EGO_POSE = VariableKind("ego pose", "x")
+EGO_VELOCITY = VariableKind("ego velocity", "v")
+EGO_BIAS = VariableKind("ego bias", "b")  # of accelerometers and gyroscopes
+EGO_ERROR = VariableKind("ego error", "e")  # slow errors of the odometry
+LANDMARK = VariableKind("landmark", "l")
+MAP_NODE = VariableKind("map node", "m")
 KINDS = (OBJECT, EGO_POSE, EGO_VELOCITY, EGO_BIAS, EGO_ERROR, LANDMARK, MAP_NODE)
 
 
@@ -51,7 +51,7 @@ class KeyId:
     epoch: int | None
 
 
-def key_of(kind: Kind, id: int, epoch: int | None) -> int:  # noqa: A002 -- an id is what it is
+def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- an id is what it is
     """Return the key. Raises `GraphError` for an id or epoch that is no whole number from 0 to `LARGEST`."""
     for name, number in (("id", id), ("epoch", 0 if epoch is None else epoch)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 0 <= number <= LARGEST:
@@ -60,7 +60,7 @@ def key_of(kind: Kind, id: int, epoch: int | None) -> int:  # noqa: A002 -- an i
     return ord(kind.letter) << 2 * _BITS | int(id) << _BITS | when
 
 
-def node_kind(node: int) -> tuple[Kind, int]:
+def node_kind(node: int) -> tuple[VariableKind, int]:
     """Kind and id of a node of an estimator; those of a road map count down from -1."""
     return (OBJECT, node) if node >= 0 else (MAP_NODE, -node)
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from saga_fg.graph.errors import GraphError, ProviderError
 from saga_fg.graph.factor_checks import Factor
-from saga_fg.graph.keys import Kind, key_of
+from saga_fg.graph.keys import VariableKind, key_of
 from saga_fg.graph.messages import with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, NewVariable
@@ -97,19 +97,19 @@ class GraphView:
         """All variables by key."""
         return self._graph.variables
 
-    def now(self, kind: Kind) -> dict[int, GraphVariable]:
+    def now(self, kind: VariableKind) -> dict[int, GraphVariable]:
         """The variables of a kind at this epoch, by id."""
         return self._graph.of(kind, self.epoch)
 
-    def before(self, kind: Kind) -> dict[int, GraphVariable]:
+    def before(self, kind: VariableKind) -> dict[int, GraphVariable]:
         """The variables of a kind at the epoch before, by id."""
         return self._graph.of(kind, self.epoch - 1)
 
-    def static(self, kind: Kind) -> dict[int, GraphVariable]:
+    def static(self, kind: VariableKind) -> dict[int, GraphVariable]:
         """The variables of a kind for all time, by id."""
         return self._graph.of(kind, None)
 
-    def key(self, kind: Kind, id: int, static: bool = False) -> int:  # noqa: A002 -- an id is what it is
+    def key(self, kind: VariableKind, id: int, static: bool = False) -> int:  # noqa: A002 -- an id is what it is
         """The key of a variable of this epoch, or of one for all time; whether it is there or only to be added."""
         key = key_of(kind, id, None if static else self.epoch)
         return self._graph.carried_over.get(key, key)

@@ -36,7 +36,7 @@ from saga_fg.graph.factor_groups import (
     NativeGroup,
     PriorGroup,
 )
-from saga_fg.graph.keys import Kind, described, key_of
+from saga_fg.graph.keys import VariableKind, described, key_of
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.messages import factor_error, solver_error
 from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state, variable_type
@@ -116,8 +116,8 @@ class SceneFactorGraph:
                 raise GraphError(f"provider {provider}: expected NewVariable, got {type(new).__name__}")
             if self.epoch < 0:
                 raise GraphError(f"provider {provider}: expected an epoch before variables: advance(time)")
-            if not isinstance(new.kind, Kind):
-                raise GraphError(f"provider {provider}: expected a Kind of variable, got {type(new.kind).__name__}")
+            if not isinstance(new.kind, VariableKind):
+                raise GraphError(f"provider {provider}: expected a VariableKind, got {type(new.kind).__name__}")
             epoch, time = (None, None) if new.static else (self.epoch, self.time)
             key = key_of(new.kind, new.id, epoch)
             kind = new.type or variable_type(f"provider {provider}: {new.kind.name} {new.id}", new.state)
@@ -216,7 +216,7 @@ class SceneFactorGraph:
         """Variables without any factor."""
         return [key for key, count in self._factor_counts.items() if count == 0]
 
-    def of(self, kind: Kind, epoch: int | None) -> dict[int, GraphVariable]:
+    def of(self, kind: VariableKind, epoch: int | None) -> dict[int, GraphVariable]:
         """The variables of a kind and an epoch, None for those for all time, by id."""
         carried_over = set(self.carried_over.values()) if epoch == self.epoch else ()
         every = (one for one in self._variables.values() if one.epoch == epoch or one.key in carried_over)

@@ -20,7 +20,7 @@ import numpy as np
 
 from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from saga_fg.graph.errors import GraphError
-from saga_fg.graph.keys import Kind
+from saga_fg.graph.keys import VariableKind
 from saga_fg.numerics.arrays import FloatArray
 
 _STEP = 1e-6
@@ -31,7 +31,7 @@ class GraphVariable:
     """key; kind; id; epoch and time (s), None for what has one variable for all time; type; label: a word for it."""
 
     key: int
-    kind: Kind
+    kind: VariableKind
     id: int
     epoch: int | None
     time: float | None
@@ -55,7 +55,7 @@ class NewVariable:
     by default the vector, pose or plane that the state is
     """
 
-    kind: Kind
+    kind: VariableKind
     id: int
     state: Any
     static: bool = False

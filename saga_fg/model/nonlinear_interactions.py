@@ -11,7 +11,7 @@ equation 2 without body contact). The first is that of Treiber, Hennecke, Helbin
 10.1103/PhysRevE.62.1805, equations 3 and 4) with round corners: at a corner a least-squares solution has no
 linearisation, and solvers do not converge.
 
-    f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + hardest
+    f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + max_deceleration
     s* = s0 + S(v T + v (v - w) / (2 sqrt(a b))),    S(x) = log(1 + e^x) for max(0, x), s likewise, m
     f  = -v / t_stop + h S((f0 + v / t_stop) / h)    for max(f0, -v / t_stop): vehicles do not reverse; h 0.05 m/s^2
 

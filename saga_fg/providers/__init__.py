@@ -9,10 +9,19 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
 from saga_fg.providers.gps import Gps
 from saga_fg.providers.imu import Imu
 from saga_fg.providers.landmarks import Landmarks
-from saga_fg.providers.lanes import Lanes
+from saga_fg.providers.lanes import LaneKeeping
 from saga_fg.providers.odometry import Odometry
 from saga_fg.providers.relative_detections import RelativeDetections
 from saga_fg.providers.start import StartSettings
 from saga_fg.providers.stationary import StationaryObjects
 
-__all__ = ["Gps", "Imu", "Landmarks", "Lanes", "Odometry", "RelativeDetections", "StartSettings", "StationaryObjects"]
+__all__ = [
+    "Gps",
+    "Imu",
+    "Landmarks",
+    "LaneKeeping",
+    "Odometry",
+    "RelativeDetections",
+    "StartSettings",
+    "StationaryObjects",
+]

@@ -27,7 +27,7 @@ _LETS_GO = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
-class Lanes(Settings):
+class LaneKeeping(Settings):
     """Attracts vehicles that drive along a lane to its centre line."""
 
     lanes: tuple[Lane, ...] = settings_group(tuple, "lanes in world coordinates")

@@ -32,7 +32,7 @@ from factors import (
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import interval_factors
 from saga_fg.graph import EGO_ERROR, OBJECT, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -110,7 +110,7 @@ def _priors(k: int, new: RecordedObjects) -> list[gtsam.JacobianFactor]:
 def _motions(k: int, transition: Transition) -> list[gtsam.JacobianFactor]:
     """Motion and interactions from the epoch before."""
     nodes = transition.nodes.tolist()
-    layout = Layout(nodes, transition.graph.dims)
+    layout = StateLayout(nodes, transition.graph.dims)
     before, now = ({name: object_key(at, name) for name in nodes} for at in (k - 1, k))
     interval = IntervalDynamics(transition)
     if not interval.linear:

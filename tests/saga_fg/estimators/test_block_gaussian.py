@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition
 
 
 def random_gaussian(rng, nodes, dims, label):
-    layout = Layout(nodes, dims)
+    layout = StateLayout(nodes, dims)
     partition = Partition(layout, np.unique(label, return_inverse=True)[1])
     blocks = []
     for places in partition.groups:

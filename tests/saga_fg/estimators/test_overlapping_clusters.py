@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from saga_fg.estimators.layout import Layout
+from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency, bisected
 
 
@@ -25,7 +25,7 @@ def grid(width, height):
 
 
 def fresh(n, dim=4):
-    return OverlappingClusters.empty().extended(Layout(np.arange(n), np.full(n, dim)))[0]
+    return OverlappingClusters.empty().extended(StateLayout(np.arange(n), np.full(n, dim)))[0]
 
 
 def distances(graph):
@@ -121,6 +121,6 @@ def test_where_bounds_cover_the_graph_there_is_no_halo():
 
 @pytest.mark.parametrize("dims", [[4, 4, 2, 6, 4, 2]])
 def test_clusters_are_numbered_by_the_size_of_their_states(dims):
-    clusters, _ = OverlappingClusters.empty().extended(Layout(np.arange(6), dims))
+    clusters, _ = OverlappingClusters.empty().extended(StateLayout(np.arange(6), dims))
     assert clusters.layout.dims[clusters.node].tolist() == sorted(dims)
     assert clusters.owner[clusters.node].tolist() == list(range(6))

@@ -17,9 +17,9 @@ from saga_fg.graph import (
     Additions,
     GraphError,
     KeyId,
-    Kind,
     NewVariable,
     SceneFactorGraph,
+    VariableKind,
     key_id,
     key_of,
 )
@@ -40,7 +40,7 @@ class Once:
 @pytest.mark.parametrize("epoch", [0, 1, 34, LARGEST, None])
 @pytest.mark.parametrize("number", [0, 12, LARGEST])
 def test_keys_can_be_read_back(number, epoch):
-    kinds = (OBJECT, EGO_POSE, LANDMARK, MAP_NODE, Kind("beacon", "B"))
+    kinds = (OBJECT, EGO_POSE, LANDMARK, MAP_NODE, VariableKind("beacon", "B"))
     for kind in kinds:
         assert key_id(key_of(kind, number, epoch)) == KeyId(kind.letter, number, epoch)
     assert len({key_of(kind, number, epoch) for kind in kinds}) == len(kinds)
@@ -56,7 +56,7 @@ def test_keys_in_words_and_those_that_are_none():
     with pytest.raises(GraphError, match="expected a key made by key_of"):
         key_id(17)
     with pytest.raises(GraphError, match="expected one letter"):
-        Kind("wall", "wa")
+        VariableKind("wall", "wa")
 
 
 def driven(lag=None, frames=6, seed=2):

@@ -23,7 +23,7 @@ from saga_fg.graph import (
     NewVariable,
 )
 from saga_fg.model.landmarks.point import PointLandmark
-from saga_fg.providers import Gps, Imu, Landmarks, Lanes, Odometry, StartSettings, StationaryObjects
+from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings, StationaryObjects
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
 from saga_fg.types.landmark import Observation
@@ -233,7 +233,7 @@ def test_vehicles_keep_to_a_lane_that_the_map_has_too_far_left() -> None:
     sensors = {"sharp": Sensor(noise={"default": NoiseModel(position=0.1)})}
     sensors["dull"] = Sensor(noise={"default": NoiseModel(position=2.0)}, use_velocity=False)
     off = {}
-    for providers in ((), (Lanes((lane,), deviation=0.3, map_deviation=1.0),)):
+    for providers in ((), (LaneKeeping((lane,), deviation=0.3, map_deviation=1.0),)):
         rng = np.random.default_rng(2)
         tracker = Tracker(settings, sensors, providers=[*providers, StationaryObjects()])
         for k in range(60):
