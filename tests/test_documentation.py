@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from data_tools.simulator import SimulatorSettings
+from pipelines.config import TrackConfig
+from pipelines.configuration.schema import Listing, Nullable, Schema, Section, Table, settings_of
+from pipelines.serving import StreamSettings
+from pipelines.slam.configuration import SlamSettings
+from saga_fg import Tracker
+from saga_fg.smoothing import SmoothingSettings
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
@@ -15,6 +25,51 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.
 
 def page_name(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
+
+
+def code_spans(page: Path) -> list[str]:
+    """The texts in backticks outside of code blocks."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    return re.findall(r"`([^`]+)`", text)
+
+
+def resolves(name: str) -> bool:
+    """A module, or an attribute of one."""
+    try:
+        pkgutil.resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+def setting_names(where: str, schema: Schema) -> Iterator[str]:
+    """The dotted names at and below one setting; `*` for a key of a table, any of several kinds of a section."""
+    yield where
+    match schema:
+        case Nullable(inner):
+            yield from setting_names(where, inner)
+        case Table(inner):
+            yield from setting_names(f"{where}.*", inner)
+        case Listing(items):
+            for inner in items:
+                yield from setting_names(where, inner)
+        case Section(classes):
+            for cls in classes:
+                for setting in settings_of(cls):
+                    yield from setting_names(f"{where}.{setting.name}", setting.schema)
+
+
+def all_settings() -> set[str]:
+    """Every setting by its full name and by every ending of it that has a dot: `tracker.clock.max_jump`."""
+    files = {
+        "smoothing": SmoothingSettings,
+        "slam": SlamSettings,
+        "limits": StreamSettings,
+        "simulator": SimulatorSettings,
+    }
+    full = {name for root, cls in files.items() for name in setting_names(root, Section((cls,)))}
+    full |= {name for item in settings_of(TrackConfig) for name in setting_names(item.name, item.schema)}
+    return {".".join(parts[first:]) for name in full for parts in [name.split(".")] for first in range(len(parts) - 1)}
 
 
 def run_examples(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -42,6 +97,34 @@ def test_links_within_the_documentation_lead_somewhere(page: Path) -> None:
             headings = re.findall(r"^#+ (.+)$", linked.read_text(encoding="utf-8"), flags=re.M)
             anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
             assert anchor in anchors, f"{page_name(page)} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_names_in_the_documentation_exist(page: Path) -> None:
+    """Modules, classes and functions of the packages. `saga_fg.datasets` is the name of an entry point group."""
+    for span in code_spans(page):
+        for name in re.findall(r"(?<![\w.])(?:factors|saga_fg|data_tools|pipelines)(?:[.:][A-Za-z]\w*)+", span):
+            assert name == "saga_fg.datasets" or resolves(name), f"{page_name(page)} names {name}"
+
+
+def test_settings_in_the_documentation_exist() -> None:
+    """Dotted names that begin with a section of settings; `tracker.graph` may be an attribute of a tracker as well."""
+    known = all_settings()
+    sections = {name.split(".")[0] for name in known} - {"*"}
+    assert {"tracker.existence.report_above", "existence.report_above", "sensors.*.max_speed"} <= known
+    for page in PAGES:
+        for span in code_spans(page):
+            (name,) = re.findall(r"^[a-z_]+(?:\.(?:[a-z_]+|\*|<name>))+(?=: |$)", span) or [""]
+            name = name.replace("<name>", "*").removesuffix(".*")
+            section, _, rest = name.partition(".")
+            if (
+                not rest
+                or section not in sections
+                or Path(name).suffix in (".csv", ".json", ".ply", ".py", ".tum", ".txt", ".yaml")
+            ):
+                continue
+            attribute = section == "tracker" and hasattr(Tracker, rest)
+            assert name in known or attribute, f"{page_name(page)} names the setting {span}"
 
 
 def test_the_contents_name_every_page() -> None:
