@@ -156,7 +156,7 @@ def unit(heading: FloatArray) -> FloatArray:
 
 
 def applies(needs: Needs, target: NodeType, source: NodeType) -> bool:
-    """Whether nodes of these types have the components that an interaction needs."""
+    """True if nodes of these types have the components that an interaction needs."""
     own, other = needs
     return target.has(own) and source.has(other)
 

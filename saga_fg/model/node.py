@@ -184,7 +184,7 @@ class NodeType:
         return None
 
     def has(self, names: Sequence[str]) -> bool:
-        """Whether the state has all these components."""
+        """True if the state has all these components."""
         return set(names) <= set(self.components)
 
     def index(self, names: Sequence[str]) -> IntArray:

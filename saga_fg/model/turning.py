@@ -12,7 +12,7 @@ velocity v turn by the angle theta within the interval dt, with J = ((0, -1), (1
 
 which solves dp/dt = v, dv/dt = (theta / dt) J v exactly, as the speed and c are constant. Sources: Bar-Shalom, Li and
 Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), section 11.7.1; Rajamani, Vehicle Dynamics
-and Control (2012), section 2.2, with the course psi + beta of the centre as the direction of v. A bicycle that stands
+and Control (2012), section 2.2, with the course psi + beta of the centre as the direction of v. A bicycle at rest
 does not turn. S and its derivative are smooth at theta = 0, where the motion is that of constant velocity.
 
 Noise: white acceleration and a random walk of c, discretised along the linear part dp/dt = v. It does not depend on the

@@ -22,14 +22,14 @@ from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
-from saga_fg.types.road_map import LANE, LIGHT, ROADSIDE, STOP_LINE, WALL, RoadMap
+from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, RoadMap
 from saga_fg.types.sensor import Sensor
 from saga_fg.types.signal import COLOUR_LABELS, COLOURS, SignalSettings, colour_updated
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
     """Own motion of a class: nodes of the map are stationary unless the settings name their class."""
-    if label in ROADSIDE and label not in settings.classes:
+    if label in MAP_CLASSES and label not in settings.classes:
         return RandomWalk()
     return class_settings(settings.classes, ClassSettings, label).motion
 

@@ -18,7 +18,7 @@ from saga_fg.settings import Positive, Settings, required_setting, setting
 
 Point = tuple[float, float]
 LIGHT, STOP_LINE, LANE, WALL = "traffic_light", "stop_line", "lane", "wall"
-ROADSIDE = (LIGHT, STOP_LINE, LANE, WALL)  # classes of the nodes that a map brings
+MAP_CLASSES = (LIGHT, STOP_LINE, LANE, WALL)  # classes of the nodes that a map brings
 
 
 @dataclass(frozen=True)

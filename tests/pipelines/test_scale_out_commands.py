@@ -241,5 +241,6 @@ def test_kitti_sequences_in_parallel(recordings: Path, tmp_path: Path) -> None:
     ]
     assert saga_fg(*track, "-o", tmp_path / "serial").exit_code == 0
     assert saga_fg(*track, "-o", tmp_path / "run", "--workers", "2").exit_code == 0
-    for name in ("0000.txt", "0017.txt"):
+    for name in ("0000.txt", "0017.txt", "tracks.csv"):
         assert (tmp_path / "run" / "tracks" / name).read_bytes() == (tmp_path / "serial" / name).read_bytes()
+    assert "0 done, 2 unchanged" in saga_fg(*track, "-o", tmp_path / "run", "--workers", "1").stdout
