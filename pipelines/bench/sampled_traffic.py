@@ -1,4 +1,4 @@
-"""Traffic sampled from the model of the running graph: a vehicle that drives by odometry and sees, in range and bearing,
+"""Traffic sampled from the model of the running graph: a vehicle drives by odometry and sees, in range and bearing,
 cars that follow each other (intelligent driver) and pedestrians who keep apart (social force).
 
 Cars and pedestrians come and go, are missed now and then, and time is irregular. Three providers give the very factors
