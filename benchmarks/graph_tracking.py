@@ -24,7 +24,7 @@ import scipy.linalg
 import scipy.sparse
 
 from pipelines.bench.contenders import dense
-from pipelines.bench.flocks import Flock, Frame
+from pipelines.bench.flocks import Flock, FlockFrame
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 D = 4  # size of a node's state, and of an edge's
@@ -44,7 +44,7 @@ class JointGraphTracking:
         self._mean = self._lift @ flock.means.ravel()
         self._P = self._lift @ (self._lift @ scipy.linalg.block_diag(*flock.covariances)).T
 
-    def prepare(self, frame: Frame) -> None:
+    def prepare(self, frame: FlockFrame) -> None:
         F, b, Q, z, H, R = dense(frame)
         self._b, self._z, self._R = self._lift @ b, z, R
         self._Q = scipy.sparse.csr_array(self._lift @ scipy.sparse.csr_array(Q) @ self._lift.T)
@@ -83,7 +83,7 @@ class SeparateGraphTracking:
         self._e = self._x[None] - self._x[:, None]
         self._E = self._P[None] + self._P[:, None]
 
-    def prepare(self, frame: Frame) -> None:
+    def prepare(self, frame: FlockFrame) -> None:
         n, transition = len(self._x), frame.transition
         F = transition.F_matrix.toarray().reshape(n, D, n, D)
         own = np.arange(n)

@@ -22,7 +22,7 @@ from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import check_writable, write_bytes
 from data_tools.plots import png
 from pipelines.bench.contenders import Filter, Ours
-from pipelines.bench.flocks import DT, Flock, Frame, flock
+from pipelines.bench.flocks import DT, Flock, FlockFrame, flock
 from pipelines.bench.measuring import timed
 from pipelines.cli.options import Verbose, counts
 from pipelines.cli.reporting import progress_bar
@@ -131,7 +131,7 @@ def _seen(measurements: Measurements, visible: BoolArray) -> Measurements:
     return Measurements(m.nodes[rows], m.z[rows], m.H[rows], m.R[rows])
 
 
-def _without_edges(frame: Frame) -> Frame:
+def _without_edges(frame: FlockFrame) -> FlockFrame:
     graph = frame.transition.graph
     return replace(frame, transition=discretise(SceneGraph.of(graph.nodes, graph.types[0]), DT))
 

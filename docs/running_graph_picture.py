@@ -9,7 +9,7 @@ import numpy as np
 from data_tools.plots import running_graph_picture
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from factors import bearing_range_factor
-from pipelines.bench.sampled_traffic import Traffic, providers, sample_traffic
+from pipelines.bench.sampled_traffic import SampledTraffic, providers, sample_traffic
 from pipelines.config import load_config
 from pipelines.explaining import graph_picture
 from saga_fg import Tracker
@@ -27,7 +27,7 @@ class Post:
 
     name = "landmarks"
 
-    def __init__(self, scene: Traffic) -> None:
+    def __init__(self, scene: SampledTraffic) -> None:
         self.scene = scene
 
     def factors(self, view: GraphView) -> Additions:

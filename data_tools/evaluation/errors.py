@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.figures import FigureTable, cell
-from data_tools.metrics import Calibration, ErrorSummary, LabelErrors, calibration, error_summary, errors_by_class
+from data_tools.metrics import EllipseCoverage, ErrorSummary, LabelErrors, calibration, error_summary, errors_by_class
 from data_tools.plots import calibration_plot, error_histograms
 
 _ERRORS = (
@@ -63,7 +63,7 @@ def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
     return (cell(f.labels), cell(f.tracked), *(cell(x) for x in errors), heading, cell(f.flipped))
 
 
-def _calibration_cells(c: Calibration) -> tuple[str, ...]:
+def _calibration_cells(c: EllipseCoverage) -> tuple[str, ...]:
     verdict = ("consistent" if c.consistent else "inconsistent") if c.enough_data else "too few boxes"
     shares = (cell(share) for share in c.coverage.values())
     return (cell(c.objects), cell(c.boxes), cell(c.anees, 2), cell(c.median_nees, 2), *shares, verdict)

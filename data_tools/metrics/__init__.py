@@ -11,7 +11,7 @@ from data_tools.metrics.bootstrap import (
 from data_tools.metrics.consistency import coverage, coverages, nees, nees_band
 from data_tools.metrics.error_sample import ErrorSample
 from data_tools.metrics.error_summary import (
-    Calibration,
+    EllipseCoverage,
     ErrorSummary,
     calibration,
     error_summary,
@@ -26,7 +26,7 @@ from data_tools.metrics.kitti_tracking import (
     kitti_tracking_metrics,
 )
 from data_tools.metrics.label_errors import LabelErrors, label_errors, label_velocities
-from data_tools.metrics.matching import Matching, match_scene
+from data_tools.metrics.matching import FrameMatch, match_scene
 from data_tools.metrics.nuscenes_tracking import (
     NuScenesClassMetrics,
     NuScenesTrackingMetrics,
@@ -39,16 +39,16 @@ from data_tools.metrics.scene import SceneMetrics, SceneMetricSettings, scene_me
 from data_tools.metrics.scene_boxes import SceneBoxes
 
 __all__ = [
-    "Calibration",
+    "EllipseCoverage",
     "ErrorSample",
     "ErrorSummary",
+    "FrameMatch",
     "HotaMetrics",
     "Interval",
     "KittiSimilarity",
     "KittiTrackingMetrics",
     "KittiTrackingSequence",
     "LabelErrors",
-    "Matching",
     "NuScenesClassMetrics",
     "NuScenesTrackingMetrics",
     "NuScenesTrackingScene",

@@ -41,7 +41,7 @@ class ErrorSummary:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class EllipseCoverage:
     """Consistency of the covariances of one class.
 
     objects, boxes  that have a track with a covariance
@@ -84,11 +84,11 @@ def error_summary(errors: LabelErrors) -> ErrorSummary:
     )
 
 
-def calibration(errors: LabelErrors) -> Calibration:
+def calibration(errors: LabelErrors) -> EllipseCoverage:
     """Compare errors with their covariances."""
     known = np.isfinite(errors.nees)
     values = errors.nees[known]
-    return Calibration(
+    return EllipseCoverage(
         objects=len(np.unique(errors.object[known])),
         boxes=len(values),
         anees=float(values.mean() / 2) if len(values) else float("nan"),

@@ -42,7 +42,7 @@ class FoundBoxes(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Matching:
+class FrameMatch:
     """The M pairs of one frame.
 
     object_row  (M,) rows of the annotations
@@ -59,7 +59,7 @@ class Matching:
 
 def match_scene(
     ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], gate: float = 2.0, same_label: bool = True
-) -> list[Matching]:
+) -> list[FrameMatch]:
     """The matching at each of the K frames of a scene; pairs further apart than `gate` (m) never match.
 
     Raises `InputError` when the two sequences differ in length.
@@ -83,7 +83,7 @@ def match_scene(
         matched = objects[rows]
         switched = seen[matched] & (last_track[matched] != found.id[columns])
         last_track[matched], seen[matched] = found.id[columns], True
-        result.append(Matching(rows, columns, distance[rows, columns], switched))
+        result.append(FrameMatch(rows, columns, distance[rows, columns], switched))
     return result
 
 

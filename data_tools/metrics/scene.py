@@ -27,7 +27,7 @@ import numpy as np
 
 from data_tools.metrics.consistency import nees
 from data_tools.metrics.error_sample import ErrorSample
-from data_tools.metrics.matching import FoundBoxes, Matching, match_scene
+from data_tools.metrics.matching import FoundBoxes, FrameMatch, match_scene
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import setting
@@ -158,7 +158,7 @@ def scene_metrics_by_label(
     }
 
 
-def _pair_errors(truth: Annotations, found: FoundBoxes, matching: Matching) -> FloatArray:
+def _pair_errors(truth: Annotations, found: FoundBoxes, matching: FrameMatch) -> FloatArray:
     """(4, M): position, velocity, heading errors and NEES of the pairs of one frame; NaN where unknown."""
     a, b = truth.boxes.select(matching.object_row), found.boxes.select(matching.track_row)
     velocity = b.velocity - a.velocity
@@ -167,7 +167,7 @@ def _pair_errors(truth: Annotations, found: FoundBoxes, matching: Matching) -> F
     return np.stack([matching.distance, np.hypot(velocity[:, 0], velocity[:, 1]), heading, consistency])
 
 
-def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, Matching]], cap: float) -> FloatArray:
+def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, FrameMatch]], cap: float) -> FloatArray:
     """Carried errors of all hidden objects, see the module."""
     carrier: dict[str, int | str] = {}
     errors: list[float] = []

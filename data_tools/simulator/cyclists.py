@@ -10,7 +10,7 @@ import numpy as np
 from data_tools.simulator.pedestrians import BODY
 from data_tools.simulator.road import Road
 from data_tools.simulator.settings import CyclistSettings
-from data_tools.simulator.trajectories import Trajectories, concatenated
+from data_tools.simulator.trajectories import SimulatedTrajectories, concatenated
 from saga_fg.numerics.arrays import FloatArray
 
 BICYCLE = (1.75, 0.6, 1.1)  # length, width, height, m
@@ -25,7 +25,7 @@ def simulate_cyclists(
     time: FloatArray,
     settings: CyclistSettings,
     rng: np.random.Generator,
-) -> Trajectories:
+) -> SimulatedTrajectories:
     """Bicycles, then their riders, that start at road s within `window`, m, inside the outer borders (d, m)."""
     h = float(time[1] - time[0])
     decay = float(np.exp(-h / settings.change_time))
@@ -50,7 +50,7 @@ def simulate_cyclists(
     velocity = ground_speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     return concatenated(
         [
-            Trajectories(
+            SimulatedTrajectories(
                 np.array([f"{name}-{k:03d}" for k in range(count)], dtype="<U16"),
                 np.full(count, label),
                 np.tile(np.array(size), (count, 1)),

@@ -10,7 +10,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class StopLine:
+class ClosingLine:
     """A line at travelled distance s, m, in some lanes, closed during red intervals (K, 2), s."""
 
     lanes: IntArray

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.simulator.disturbances import StopLine
+from data_tools.simulator.disturbances import ClosingLine
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.sensors import position_errors, sensor_position
 from data_tools.simulator.settings import LightSettings, SensorSettings
@@ -46,7 +46,7 @@ class Signal:
         return "amber" if time < self.red[now[0], 0] + self.amber_duration else "red"
 
 
-def signals_of(lanes: Lanes, lines: tuple[StopLine, ...], settings: LightSettings) -> tuple[Signal, ...]:
+def signals_of(lanes: Lanes, lines: tuple[ClosingLine, ...], settings: LightSettings) -> tuple[Signal, ...]:
     """The lights of the stop lines."""
     signals: list[Signal] = []
     done: set[int] = set()
@@ -66,7 +66,7 @@ def signals_of(lanes: Lanes, lines: tuple[StopLine, ...], settings: LightSetting
 def sample_map(
     lanes: Lanes,
     focus: float,
-    lines: tuple[StopLine, ...],
+    lines: tuple[ClosingLine, ...],
     signals: tuple[Signal, ...],
     settings: LightSettings,
     rng: np.random.Generator,

@@ -14,7 +14,7 @@ import numpy as np
 
 from data_tools.simulator.road import Road
 from data_tools.simulator.settings import PedestrianSettings
-from data_tools.simulator.trajectories import Trajectories
+from data_tools.simulator.trajectories import SimulatedTrajectories
 from saga_fg.numerics.arrays import FloatArray
 
 RELAXATION = 0.6  # tau, s
@@ -30,7 +30,7 @@ def simulate_pedestrians(
     time: FloatArray,
     settings: PedestrianSettings,
     rng: np.random.Generator,
-) -> Trajectories:
+) -> SimulatedTrajectories:
     """Pedestrians on `pavements` (lowest and highest offset d, m) who start at road s within `window`, m."""
     groups = int(rng.integers(settings.groups[0], settings.groups[1] + 1)) if pavements else 0
     count = rng.integers(settings.group_size[0], settings.group_size[1] + 1, size=groups)
@@ -69,7 +69,7 @@ def simulate_pedestrians(
     tangent = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
     size = np.array(BODY) * np.exp(0.08 * np.clip(rng.standard_normal((len(group), 3)), -2, 2))
-    return Trajectories(
+    return SimulatedTrajectories(
         np.array([f"pedestrian-{k:03d}" for k in range(len(group))], dtype=np.str_),
         np.full(len(group), "pedestrian"),
         size,

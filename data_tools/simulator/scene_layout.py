@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.simulator.disturbances import SlowZone, StopLine, sample_intervals
+from data_tools.simulator.disturbances import ClosingLine, SlowZone, sample_intervals
 from data_tools.simulator.driver_models import equilibrium_gap
 from data_tools.simulator.fleet import Fleet, attach_trailers, sample_fleet
 from data_tools.simulator.lanes import Lanes
@@ -35,7 +35,7 @@ class SceneLayout:
     lane: IntArray
     s: FloatArray
     speed: FloatArray
-    stop_lines: tuple[StopLine, ...]
+    stop_lines: tuple[ClosingLine, ...]
     slow_zones: tuple[SlowZone, ...]
     trailer: FloatArray
 
@@ -100,7 +100,7 @@ def _sample_lanes(
 
 def _sample_disturbances(
     lanes: Lanes, focus: float, until: float, settings: TrafficSettings, rng: np.random.Generator
-) -> tuple[tuple[StopLine, ...], tuple[SlowZone, ...]]:
+) -> tuple[tuple[ClosingLine, ...], tuple[SlowZone, ...]]:
     opposite = lanes.road.length - (focus + JUNCTION)
     light = lanes.ending < 0 and rng.random() < settings.signal_probability
     lane_wise = rng.random() < settings.lane_wise_probability
@@ -110,7 +110,7 @@ def _sample_disturbances(
         if light:
             turning = mine[:1] if lane_wise and len(mine) > 1 else mine[:0]  # the innermost lane turns off
             own = sample_intervals(settings.red_duration, settings.green_duration, until, rng)
-            stop_lines += [StopLine(np.setdiff1d(mine, turning), place, shared), StopLine(turning, place, own)]
+            stop_lines += [ClosingLine(np.setdiff1d(mine, turning), place, shared), ClosingLine(turning, place, own)]
         elif lanes.taper == 0:  # cones are disturbance enough
             for group in mine[:, None] if lane_wise else [mine]:
                 speed = float(rng.uniform(*settings.slow_speed))

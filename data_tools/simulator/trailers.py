@@ -13,13 +13,13 @@ import numpy as np
 from data_tools.simulator.fleet import HITCH
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.traffic import TrafficHistory
-from data_tools.simulator.trajectories import Trajectories
+from data_tools.simulator.trajectories import SimulatedTrajectories
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 def split_trailers(
-    vehicles: Trajectories, lanes: Lanes, history: TrafficHistory, trailer: FloatArray
-) -> tuple[Trajectories, Trajectories]:
+    vehicles: SimulatedTrajectories, lanes: Lanes, history: TrafficHistory, trailer: FloatArray
+) -> tuple[SimulatedTrajectories, SimulatedTrajectories]:
     """The vehicles without their trailers, and the trailers; `trailer` (N,) are their lengths, m, 0 for none."""
     rows = np.flatnonzero(trailer > 0)
     if len(rows) == 0:
@@ -32,7 +32,7 @@ def split_trailers(
     size[rows, 0] = truck
     pose = _shifted(lanes, history, rows, -(whole - behind) / 2)
     trailer_size = np.column_stack([behind, vehicles.size[rows, 1], vehicles.size[rows, 2]])
-    trailers = Trajectories(
+    trailers = SimulatedTrajectories(
         np.char.replace(vehicles.id[rows], "vehicle", "trailer"),
         np.full(len(rows), "trailer"),
         trailer_size,

@@ -16,7 +16,7 @@ from saga_fg.types.boxes import Boxes
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectories:
+class SimulatedTrajectories:
     """N objects on the ground at T equally spaced times, in world coordinates.
 
     id, label  (N,)
@@ -58,7 +58,7 @@ class Trajectories:
         )
         return boxes, self.present[k] & self.present[k + 1]
 
-    def select(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Trajectories:
+    def select(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> SimulatedTrajectories:
         """The objects of some rows."""
         return replace(
             self,
@@ -67,9 +67,9 @@ class Trajectories:
         )
 
 
-def concatenated(parts: Sequence[Trajectories]) -> Trajectories:
+def concatenated(parts: Sequence[SimulatedTrajectories]) -> SimulatedTrajectories:
     """All objects of `parts`, which share their times."""
-    return Trajectories(
+    return SimulatedTrajectories(
         **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("id", "label", "size")},
         time=parts[0].time,
         **{
@@ -79,10 +79,10 @@ def concatenated(parts: Sequence[Trajectories]) -> Trajectories:
     )
 
 
-def static_objects(id: StrArray, boxes: Boxes, time: FloatArray) -> Trajectories:  # noqa: A002
+def static_objects(id: StrArray, boxes: Boxes, time: FloatArray) -> SimulatedTrajectories:  # noqa: A002
     """Trajectories of objects that never move."""
     shape = (len(time), len(boxes))
-    return Trajectories(
+    return SimulatedTrajectories(
         id,
         boxes.label,
         boxes.size,

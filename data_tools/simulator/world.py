@@ -16,7 +16,7 @@ from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.surroundings import sample_cones, sample_surroundings
 from data_tools.simulator.traffic import Traffic, TrafficHistory, record_traffic
 from data_tools.simulator.trailers import split_trailers
-from data_tools.simulator.trajectories import Trajectories, concatenated, static_objects
+from data_tools.simulator.trajectories import SimulatedTrajectories, concatenated, static_objects
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -41,9 +41,9 @@ class World:
     history    states of all vehicles over time
     """
 
-    objects: Trajectories
+    objects: SimulatedTrajectories
     occluders: Boxes
-    ego: Trajectories
+    ego: SimulatedTrajectories
     signals: tuple[Signal, ...]
     road_map: RoadMap | None
     layout: SceneLayout
@@ -115,12 +115,12 @@ def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.r
     return record_traffic(traffic, int(np.ceil(settings.duration / settings.step)) + 2)
 
 
-def vehicle_trajectories(layout: SceneLayout, history: TrafficHistory) -> Trajectories:
+def vehicle_trajectories(layout: SceneLayout, history: TrafficHistory) -> SimulatedTrajectories:
     """Motion of the vehicles in world coordinates, a truck and its trailer as one object."""
     position, heading = layout.lanes.pose(history.lane, history.s, history.offset, history.slope)
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     fleet = layout.fleet
-    return Trajectories(
+    return SimulatedTrajectories(
         _ids("vehicle", len(fleet)),
         fleet.label,
         fleet.size,

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from factors import interaction_factors, linear_detection_factors, nonlinear_graph, position, prior_factors
-from pipelines.bench.flocks import DT, Flock, Frame
+from pipelines.bench.flocks import DT, Flock, FlockFrame
 from saga_fg.estimators import Estimator, FixedLagSmoother, Gaussian, kalman_predict, kalman_update
 from saga_fg.numerics.arrays import FloatArray
 
@@ -17,7 +17,7 @@ from saga_fg.numerics.arrays import FloatArray
 class Contender(Protocol):
     """One of those that are compared. `prepare` is not timed, `step` is."""
 
-    def prepare(self, frame: Frame) -> None:
+    def prepare(self, frame: FlockFrame) -> None:
         """Whatever is not the contender's own work."""
 
     def step(self) -> None:
@@ -39,7 +39,7 @@ class Ours:
         self._nodes = flock.nodes
         estimator.add(flock.nodes, flock.means, flock.covariances)
 
-    def prepare(self, frame: Frame) -> None:
+    def prepare(self, frame: FlockFrame) -> None:
         self._frame = frame
 
     def step(self) -> None:
@@ -70,7 +70,7 @@ class Textbook:
         self._x = Gaussian(flock.means.ravel(), scipy.linalg.block_diag(*flock.covariances))
         self._diagonal = np.arange(4 * len(flock)).reshape(-1, 4)
 
-    def prepare(self, frame: Frame) -> None:
+    def prepare(self, frame: FlockFrame) -> None:
         self._frame = dense(frame)
 
     def step(self) -> None:
@@ -98,7 +98,7 @@ class GtsamWindow:
         priors = nonlinear_graph(prior_factors(keys, flock.means, flock.covariances), dict.fromkeys(keys.tolist(), 4))
         self._smoother.update(priors, self._zeros(keys), dict.fromkeys(keys.tolist(), 0.0))
 
-    def prepare(self, frame: Frame) -> None:
+    def prepare(self, frame: FlockFrame) -> None:
         before, now = self._keys(self._frames), self._keys(self._frames + 1)
         self._frames += 1
         (F,) = frame.transition.F
@@ -141,7 +141,7 @@ class GtsamWindow:
         return values
 
 
-def dense(frame: Frame) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+def dense(frame: FlockFrame) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """F, b, Q, z, H, R of a frame as the textbook wants them."""
     transition, seen = frame.transition, frame.measurements
     H = np.zeros((2 * len(seen), len(transition.b)))

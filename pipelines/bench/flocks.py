@@ -34,7 +34,7 @@ CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class FlockFrame:
     """An interval and what is seen at its end; truth (n, 4) there."""
 
     transition: Transition
@@ -50,7 +50,7 @@ class Flock:
     nodes: IntArray
     means: FloatArray
     covariances: FloatArray
-    frames: tuple[Frame, ...]
+    frames: tuple[FlockFrame, ...]
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -78,7 +78,7 @@ def flock(kind: Kind, n: int, frames: int, seed: int, mixing: float = 0.35) -> F
         truth = sample_step(transition, truth, rng)
         seen = np.flatnonzero(rng.random(n) >= MISSED)
         z = truth[seen, :2] + NOISE * rng.normal(size=(len(seen), 2))
-        record.append(Frame(transition, Measurements(seen, z, np.eye(2, 4), NOISE**2 * np.eye(2)), truth))
+        record.append(FlockFrame(transition, Measurements(seen, z, np.eye(2, 4), NOISE**2 * np.eye(2)), truth))
     return Flock(kind, np.arange(n), means, np.tile(P, (n, 1, 1)), tuple(record))
 
 

@@ -17,7 +17,7 @@ from factors import gaussian_factors, prior_factors
 from pipelines.bench.estimator_figures import Row
 from pipelines.bench.flocks import Kind
 from pipelines.bench.measuring import timed
-from pipelines.bench.sampled_traffic import Moment, process_noise, providers, sample_traffic
+from pipelines.bench.sampled_traffic import SampledFrame, process_noise, providers, sample_traffic
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphView, NewVariable
 from saga_fg.graph.factor_checks import Factor
@@ -154,7 +154,7 @@ def _difference(whole: IncrementalSmoother, window: IncrementalSmoother, key: in
     return np.asarray(np.abs(way) / np.sqrt(np.diag(whole.covariance(key))))
 
 
-def _error(smoother: IncrementalSmoother, key: int, moment: Moment) -> FloatArray:
+def _error(smoother: IncrementalSmoother, key: int, moment: SampledFrame) -> FloatArray:
     variable = smoother.graph().variable(key)
     truth = moment.pose if variable.kind == EGO_POSE else moment.states[variable.id]
     return variable.type.local(smoother.state(key), truth)

@@ -1,4 +1,4 @@
-"""Traffic drawn from the model of the running graph: a vehicle that drives by odometry and sees, in range and bearing,
+"""Traffic sampled from the model of the running graph: a vehicle drives by odometry and sees, in range and bearing,
 cars that follow each other (intelligent driver) and pedestrians who keep apart (social force).
 
 Cars and pedestrians come and go, are missed now and then, and time is irregular. Three providers give the very factors
@@ -41,7 +41,7 @@ def process_noise(dt: float) -> FloatArray:
 
 
 @dataclass
-class Moment:
+class SampledFrame:
     """States and pose as they are; the odometry since the moment before, prior means of objects that are new, and range
     and bearing of those seen.
     """
@@ -56,13 +56,13 @@ class Moment:
 
 
 @dataclass
-class Traffic:
+class SampledTraffic:
     """kinds: "car" or "pedestrian" by id; leaders: of cars by id; start: where the vehicle believes to be."""
 
     start: gtsam.Pose2
     kinds: dict[int, str] = field(default_factory=dict)
     leaders: dict[int, int] = field(default_factory=dict)
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[SampledFrame] = field(default_factory=list)
 
     def neighbours(self, node: int, present: Collection[int]) -> list[int]:
         """Who acts on a node: a car's leader, all other pedestrians on a pedestrian."""
@@ -83,11 +83,11 @@ def sample_traffic(
     cars: int = 4,
     pedestrians: int = 3,
     intervals: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
-) -> Traffic:
+) -> SampledTraffic:
     """A scene of so many frames, with intervals in between that are drawn from `intervals`, s."""
     waiting: dict[int, tuple[FloatArray, int]] = {}
     heading = rng.uniform(-0.3, 0.3)
-    scene = Traffic(gtsam.Pose2(0, 0, heading))
+    scene = SampledTraffic(gtsam.Pose2(0, 0, heading))
     along, side = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     for k in range(cars):
         place = (20 + 14 * (cars - k) + rng.normal()) * along + 3 * side
@@ -122,16 +122,16 @@ def sample_traffic(
                 s = pose.transformTo(x[:2])
                 z = np.array([np.hypot(*s), np.arctan2(s[1], s[0])])
                 seen[node] = z + np.linalg.cholesky(SEEN) @ rng.normal(size=2)
-        scene.moments.append(Moment(time, dt, pose, step, states, born, seen))
+        scene.moments.append(SampledFrame(time, dt, pose, step, states, born, seen))
     return scene
 
 
-class Vehicle:
+class VehicleProvider:
     """The ego pose, by odometry."""
 
     name = "odometry"
 
-    def __init__(self, scene: Traffic) -> None:
+    def __init__(self, scene: SampledTraffic) -> None:
         self.scene = scene
 
     def factors(self, view: GraphView) -> Additions:
@@ -145,12 +145,12 @@ class Vehicle:
         return Additions([new], [between_factor(before, key, moment.odometry.matrix(), ODOMETRY)])
 
 
-class Objects:
+class ObjectProvider:
     """Births and interactions, those of one shape in one batch."""
 
     name = "interactions"
 
-    def __init__(self, scene: Traffic) -> None:
+    def __init__(self, scene: SampledTraffic) -> None:
         self.scene = scene
 
     def factors(self, view: GraphView) -> Additions:
@@ -179,12 +179,12 @@ class Objects:
         return Additions(new, factors)
 
 
-class Detections:
+class DetectionProvider:
     """Range and bearing from the vehicle."""
 
     name = "detections"
 
-    def __init__(self, scene: Traffic, robust: Robust | None = None) -> None:
+    def __init__(self, scene: SampledTraffic, robust: Robust | None = None) -> None:
         self.scene, self.robust = scene, robust
 
     def factors(self, view: GraphView) -> Additions:
@@ -197,6 +197,6 @@ class Detections:
         return Additions(factors=[relative_range_bearing_factors(rows, z, SEEN, 4, robust=self.robust)])
 
 
-def providers(scene: Traffic, robust: Robust | None = None) -> list[FactorProvider]:
+def providers(scene: SampledTraffic, robust: Robust | None = None) -> list[FactorProvider]:
     """The model that a scene was drawn from."""
-    return [Vehicle(scene), Objects(scene), Detections(scene, robust)]
+    return [VehicleProvider(scene), ObjectProvider(scene), DetectionProvider(scene, robust)]

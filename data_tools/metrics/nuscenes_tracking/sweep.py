@@ -43,7 +43,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class RowPairs:
     """P pairs of a true row and a found row of the same scene, frame and class, in order of found, then true row."""
 
     true: IntArray
@@ -65,7 +65,7 @@ class Sweep:
     distance: FloatArray
 
 
-def candidate_pairs(true: Rows, found: Rows, gate: float) -> Pairs:
+def candidate_pairs(true: Rows, found: Rows, gate: float) -> RowPairs:
     """All pairs of one class nearer than `gate` (m).
 
     Distances come from |a|^2 - 2 a.b + |b|^2, as in the official evaluation: far from the origin this leaves a few
@@ -87,10 +87,10 @@ def candidate_pairs(true: Rows, found: Rows, gate: float) -> Pairs:
         near = (distance < gate) & (true.boxes.label[a0:a1, None] == found.boxes.label[None, b0:b1])
         column, row = np.nonzero(near.T)
         parts.append((row + a0, column + b0, distance[row, column]))
-    return Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return RowPairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Sweep:
+def sweep(true: Rows, found: Rows, pairs: RowPairs, thresholds: FloatArray) -> Sweep:
     """Match at `thresholds` (classes, T) of the track score, NaN where a class has no further threshold."""
     classes, T = thresholds.shape
     partner = np.full((len(true.scene), T), -1, dtype=np.int64)
@@ -103,7 +103,7 @@ def sweep(true: Rows, found: Rows, pairs: Pairs, thresholds: FloatArray) -> Swee
     for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         if start == stop:
             continue
-        here = Pairs(pairs.true[start:stop], pairs.found[start:stop], pairs.distance[start:stop])
+        here = RowPairs(pairs.true[start:stop], pairs.found[start:stop], pairs.distance[start:stop])
         present = score[here.found][:, None] >= thresholds[label[here.true]]
         remembered = last[identity[here.true]]
         kept = _first_of_each(present & (remembered == track[here.found][:, None]), here.found)

@@ -18,7 +18,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
 from saga_fg.slam.joint.graph import Record, stationary_factors
 from saga_fg.slam.joint.landmarks import Observations, nearest_landmarks
-from saga_fg.slam.joint.lanes import LaneKeeping
+from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects
 from saga_fg.slam.joint.record import record_epochs
@@ -54,7 +54,7 @@ def estimate_jointly(
     estimate = None
     for _ in range(settings.passes):
         tracker = new_tracker()
-        lanes = LaneKeeping(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
+        lanes = LaneAssociation(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
         record = record_epochs(frames, path, odometry, tracker, settings.motion_noise)
         stationary = stationary_probabilities(record, path, slow, settings)
         seen = nearest_landmarks(landmarks, path, settings.max_landmark_distance)
@@ -85,7 +85,7 @@ def _solved(
     record: Record,
     path: FloatArray,
     stationary: Sequence[Sequence[FloatArray] | None],
-    lanes: LaneKeeping,
+    lanes: LaneAssociation,
     providers: Sequence[FactorProvider],
     settings: JointSettings,
 ) -> JointEstimate:

@@ -74,7 +74,7 @@ class LaneAssignment:
     probability: float
 
 
-class LaneKeeping:
+class LaneAssociation:
     """Provider of the lanes of the maps so far, and of the vehicles assigned to them."""
 
     name = "lanes"

@@ -23,7 +23,7 @@ from saga_fg.numerics.geometry import checked_transform
 from saga_fg.slam.joint.batch import checked_landmarks
 from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
 from saga_fg.slam.joint.landmarks import Observations, WindowLandmarks
-from saga_fg.slam.joint.lanes import LaneKeeping
+from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.record import EpochRecorder, RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
@@ -75,7 +75,7 @@ class OnlineEstimator:
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
         self._landmarks = WindowLandmarks(mapper or MapperSettings())
-        self._lanes = LaneKeeping(self._settings.lanes, [tracker.settings.road_map])
+        self._lanes = LaneAssociation(self._settings.lanes, [tracker.settings.road_map])
         self._stationary: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
         self._solution: GraphSolution | None = None

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.simulator.disturbances import SlowZone, StopLine, sample_intervals
+from data_tools.simulator.disturbances import ClosingLine, SlowZone, sample_intervals
 from data_tools.simulator.driver_models import (
     HARDEST_BRAKING,
     Drivers,
@@ -43,7 +43,7 @@ def queue(
     count: int,
     speed: float,
     settings: DriverSettings = SMOOTH,
-    stop_lines: tuple[StopLine, ...] = (),
+    stop_lines: tuple[ClosingLine, ...] = (),
     slow_zones: tuple[SlowZone, ...] = (),
     length: float = 2000.0,
     leader_desires: float = 14.0,
@@ -107,7 +107,7 @@ def test_a_slow_down_runs_backwards_through_the_queue_as_a_wave() -> None:
 
 
 def test_a_red_light_stops_the_queue_before_the_line_and_green_lets_it_go() -> None:
-    line = StopLine(np.array([0]), 1100.0, np.array([[0.0, 40.0]]))
+    line = ClosingLine(np.array([0]), 1100.0, np.array([[0.0, 40.0]]))
     history = record_traffic(queue(8, 10.0, stop_lines=(line,)), 1600)
     half = KINDS[CAR].size[0] / 2
     red = history.time < 40.0
@@ -118,7 +118,7 @@ def test_a_red_light_stops_the_queue_before_the_line_and_green_lets_it_go() -> N
 
 
 def test_who_cannot_stop_any_more_passes_the_light() -> None:
-    line = StopLine(np.array([0]), 1012.0, np.array([[0.0, 40.0]]))
+    line = ClosingLine(np.array([0]), 1012.0, np.array([[0.0, 40.0]]))
     history = record_traffic(queue(3, 12.0, stop_lines=(line,)), 600)
     assert history.s[-1, 0] > 1100.0  # was 10 m before the line
     assert history.s[-1, 1] < 1012.0

@@ -12,7 +12,7 @@ from data_tools.simulator.pedestrians import simulate_pedestrians
 from data_tools.simulator.road import curved_road
 from data_tools.simulator.scene_layout import sample_layout
 from data_tools.simulator.settings import PedestrianSettings, RoadSettings, SimulatorSettings
-from data_tools.simulator.trajectories import Trajectories, static_objects
+from data_tools.simulator.trajectories import SimulatedTrajectories, static_objects
 from data_tools.simulator.world import World, build_world, simulate_traffic
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -125,7 +125,7 @@ def test_the_ego_vehicle_is_a_car_in_traffic_and_no_object() -> None:
         assert (distance < 60).sum() >= 8
 
 
-def people(settings: PedestrianSettings, seed: int = 0) -> Trajectories:
+def people(settings: PedestrianSettings, seed: int = 0) -> SimulatedTrajectories:
     road = curved_road(1000.0, [], np.zeros(2), 0.0)
     time = 0.05 * np.arange(800)
     return simulate_pedestrians(road, [(-9.0, -7.0)], (300.0, 500.0), time, settings, np.random.default_rng(seed))
@@ -157,9 +157,9 @@ def test_a_group_pauses_together() -> None:
     assert np.ptp(walkers.position[..., 0] - walkers.position[:, :1, 0], axis=0).max() < 1e-6
 
 
-def straight(position: FloatArray, velocity: FloatArray, time: FloatArray) -> Trajectories:
+def straight(position: FloatArray, velocity: FloatArray, time: FloatArray) -> SimulatedTrajectories:
     shape = (len(time), 1)
-    return Trajectories(
+    return SimulatedTrajectories(
         np.array(["a"]),
         np.array(["car"]),
         np.array([[4.0, 2.0, 1.5]]),

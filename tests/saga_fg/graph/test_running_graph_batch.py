@@ -9,7 +9,13 @@ from graph_estimator import GraphEstimator
 from random_graphs import CAR, CONE
 
 from factors import ResidualFactors, prior_factor
-from pipelines.bench.sampled_traffic import Detections, Objects, Vehicle, providers, sample_traffic
+from pipelines.bench.sampled_traffic import (
+    DetectionProvider,
+    ObjectProvider,
+    VehicleProvider,
+    providers,
+    sample_traffic,
+)
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraduatedNonConvexity, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphError, NewVariable, UndeterminedError, key_of
@@ -17,7 +23,7 @@ from tests.saga_fg.graph.test_running_graph_linear import MILLISECONDS, USUAL, l
 
 
 class Batch(GraphEstimator):
-    """Objects in a `BatchSolver`."""
+    """ObjectProvider in a `BatchSolver`."""
 
     def __init__(self):
         self.smoother, self.nodes = BatchSolver(), []
@@ -74,8 +80,10 @@ def test_what_goes_in_acts():
     """Without interactions the estimate is another one."""
     scene, alone = (sample_traffic(np.random.default_rng(3), frames=8) for _ in range(2))
     alone.leaders, alone.neighbours = {}, lambda node, present: []
-    together = driven(BatchSolver([Vehicle(scene), Objects(scene), Detections(scene)]), scene)
-    by_themselves = driven(BatchSolver([Vehicle(alone), Objects(alone), Detections(alone)]), scene)
+    together = driven(BatchSolver([VehicleProvider(scene), ObjectProvider(scene), DetectionProvider(scene)]), scene)
+    by_themselves = driven(
+        BatchSolver([VehicleProvider(alone), ObjectProvider(alone), DetectionProvider(alone)]), scene
+    )
     assert apart(together, by_themselves) > 0.1
 
 

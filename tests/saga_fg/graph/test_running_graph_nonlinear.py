@@ -10,7 +10,13 @@ import pytest
 from scipy.stats import chi2
 
 from factors import Robust, SolverSettings
-from pipelines.bench.sampled_traffic import Detections, Objects, Vehicle, providers, sample_traffic
+from pipelines.bench.sampled_traffic import (
+    DetectionProvider,
+    ObjectProvider,
+    VehicleProvider,
+    providers,
+    sample_traffic,
+)
 from saga_fg.estimators import IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT
 
@@ -117,7 +123,7 @@ def test_what_goes_in_acts():
             smoother.step(moment.time)
         return {one.id: smoother.state(one.key) for one in smoother.graph().of(OBJECT, 7).values()}
 
-    together = newest([Vehicle(scene), Objects(scene), Detections(scene)])
-    apart = newest([Vehicle(alone), Objects(alone), Detections(alone)])
+    together = newest([VehicleProvider(scene), ObjectProvider(scene), DetectionProvider(scene)])
+    apart = newest([VehicleProvider(alone), ObjectProvider(alone), DetectionProvider(alone)])
     assert together.keys() == apart.keys()
     assert max(np.abs(together[node] - apart[node]).max() for node in together) > 0.01

@@ -20,7 +20,7 @@ from saga_fg.slam.joint import (
     estimate_online,
     lane_key,
 )
-from saga_fg.slam.joint.lanes import KnownLane, LaneKeeping, assign_lanes, known_lanes
+from saga_fg.slam.joint.lanes import KnownLane, LaneAssociation, assign_lanes, known_lanes
 from saga_fg.types.road_map import Lane, RoadMap
 
 RADIUS = 200.0  # m of the bend
@@ -144,7 +144,7 @@ def test_a_map_that_every_frame_brings_is_read_once(monkeypatch: pytest.MonkeyPa
         return known_lanes(maps)
 
     monkeypatch.setattr("saga_fg.slam.joint.lanes.known_lanes", counted)
-    lanes, same = LaneKeeping(LaneSettings(), []), road()
+    lanes, same = LaneAssociation(LaneSettings(), []), road()
     for _ in range(3):
         lanes.add_maps(same)
     assert read == [1]
