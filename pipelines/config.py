@@ -10,7 +10,8 @@ from typing import Literal
 
 from pipelines.configuration import load_settings, read_settings
 from saga_fg.model.learned_interactions import LearnedInteractions
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.sensor import Sensor
 from saga_fg.settings import settings_group
 from saga_fg.tracking import (
     AssociationName,
@@ -23,7 +24,6 @@ from saga_fg.tracking import (
     TrackerSettings,
 )
 from saga_fg.types.by_class import DEFAULT, class_settings
-from saga_fg.types.sensor import Sensor
 
 Method = Literal["saga", "kf", "centerpoint"]
 Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings, read_settings
+from saga_fg.model.sensor import Sensor
 from saga_fg.settings import settings_group
 from saga_fg.smoothing import SmoothingSettings
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.sensor import Sensor
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.learning.trajectories import Trajectories
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.box_filter import MOVING
 

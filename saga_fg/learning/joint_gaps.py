@@ -18,7 +18,7 @@ from saga_fg.learning.trajectories import Trajectories
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import EdgeRule, build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.by_class import DEFAULT
 

@@ -24,7 +24,7 @@ from saga_fg.estimators import BatchSmoother, Births, Measurements, SmoothedStat
 from saga_fg.graph import FactorProvider
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import VELOCITY
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing.evidence import Evidence

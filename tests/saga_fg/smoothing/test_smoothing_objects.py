@@ -7,7 +7,8 @@ import pytest
 
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
+from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
@@ -30,7 +31,6 @@ from saga_fg.smoothing import (
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import NoiseModel, Sensor
 
 SENSORS = {"default": Sensor({"default": NoiseModel(position=0.1)})}
 CLASSES = {"default": OfflineClass(acceleration_noise=0.5)}

@@ -14,9 +14,9 @@ from saga_fg import (
     Tracker,
     TrackerSettings,
 )
+from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import ClassSettings, ExistenceSettings
-from saga_fg.types.sensor import Extrinsics, FieldOfView, NoiseModel
 
 TENTHS = np.arange(0, 5, 0.1)
 

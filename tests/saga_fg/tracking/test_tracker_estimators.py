@@ -5,8 +5,8 @@ import pytest
 from traffic_frames import frame, run, seen, straight
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.sensor import NoiseModel
 
 CLASSES = {
     "car": ClassSettings(motion=ConstantVelocity(1.0), gate=1 - 1e-7),
