@@ -11,8 +11,8 @@ import typer
 
 from pipelines.cli import options
 from pipelines.cli import tracking_options as how
+from pipelines.cli.console import progress_bar, working
 from pipelines.cli.datasets import dataset_commands
-from pipelines.cli.reporting import progress_bar, working
 from pipelines.cli.tables import JsonFile, report
 from saga_fg.errors import InputError
 
