@@ -89,7 +89,7 @@ def annotated_source(kind: str, place: str, recordings: Sequence[str] | None = N
 
 @dataclass(frozen=True)
 class GapBenchSettings:
-    """How much is done: folds, how many of them are tested, gaps judged in a recording, whether by networks too."""
+    """Size of the benchmark: folds, tested folds, gaps per recording, networks or none."""
 
     folds: int = 3
     tested_folds: int | None = None

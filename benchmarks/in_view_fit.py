@@ -70,7 +70,7 @@ def fit_interactions_in_view(
 
 
 class _Views:
-    """What recordings say of parameters x: those of rules, the logarithm of every class's noise, explained noise."""
+    """Likelihood of recordings given parameters x: those of rules, log noise of each class, explained noise."""
 
     def __init__(
         self, recordings: Sequence[Trajectories], position_noise: float, acceleration_noise: Mapping[str, float]
@@ -91,7 +91,7 @@ class _Views:
         return dict(zip(self._noise, np.exp(x[len(parameters.start) : -1]).tolist(), strict=True))
 
     def log_likelihood(self, parameters: RuleParameters, x: FloatArray) -> tuple[float, int]:
-        """Of all positions of all recordings but the first of each object, with the number of them."""
+        """Return the log-likelihood of all positions but the first of each object, and their number."""
         rules, q = parameters.valued(x[: len(parameters.start)]), self.noise(parameters, x)
         total, count = 0.0, 0
         for trajectories, alone in self._recordings:

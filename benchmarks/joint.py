@@ -142,7 +142,7 @@ def _change(rows: Sequence[JointRow], a: Callable[[JointRow], float], b: Callabl
     names = list(dict.fromkeys(row.scene for row in rows))
 
     def sums(ate: Callable[[JointRow], float]) -> list[list[float]]:
-        """Of each recording: squared errors, poses."""
+        """Sum of squared errors and number of poses of each recording."""
         mine = ([row for row in rows if row.scene == name] for name in names)
         return [[sum(r.poses * ate(r) ** 2 for r in some), float(sum(r.poses for r in some))] for some in mine]
 

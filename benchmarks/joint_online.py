@@ -174,7 +174,7 @@ def _judged(rows: Sequence[OnlineRow]) -> OnlineBench:
     names = list(dict.fromkeys(row.scene for row in rows))
 
     def change(errors: Callable[[OnlineRow], tuple[float, float]], count: Callable[[OnlineRow], int]) -> Interval:
-        """Of an error, decoupled and joint, whose squares add up over so many poses or pairs."""
+        """Change of an RMSE from decoupled to joint; `count` is the number of poses or pairs in its squares."""
         sums = np.zeros((2, len(names), 2))
         for row in rows:
             if count(row):

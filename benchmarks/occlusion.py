@@ -107,7 +107,7 @@ def occlusion(
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
-    """What the graph is worth where objects are hidden, on simulated traffic.
+    """Compare errors of hidden objects with and without the graph, on simulated traffic.
 
     \b
     Examples:

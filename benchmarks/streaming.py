@@ -38,7 +38,7 @@ PART = 30.0  # s that are read at a time, after which memory is read
 
 @dataclass(frozen=True)
 class StreamingBenchSettings(Settings):
-    """How much is measured."""
+    """Size of the benchmark."""
 
     objects: Annotated[int, Range(PLATOON, 10**6)] = setting(200, "objects at any time")
     seconds: Positive = setting(300.0, "length of the recording, s")
@@ -54,7 +54,7 @@ class StreamingBenchSettings(Settings):
 
 @dataclass(frozen=True)
 class StreamingRow:
-    """When so much was recorded (s): resident memory and the most so far (MB), and CPU time so far (s)."""
+    """Resident memory and its peak so far (MB), and CPU time so far (s), by the length recorded (s)."""
 
     recorded: float
     memory: float

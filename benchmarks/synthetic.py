@@ -121,7 +121,7 @@ class Cell:
         return float(ratio_of_sums(self._sums(contender, figure).sum(axis=0)))
 
     def change(self, contender: str, baseline: str, figure: str) -> Interval:
-        """Of a figure from the baseline's: a difference of MOTA, a relative change of MOTP and of switches."""
+        """Change of a figure from the baseline's: difference of MOTA, relative change of MOTP and of switches."""
         a, b = self._sums(contender, figure), self._sums(baseline, figure)
         if figure == "MOTA":
             return paired_bootstrap(a, b, ratio_of_sums, difference)

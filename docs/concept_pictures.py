@@ -23,7 +23,7 @@ ELLIPSE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degree
 
 @dataclass(frozen=True, eq=False)
 class Follow:
-    """What one method said of the hidden car along the road at times (k,) s: error and standard deviation (k,) m."""
+    """Estimates of the hidden car along the road at times (k,), s, by one method: error and deviation (k,), m."""
 
     tracker: Tracker
     time: FloatArray

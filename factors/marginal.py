@@ -65,13 +65,13 @@ def marginal_moments(
     if set(wanted) - set(remaining.keyVector()):  # nothing is left that speaks of them
         raise singular_system(graph)
     try:
-        root, mean = _solved(remaining, gtsam.Ordering(list(wanted)), elimination)
+        root, mean = _solve(remaining, gtsam.Ordering(list(wanted)), elimination)
     except np.linalg.LinAlgError as error:
         raise singular_system(graph, error) from error
     return mean, root @ root.T
 
 
-def _solved(
+def _solve(
     graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, elimination: Elimination
 ) -> tuple[FloatArray, FloatArray]:
     """Return a root S of the covariance S S^T, and the mean; raise LinAlgError when there is none."""

@@ -1,4 +1,4 @@
-"""An object that stands on a plane: on the ground, which is a landmark.
+"""An object on a plane: on the ground, which is a landmark.
 
     r = n . p + d - height
 

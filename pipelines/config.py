@@ -48,20 +48,20 @@ class TrackConfig:
     )
 
     def with_estimator(self, estimator: EstimatorName | None, lag: float | None) -> TrackConfig:
-        """The same with another estimator and window (s); None leaves what is there."""
+        """Return a copy with this estimator and window (s); None keeps the present one."""
         tracker = self.tracker
         tracker = replace(tracker, estimator=estimator or tracker.estimator, lag=tracker.lag if lag is None else lag)
         return replace(self, tracker=tracker)
 
     def with_association(self, method: AssociationName | None) -> TrackConfig:
-        """The same with another way to match detections to tracks; None leaves what is there."""
+        """Return a copy with this association method; None keeps the present one."""
         if method is None:
             return self
         association = replace(self.tracker.association, method=method)
         return replace(self, tracker=replace(self.tracker, association=association))
 
     def with_acceleration_noise(self, noise: Mapping[str, float]) -> TrackConfig:
-        """The same with constant velocity and this noise (m^2/s^3) for each class; `default` serves the rest."""
+        """Return a copy with constant velocity and this noise (m^2/s^3) by class; `default` serves the rest."""
         classes = dict(self.tracker.classes)
         for label, q in noise.items():
             motion = ConstantVelocity(acceleration_noise=q)
@@ -69,7 +69,7 @@ class TrackConfig:
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
     def with_interactions(self, learned: LearnedInteractions) -> TrackConfig:
-        """The same with learned edge rules. The process noise stays: association needs more room than prediction."""
+        """Return a copy with learned edge rules; process noise stays, as association needs more than prediction."""
         return replace(
             self, tracker=replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
         )
@@ -84,12 +84,12 @@ class TrackConfig:
         return Tracker(self.of_method(method).tracker, self.sensors, observer=observer)
 
     def of_method(self, method: Method) -> TrackConfig:
-        """The same, without edges unless the method has them."""
+        """Return a copy for a method: without edges, unless it is `saga`."""
         return self if method == "saga" else replace(self, tracker=replace(self.tracker, edges=()))
 
 
 def load_interactions(path: Path) -> LearnedInteractions:
-    """What `saga-fg learn interactions` wrote. Raises `InputError` naming the file and the dotted key of a mistake."""
+    """Read the file of `saga-fg learn interactions`. Raises `InputError` naming file and dotted key of a mistake."""
     return load_settings(LearnedInteractions, path)
 
 

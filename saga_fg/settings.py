@@ -1,4 +1,4 @@
-"""How settings are declared: frozen dataclasses whose fields carry their own comment and range.
+"""Declaration of settings: frozen dataclasses whose fields carry their own comment and range.
 
     @dataclass(frozen=True)
     class GateSettings(Settings):
@@ -38,13 +38,13 @@ class Range:
 
     @property
     def bounds(self) -> str:
-        """As in "a number > 0"; empty if there are none."""
+        """Bounds as text, like the end of "a number > 0"; empty if there are none."""
         if self.high < math.inf:
             return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
         return "" if self.low == -math.inf else f"{'>' if self.above else '>='} {self.low:g}"
 
     def __str__(self) -> str:
-        """As in "expected a finite number > 0"."""
+        """Expectation as text, like "finite number > 0"."""
         finite = "" if self.infinite or self.high < math.inf else "finite "
         return f"{finite}number {self.bounds}".rstrip()
 

@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def in_a_process_of_its_own(name: str, seed: int, part: int, state: Path) -> tuple[int, int]:
-    """How many inputs of a part were refused, and how many were faults; a crash or hang ends the part and is one."""
+    """Count the refused inputs of a part, and the faults; a crash or hang ends the part and is a fault."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_child, args=(name, seed, part, state, there.send))

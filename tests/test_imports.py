@@ -1,4 +1,4 @@
-"""What importing costs, and which way imports run."""
+"""Cost and direction of imports."""
 
 from __future__ import annotations
 

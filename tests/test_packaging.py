@@ -1,4 +1,4 @@
-"""What a user gets from pip: the four packages, their data files, the command, and nothing else."""
+"""Contents of the installed package: the four packages, their data files, the command, and nothing else."""
 
 from __future__ import annotations
 

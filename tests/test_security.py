@@ -1,4 +1,4 @@
-"""What docs/security.md promises of files from outside."""
+"""Promises of docs/security.md on files from outside."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def register(
         step += 1
         rows, paired = surfels.nearest(transform_points(T, points), farthest)
         J, r, w = _linearised(points[rows], paired, T, scale)
-        x = _solved(J.T @ (w[:, None] * J), -J.T @ (w * r), span)
+        x = _solve(J.T @ (w[:, None] * J), -J.T @ (w * r), span)
         T = _rigid(T @ gtsam.Pose3.Expmap(x).matrix())
         converged = bool(
             np.linalg.norm(x[3:]) < settings.translation_tolerance
@@ -111,7 +111,7 @@ def _linearised(
     return np.hstack([np.cross(points, normal), normal]), r, 1 / (1 + (r / scale) ** 2)
 
 
-def _solved(H: FloatArray, g: FloatArray, span: float) -> FloatArray:
+def _solve(H: FloatArray, g: FloatArray, span: float) -> FloatArray:
     """The Gauss-Newton step; `span`, a typical distance of the points, m, scales rotations to translations."""
     scale = np.array([span, span, span, 1.0, 1.0, 1.0])
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))

@@ -122,7 +122,7 @@ class LaneOrder:
 
     @classmethod
     def of(cls, s: FloatArray, lanes: IntArray) -> LaneOrder:
-        """From s (N,), m, and the lanes that each vehicle occupies (N, 2), -1 for none; two during a lane change."""
+        """Sort vehicles by s (N,), m, in the lanes (N, 2) that each occupies: -1 for none, two during a change."""
         rows, columns = np.nonzero(lanes >= 0)
         key = lanes[rows, columns] * SPAN + s[rows]
         order = np.argsort(key, kind="stable")

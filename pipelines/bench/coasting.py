@@ -93,7 +93,7 @@ def _windows(scene: Scene, rng: np.random.Generator) -> Windows:
 
 
 def _hidden(names: Sequence[str], time: float, windows: Windows) -> BoolArray:
-    """Which objects (N,) are hidden at a time."""
+    """Mask (N,) of the objects that are hidden at a time."""
     now = {n for n, a, b in zip(windows.name, windows.start, windows.stop, strict=True) if a <= time <= b}
     return np.array([name in now for name in names], dtype=np.bool_)
 

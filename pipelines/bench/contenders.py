@@ -1,4 +1,4 @@
-"""What is compared: the textbook, GTSAM's own smoother, and our estimators, all driven alike."""
+"""Contenders behind one interface: the textbook filter, GTSAM's smoother, and the estimators of saga-fg."""
 
 from __future__ import annotations
 

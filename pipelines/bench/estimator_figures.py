@@ -84,7 +84,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def criteria(rows: Sequence[Row], soaks: Sequence[Soak]) -> tuple[Criterion, ...]:
-    """What is to be reached on two cores, as ratios within one run."""
+    """Limits to reach on two cores, as ratios within one run."""
     table = {(row.case, row.graph, row.nodes, row.contender): row for row in rows}
     nothing = Row("", "connected", 0, "", math.nan, math.nan)
 

@@ -44,7 +44,7 @@ _COVARIANCES = 50  # more nodes take GTSAM's smoother seconds to tell its covari
 
 @dataclass(frozen=True)
 class EstimatorBenchSettings:
-    """How much is measured."""
+    """Size of the benchmark."""
 
     sizes: tuple[int, ...] = setting((10, 50, 100, 300, 1000), "numbers of nodes")
     frames: int = setting(20, "largest number of frames that are timed in each case")

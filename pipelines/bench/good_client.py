@@ -112,7 +112,7 @@ class GoodClient(threading.Thread):
                 time.sleep(0.02)
 
     def _die(self, seq: int) -> None:
-        """As a process that is killed: frames on the way, answers unread."""
+        """Disconnect like a killed process: frames on the way, answers unread."""
         for each in range(seq, min(seq + 3, self.frames)):
             self._client.send(self._line(each))
         self._client.close()

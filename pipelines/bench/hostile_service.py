@@ -46,7 +46,7 @@ MOST_STALL, MOST_GROWTH = 0.5, 1.05  # s; memory at the end by memory at the sta
 
 @dataclass(frozen=True)
 class HostileBenchSettings(Settings):
-    """How long, and how fast."""
+    """Number and rate of messages."""
 
     messages: PositiveInt = setting(20_000, "messages in all, a fifth of them valid frames of two good clients")
     objects: PositiveInt = setting(50, "objects in each valid frame")
@@ -55,7 +55,7 @@ class HostileBenchSettings(Settings):
 
     @property
     def frames(self) -> int:
-        """Of each good client."""
+        """Frames that each good client sends."""
         return max(1, round(self.messages * VALID / len(SENSORS)))
 
 

@@ -1,4 +1,4 @@
-"""How time and memory are measured: side by side, in one run, on one thread.
+"""Measurement of time and memory: side by side, in one run, on one thread.
 
 Times are CPU times of the thread, so that whatever else the machine does counts little; contenders take turns frame by
 frame, so that what is left of it hits all of them alike. Figures are medians, and ratios of medians.
@@ -46,7 +46,7 @@ def size_of(value: Any) -> float:
 
 
 def environment() -> dict[str, str]:
-    """What the figures depend on."""
+    """Return versions and hardware that the figures depend on."""
     blas = sorted({f"{pool['internal_api']} {pool['version']}" for pool in threadpool_info()})
     packages = {name: version(name) for name in ("saga-fg", "gtsam", "numpy", "scipy")}
     return {"python": platform.python_version(), "machine": platform.machine(), "blas": ", ".join(blas), **packages}

@@ -38,7 +38,7 @@ Runs = Mapping[str, TrackedScene]
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """How good a tracker is on a set.
+    """Scores of a tracker on a set.
 
     figures_of  headline figures of some scenes, by their numbers; a number may occur more than once
     errors      at the labels, scene by scene

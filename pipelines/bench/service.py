@@ -58,7 +58,7 @@ class ServiceBench:
 
     @property
     def nothing_lost(self) -> bool:
-        """Whether every valid frame was taken in once, and every broken line refused."""
+        """True if every valid frame was taken in once, and every broken line refused."""
         return self.valid == self.taken_in and self.broken == self.refused
 
 

@@ -38,7 +38,7 @@ LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE")
 
 @dataclass(frozen=True)
 class TrackingBenchSettings:
-    """How much is done.
+    """Size of the benchmark.
 
     components  whether to switch components off one by one
     contenders  whether to track by graph matching and by interactions learned on other scenes of the set, and to judge

@@ -1,4 +1,4 @@
-"""What the tracking benchmark compares: the methods, and the graph-aware tracker with one component switched off.
+"""Variants of the tracking benchmark: the methods, and the graph-aware tracker with one component switched off.
 
 A component is a named change of settings, written as dotted names and values over the shipped configuration; `*` stands
 for every entry of a mapping. A value may be a function of the old value. One that is off as shipped is not compared.

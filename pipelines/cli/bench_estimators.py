@@ -40,7 +40,7 @@ def estimators(
     json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
-    """What the estimators cost and how exact they are.
+    """Measure time, memory and exactness of the estimators.
 
     Filters are compared with the textbook's on dense matrices, fixed-lag smoothers with GTSAM's, batch smoothers with
     Rauch, Tung and Striebel's, a running graph of intelligent drivers with a linear one, and one with a lag with the

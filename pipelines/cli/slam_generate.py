@@ -13,7 +13,7 @@ from pipelines.cli.summary import counted
 
 
 class Shape(StrEnum):
-    """What is driven through."""
+    """Shape of the simulated drive."""
 
     CITY = "city"
     TORUS = "torus"

@@ -1,4 +1,4 @@
-"""What a settings dataclass may hold, as a small schema that reading, writing and documenting share.
+"""Schema of settings dataclasses, shared by reading, writing and documenting them.
 
 | type hint of the field                  | schema     | in YAML                                                     |
 |-----------------------------------------|------------|-------------------------------------------------------------|

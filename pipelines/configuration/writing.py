@@ -95,7 +95,7 @@ def _comment(item: Setting) -> str:
 def _form(
     schema: Schema, value: Any, base: Any, comments: bool, selection: Sequence[str] = EVERYTHING
 ) -> str | list[str]:
-    """How a value is written: on the line of its key (text), or in lines below it."""
+    """Return a value as YAML: text on the line of its key, or a list of lines below it."""
     while isinstance(schema, Nullable) and value is not None:
         schema = schema.value
     match schema:

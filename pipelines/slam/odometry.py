@@ -108,7 +108,7 @@ class LidarOdometry:
         else:
             if not timestamp > last.timestamp:
                 raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
-            placed = self._placed(last, scan, timestamp)
+            placed = self._place(last, scan, timestamp)
         self._last = placed
         if placed.keyframe:
             self._keyframe = placed.map_T_lidar
@@ -116,7 +116,7 @@ class LidarOdometry:
             self._map.add(transform_points(placed.map_T_lidar, points), placed.map_T_lidar[:3, 3])
         return placed
 
-    def _placed(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
+    def _place(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
         s, dt = self.settings, timestamp - last.timestamp
         motion = gtsam.Pose3.Expmap(self._velocity * dt).matrix()
         predicted = last.map_T_lidar @ motion

@@ -2,7 +2,7 @@
 
 The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.slam.joint` (detections,
 interactions, objects that stand) are solved as one. Its moments are the keyframes, and scans in between where the
-vehicle is slow, since objects move while it stands. Poses are those of the sensor; detections are brought into its
+vehicle is slow, since objects move while it is stationary. Poses are those of the sensor; detections are brought into its
 frame.
 """
 

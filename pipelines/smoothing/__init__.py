@@ -1,4 +1,4 @@
-"""From recordings to labels: the online pass, the passes of smoothing, the labels."""
+"""Offline labelling of recordings: the online pass, the passes of smoothing, the labels."""
 
 from pipelines.smoothing.chunks import ChunkSettings
 from pipelines.smoothing.config import SmoothConfig, load_smooth_config

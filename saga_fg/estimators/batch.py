@@ -74,11 +74,11 @@ class BatchSmoother(RecordedSmoother):
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         super().add(nodes, means, covariances)
-        self._changed()
+        self._clear_cache()
 
     def predict(self, transition: Transition) -> None:
         super().predict(transition)
-        self._changed()
+        self._clear_cache()
 
     def update(
         self,
@@ -89,7 +89,7 @@ class BatchSmoother(RecordedSmoother):
         """Take in measurements, as `RecordedSmoother.update`; a loss may be reached by graduated non-convexity."""
         likelihood = self._recording.update(RecordedMeasurements(measurements, robust), time)
         self._graduated &= not isinstance(robust, GraduatedNonConvexity)
-        self._changed()
+        self._clear_cache()
         return likelihood
 
     @property
@@ -150,7 +150,7 @@ class BatchSmoother(RecordedSmoother):
         require_kind("state", state, BatchState)
         self._recording.restore(state.recording)
         self._graduated = state.graduated
-        self._changed()
+        self._clear_cache()
 
     def posterior(self) -> BlockGaussian:
         self._graduate()
@@ -226,7 +226,7 @@ class BatchSmoother(RecordedSmoother):
         log.info("eliminated in the order of time: %s", reason)
         self._order, self._sparse = "time", None
 
-    def _changed(self) -> None:
+    def _clear_cache(self) -> None:
         self._order = self._sparse = None
 
 

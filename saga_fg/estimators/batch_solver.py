@@ -43,11 +43,11 @@ class BatchSolver:
         settings: SolverSettings | None = None,
     ) -> None:
         self.providers = tuple(providers)
-        self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
+        self.origin = np.zeros(2)  # origin of the positions of objects, world, m
         self._settings = settings or SolverSettings()
         self._graph = SceneFactorGraph()
         self._solution: GraphSolution | None = None
-        self._lent = False  # whether somebody may hold the graph
+        self._shared = False  # a caller may hold the graph, so that its values are copied before a change
         if graph is not None:
             self.restore(graph)
 
@@ -62,41 +62,39 @@ class BatchSolver:
         frame: the input of the epoch
         """
         asked = self.providers if providers is None else providers
-        unchanged, begun = (self._graph, self._solution, self._lent), predictors(asked)
-        self._asked(time, begun or asked, frame)
+        unchanged, begun = (self._graph, self._solution, self._shared), predictors(asked)
+        self._ask(time, begun or asked, frame)
         if begun:
             try:
-                self._asked(None, asked, frame)
+                self._ask(None, asked, frame)
             except GraphError:
-                self._graph, self._solution, self._lent = unchanged
+                self._graph, self._solution, self._shared = unchanged
                 self._graph.erase_unknown_values()
                 raise
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch."""
-        self._asked(None, providers)
+        self._ask(None, providers)
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Integrate variables out, linearised at the solution; their information on others stays."""
         graph = self.graph().copy()
         graph.marginalise(keys)
-        self._changed(graph)
+        self._replace_graph(graph)
 
     def solve(self) -> GraphSolution:
         """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
         if self._solution is None:
             graph = self._graph.copy()
             graph.erase_unknown_values()  # when a provider asks, others have added some already
-            self._solution = _solved(graph, self._settings)
+            self._solution = _minimise(graph, self._settings)
             self._graph = graph
         return self._solution
-
-    solution = solve
 
     def graph(self) -> SceneFactorGraph:
         """The graph itself, solved: its variables, factors and values. To be read, not changed."""
         self.solve()
-        self._lent = True
+        self._shared = True
         return self._graph
 
     def state(self, key: int) -> object:
@@ -122,11 +120,11 @@ class BatchSolver:
         """Continue from a graph, of whichever back end."""
         if not isinstance(graph, SceneFactorGraph):
             raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
-        self._changed(graph.copy())
+        self._replace_graph(graph.copy())
 
-    def _asked(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:
+    def _ask(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:
         known = self._graph
-        graph = known.copy(share_values=not self._lent)
+        graph = known.copy(share_values=not self._shared)
         view = GraphView(graph, self.covariance, self.origin, frame)
         try:
             if time is not None:
@@ -136,13 +134,13 @@ class BatchSolver:
         except GraphError:
             known.erase_unknown_values()
             raise
-        self._changed(graph)
+        self._replace_graph(graph)
 
-    def _changed(self, graph: SceneFactorGraph) -> None:
-        self._graph, self._solution, self._lent = graph, None, False
+    def _replace_graph(self, graph: SceneFactorGraph) -> None:
+        self._graph, self._solution, self._shared = graph, None, False
 
 
-def _solved(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
+def _minimise(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
     """The minimum, to which the graph moves."""
     native, ours = graph.solver_inputs()
     try:

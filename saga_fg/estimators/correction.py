@@ -118,7 +118,7 @@ def _posterior(x: BlockGaussian, stacks: Iterable[_Stacked]) -> tuple[BlockGauss
     """Correct components, each of which is in one stack at most."""
     mean, blocks, gains = x.mean.copy(), list(x.blocks), []
     for stacked in stacks:
-        gain, P = _corrected(stacked)
+        gain, P = _correct(stacked)
         gains.append(gain)
         mean[gain.places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
         if isinstance(stacked.active, slice):  # all of the group
@@ -201,7 +201,7 @@ def _innovation_root(stacked: _Stacked) -> FloatArray:
         ) from None
 
 
-def _corrected(stacked: _Stacked) -> tuple[Gain, FloatArray]:
+def _correct(stacked: _Stacked) -> tuple[Gain, FloatArray]:
     """Gain and posterior covariance (c, s, s)."""
     P, L = stacked.P, _innovation_root(stacked)
     solved = solve_lower(L, np.concatenate([stacked.H_P, stacked.innovation], axis=2))

@@ -50,7 +50,7 @@ class GraphFilter(LatestMarginals):
                where measurements put it; else it is linearised at the prediction, as by the extended Kalman filter
 
     What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
-    stands still; where noise is so small that factors would lose digits, it is predicted by covariances.
+    is stationary; where noise is so small that factors would lose digits, it is predicted by covariances.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, relinearised: bool = False) -> None:
@@ -86,14 +86,14 @@ class GraphFilter(LatestMarginals):
 
     def ask_providers(self) -> None:
         """Let the users' providers add their factors."""
-        smoother = self._changed()
+        smoother = self._smoother_to_change()
         smoother.extend(self.providers)
         smoother.forget(self._keys.values())
         self._auxiliary = self._auxiliary_now()
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Let some providers add their factors at the present epoch."""
-        self._changed().extend(providers)
+        self._smoother_to_change().extend(providers)
 
     @property
     def others(self) -> list[int]:
@@ -112,7 +112,7 @@ class GraphFilter(LatestMarginals):
         mean, covariance = checked_prior(nodes, means, covariances)
         layout = self._layout.extended(nodes, mean.shape[1])
         added = layout.nodes[len(self._layout) :]
-        smoother = self._changed()
+        smoother = self._smoother_to_change()
         keys = {node: node_key(node, smoother.graph().epoch) for node in added.tolist()}
         back = [key for key in keys.values() if key in smoother.graph().variables]
         if back:  # removed and added at the same epoch: iSAM2 has to forget them first
@@ -135,7 +135,7 @@ class GraphFilter(LatestMarginals):
         chosen = lossy(x, dynamics, still, window=self._lag > 0)
         unused = np.isin(transition.nodes, nodes[still | chosen])
         change = self._predict_by_covariance(dynamics, chosen, keys) if chosen.any() else None
-        smoother = self._changed()
+        smoother = self._smoother_to_change()
         smoother.forget({*self._keys.values(), *self._auxiliary})
         moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, carried_over)
         begun = [moved, *predictors(self.providers)]
@@ -153,7 +153,7 @@ class GraphFilter(LatestMarginals):
             return 0.0
         x = self.posterior()
         likelihood = innovation_likelihood(x, *recorded.linearised(x.layout, x.mean))
-        self._changed().extend([DetectionFactors(measurements, self._keys)])
+        self._smoother_to_change().extend([DetectionFactors(measurements, self._keys)])
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -181,7 +181,7 @@ class GraphFilter(LatestMarginals):
     def restore(self, state: GraphState) -> None:
         """Continue from a snapshot."""
         require_kind("state", state, GraphState)
-        self._changed().restore(state.graph)
+        self._smoother_to_change().restore(state.graph)
         self._layout, self._keys, self._auxiliary = state.layout, state.keys, state.auxiliary
 
     def _auxiliary_now(self) -> tuple[int, ...]:
@@ -212,7 +212,7 @@ class GraphFilter(LatestMarginals):
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         return self.posterior(), self._layout.rows(nodes)
 
-    def _changed(self) -> IncrementalSmoother:
+    def _smoother_to_change(self) -> IncrementalSmoother:
         self._posterior = None
         return self._smoother
 

@@ -100,7 +100,7 @@ class IncrementalSmoother:
         """
         graph = self._graph.copy()
         graph.advance(time, carried_over)
-        self._asked(graph, providers, change)
+        self._ask_and_move(graph, providers, change)
         self._times = [*self._times, graph.time]
 
     def forget(self, kept: Collection[int] = ()) -> None:
@@ -121,7 +121,7 @@ class IncrementalSmoother:
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Ask some more providers at the present epoch, and solve again."""
-        self._asked(self._graph.copy(), providers)
+        self._ask_and_move(self._graph.copy(), providers)
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Integrate variables out; their information on others stays."""
@@ -178,7 +178,7 @@ class IncrementalSmoother:
         times = {one.time for one in graph.variables.values() if one.time is not None}
         self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))
 
-    def _asked(
+    def _ask_and_move(
         self,
         graph: SceneFactorGraph,
         providers: Sequence[FactorProvider],
@@ -200,18 +200,18 @@ class IncrementalSmoother:
                 change(graph)
 
     def _move_to(self, graph: SceneFactorGraph) -> None:
-        self._engine = self._solved(graph)
+        self._engine = self._solve(graph)
         self._graph = graph
 
     def _ready(self) -> Engine:
         """iSAM2 with the graph as it is."""
         if self._engine is None:
             graph = self._graph.copy()
-            self._engine = self._solved(graph)
+            self._engine = self._solve(graph)
             self._graph = graph
         return self._engine
 
-    def _solved(self, graph: SceneFactorGraph) -> Engine:
+    def _solve(self, graph: SceneFactorGraph) -> Engine:
         """iSAM2 with the graph, which moves to the solution."""
         engine, self._engine = self._engine, None  # it is begun anew, should it fail
         start = graph.values

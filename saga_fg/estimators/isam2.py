@@ -101,7 +101,7 @@ class IncrementalFilter(LatestMarginals):
             return
         if np.isin(added, state.newest.leaving).any():  # removed and added at the same time
             state = _moved(state, ZeroInterval())
-        state, x = _solved(state)
+        state, x = _solve(state)
         x = x.extended(x.layout.extended(added, mean.shape[1]), mean, covariance)
         new = NewNodes(added, mean, covariance)
         epochs = state.with_newest(replace(state.newest, new_nodes=(*state.newest.new_nodes, new)))
@@ -120,20 +120,20 @@ class IncrementalFilter(LatestMarginals):
             return 0.0
         state = self._state
         if state.x is None and _is_wide(state, recorded):
-            state, _ = _solved(state)
+            state, _ = _solve(state)
         epochs = state.with_newest(replace(state.newest, measurements=(*state.newest.measurements, recorded)))
         if state.x is None:
             assert state.tree is not None
             prior_mean = state.tree.variables.origin
             linear = recorded.linearised(state.tree.components.layout, prior_mean)
             white = whitened(linear)
-            self._state, x = _solved(replace(state, tree=state.tree.with_measurements(white), epochs=epochs))
+            self._state, x = _solve(replace(state, tree=state.tree.with_measurements(white), epochs=epochs))
             return posterior_likelihood(x, prior_mean, *white)
         linear = recorded.linearised(state.x.layout, state.x.mean)
         likelihood = innovation_likelihood(state.x, *linear)
         tree = _begun(state.x, _largest(state.x.partition) <= _SMALL) if state.tree is None else state.tree
         tree = None if tree is None else tree.with_measurements(whitened(linear))
-        self._state, _ = _solved(replace(state, tree=tree, x=None, epochs=epochs))
+        self._state, _ = _solve(replace(state, tree=tree, x=None, epochs=epochs))
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -148,12 +148,12 @@ class IncrementalFilter(LatestMarginals):
 
     def posterior(self) -> BlockGaussian:
         """Posterior of the present nodes, and perhaps of some that have just left."""
-        self._state, x = _solved(self._state)
+        self._state, x = _solve(self._state)
         return x
 
     def graph(self) -> SceneFactorGraph:
         """The last interval: the posterior before it as prior, its factors, and all measurements since."""
-        self._state, x = _solved(self._state)
+        self._state, x = _solve(self._state)
         state = self._state
         steps = filter_epochs(state.before, list(state.epochs))
         means = [*smoothed_means(steps)[:-1], x.mean]
@@ -161,7 +161,7 @@ class IncrementalFilter(LatestMarginals):
 
     def snapshot(self) -> IncrementalState:
         """The whole state as a value. The filter itself restarts from it, so that both go on to the same bits."""
-        self._state, x = _solved(self._state)
+        self._state, x = _solve(self._state)
         leaving = x.layout.rows(self._state.newest.leaving)
         state = IncrementalState(x.without(leaving), self.time)
         self.restore(state)
@@ -176,7 +176,7 @@ class IncrementalFilter(LatestMarginals):
         return live_rows(self.posterior(), self._state.live, nodes)
 
 
-def _solved(state: _State) -> tuple[_State, BlockGaussian]:
+def _solve(state: _State) -> tuple[_State, BlockGaussian]:
     """Update the tree; where GTSAM's arithmetic fails, filter by covariances without it."""
     if state.x is not None:
         return state, state.x
@@ -201,7 +201,7 @@ def _begun(x: BlockGaussian, small: bool) -> BayesTree | None:
 
 def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
     """Move over an interval: by interaction factors, or by covariances for components whose digits these would lose."""
-    state, x = _solved(state)
+    state, x = _solve(state)
     stay = x.without(x.layout.rows(state.newest.leaving))
     dynamics = interval.linearised(stay.layout, stay.mean)
     apart = dynamics.separated(stay)

@@ -172,16 +172,16 @@ def interval_factors(
     for blocks in dynamics.Q:
         noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
         regular[blocks.target] = _is_regular(blocks.values)
-    same = now == then  # of who rests
-    kinds = np.zeros(len(layout), dtype=np.int64)  # sizes of the states that a node listens to
+    same = now == then  # nodes whose variable stays
+    block_shapes = np.zeros(len(layout), dtype=np.int64)  # numbers of state sizes among the sources of a node
     for blocks in dynamics.F:
-        kinds[np.unique(blocks.target)] += 1
+        block_shapes[np.unique(blocks.target)] += 1
     nonlinear: list[ResidualFactors] = []
     moves_nonlinearly = same.copy()
     for group, rows in interval.nonlinear_rows(layout) if isinstance(interval, IntervalDynamics) else ():
         moves_nonlinearly[rows[:, 0]] = True
         nonlinear.append(group.factors(then[rows[:, 0]], now[rows]))
-    together = regular & (kinds == 1) & ~moves_nonlinearly
+    together = regular & (block_shapes == 1) & ~moves_nonlinearly
     native: list[gtsam.JacobianFactor] = []
     for blocks in dynamics.F:
         mine = np.flatnonzero(together[blocks.target])

@@ -100,7 +100,7 @@ class Recording:
         self._prior, self._converged = state.prior, state.converged
         self._epochs, self._layouts, self._steps = list(state.epochs), list(state.layouts), list(state.steps)
         self._nonlinear = not all(epoch.linear for epoch in state.epochs)
-        self._changed()
+        self._clear_cache()
 
     @property
     def time(self) -> float:
@@ -152,7 +152,7 @@ class Recording:
             self._steps[-1] = self._steps[-1].with_new_nodes(new)
         self._epochs[-1] = replace(epoch, new_nodes=(*epoch.new_nodes, new))
         self._layouts[-1] = self._layouts[-1].extended(added, mean.shape[1])
-        self._changed()
+        self._clear_cache()
 
     def predict(self, interval: IntervalDynamics) -> None:
         """Begin a new epoch."""
@@ -186,7 +186,7 @@ class Recording:
         self._epochs, self._layouts, self._steps = epochs, layouts, steps
         self._nonlinear |= not recorded.linear
         self._converged = not self._nonlinear
-        self._changed()
+        self._clear_cache()
         return likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -214,7 +214,7 @@ class Recording:
         self._epochs = [replace(self._epochs[k], new_nodes=()), *self._epochs[k + 1 :]]
         self._layouts, self._steps = self._layouts[k:], [first, *self._steps[k + 1 :]]
         self._nonlinear = not all(epoch.linear for epoch in self._epochs)
-        self._changed()
+        self._clear_cache()
 
     def latest(self) -> BlockGaussian:
         """The filter's posterior at the newest epoch, over all its nodes."""
@@ -258,7 +258,7 @@ class Recording:
         )
         self._epochs, self._steps = list(epochs), steps
         self._converged = not self._nonlinear
-        self._changed()
+        self._clear_cache()
 
     def solve(self) -> None:
         """Complete the filter's pass; linearise until the smoothed means stand still where that makes a difference."""
@@ -280,7 +280,7 @@ class Recording:
         else:
             log.warning("no convergence in %d iterations; last step %.2g sigma", self._settings.max_iterations, step)
         self._steps, self._converged = steps, True
-        self._changed()
+        self._clear_cache()
         self._means = solved
 
     def _begin_epoch(self, interval: IntervalDynamics | ZeroInterval) -> None:
@@ -295,7 +295,7 @@ class Recording:
         self._layouts, self._steps = [*self._layouts, layout], steps
         self._nonlinear |= not interval.linear
         self._converged &= interval.linear or not self._lazy
-        self._changed()
+        self._clear_cache()
 
     def _epoch_at(self, time: float) -> tuple[int, list[Epoch], list[StateLayout]]:
         """The epoch of `time`, with epochs and layouts in which it is, an interval split if need be."""
@@ -320,7 +320,7 @@ class Recording:
         layouts.insert(k + 1, layouts[k].without(leaving) if len(leaving) else layouts[k])
         return k + 1, epochs, layouts
 
-    def _changed(self) -> None:
+    def _clear_cache(self) -> None:
         self._layout = None
         self._means = self._covariances = self._marginals = None
 

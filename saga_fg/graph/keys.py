@@ -51,7 +51,7 @@ class KeyId:
     epoch: int | None
 
 
-def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- an id is what it is
+def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- GTSAM and the tables call it id
     """Return the key. Raises `GraphError` for an id or epoch that is no whole number from 0 to `LARGEST`."""
     for name, number in (("id", id), ("epoch", 0 if epoch is None else epoch)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 0 <= number <= LARGEST:

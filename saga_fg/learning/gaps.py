@@ -83,7 +83,7 @@ def gap_ends(trajectories: Trajectories, settings: GapSettings) -> FloatArray:
 
 
 def _interval(trajectories: Trajectories, settings: GapSettings) -> float:
-    """From one moment to the next, as a rule, s."""
+    """Return the median interval between moments, s."""
     return float(np.median(np.diff(trajectories.time))) if len(trajectories) > 1 else settings.step
 
 

@@ -41,7 +41,8 @@ class JointGaps:
         rules: Sequence[EdgeRule],
         explained_noise: float = 0.0,
     ) -> None:
-        self._of, self._filtered, self._rules, self._explained = trajectories, filtered, tuple(rules), explained_noise
+        self._trajectories, self._filtered = trajectories, filtered
+        self._rules, self._explained = tuple(rules), explained_noise
         self._R = position_noise**2 * np.eye(2)
         by_class = {c: NodeType(c, ConstantVelocity(noise.get(c, noise[DEFAULT]))) for c in set(trajectories.label)}
         self._types = [by_class[c] for c in trajectories.label]
@@ -49,7 +50,7 @@ class JointGaps:
 
     def errors(self, gaps: GapSample, settings: GapSettings) -> FloatArray:
         """Position errors (W, S), m, of the predictions through the gaps."""
-        _, stride, steps = gap_moments(self._of, settings)
+        _, stride, steps = gap_moments(self._trajectories, settings)
         errors = np.full((len(gaps), steps), np.nan)
         for k, state, present, _ in self._in_view(int(gaps.moment.max(initial=-1)) + 1):
             rows = np.flatnonzero(gaps.moment == k)
@@ -57,18 +58,18 @@ class JointGaps:
                 start = state.snapshot()
                 for w in rows.tolist():
                     state.restore(start)
-                    errors[w] = self._gap(state, present, int(gaps.row[w]), k, stride, steps)
+                    errors[w] = self._gap_errors(state, present, int(gaps.row[w]), k, stride, steps)
                 state.restore(start)
         return errors
 
     def log_likelihood(self) -> tuple[float, int]:
         """Log-likelihood of all positions but the first of each object, and their number."""
-        steps = [result for *_, result in self._in_view(len(self._of))]
+        steps = [result for *_, result in self._in_view(len(self._trajectories))]
         return sum(log for log, _ in steps), sum(count for _, count in steps)
 
     def _in_view(self, moments: int) -> Iterator[tuple[int, JointKalmanFilter, IntArray, tuple[float, int]]]:
         """After each moment: the filter, the rows in view, and log-likelihood and number of the positions measured."""
-        seen = np.isfinite(self._of.position[..., 0])
+        seen = np.isfinite(self._trajectories.position[..., 0])
         state, present = JointKalmanFilter(), np.empty(0, dtype=np.int64)
         for k in range(moments):
             now = np.flatnonzero(seen[k])
@@ -77,18 +78,17 @@ class JointGaps:
                 state.marginalise(lost)
             kept, log = np.setdiff1d(present, lost), 0.0
             if len(kept):
-                self._predict(
-                    state, kept, self._filtered.heading[k - 1], k - 1, self._of.time[k] - self._of.time[k - 1]
-                )
+                dt = self._trajectories.time[k] - self._trajectories.time[k - 1]
+                self._predict(state, kept, self._filtered.heading[k - 1], k - 1, dt)
                 log = self._measure(state, kept, k)
             new = np.setdiff1d(now, kept)
             if len(new):
-                mean = np.concatenate([self._of.position[k, new], np.zeros((len(new), 2))], axis=1)
+                mean = np.concatenate([self._trajectories.position[k, new], np.zeros((len(new), 2))], axis=1)
                 state.add(new, mean, np.tile(self._initial, (len(new), 1, 1)))
             present = now
             yield k, state, present, (log, len(kept))
 
-    def _gap(
+    def _gap_errors(
         self, state: JointKalmanFilter, present: IntArray, hidden: int, k: int, stride: int, steps: int
     ) -> FloatArray:
         """(S,) errors of one object that is hidden from moment k on."""
@@ -96,9 +96,9 @@ class JointGaps:
         course = self._filtered.heading[k].copy()
         for step in range(steps):
             before, at = k + step * stride, k + (step + 1) * stride
-            if at >= len(self._of):
+            if at >= len(self._trajectories):
                 break
-            dt = (self._of.time[at] - self._of.time[before]) / SUBSTEPS
+            dt = (self._trajectories.time[at] - self._trajectories.time[before]) / SUBSTEPS
             for part in range(SUBSTEPS):
                 heading = self._filtered.heading[before].copy()
                 heading[hidden] = course[hidden]
@@ -111,18 +111,18 @@ class JointGaps:
                     dt,
                     hidden_moved=bool(self._filtered.has_moved[k, hidden]),
                     hidden=hidden,
-                    unseen=self._of.time[before] - self._of.time[k] + part * dt,
+                    unseen=self._trajectories.time[before] - self._trajectories.time[k] + part * dt,
                 )
                 new = state.mean([hidden])[0, 2:]
                 if self._filtered.has_moved[k, hidden] and v @ v > TURNS_ABOVE**2:
                     course[hidden] += np.arctan2(v[0] * new[1] - v[1] * new[0], v @ new)
-            here = np.isfinite(self._of.position[at, :, 0])
+            here = np.isfinite(self._trajectories.position[at, :, 0])
             lost = present[~here[present] & (present != hidden)]
             if len(lost):
                 state.marginalise(lost)
                 present = np.setdiff1d(present, lost)
             self._measure(state, present[present != hidden], at)
-            errors[step] = np.hypot(*(self._of.position[at, hidden] - state.mean([hidden])[0, :2]))
+            errors[step] = np.hypot(*(self._trajectories.position[at, hidden] - state.mean([hidden])[0, :2]))
         return errors
 
     def _predict(
@@ -141,12 +141,12 @@ class JointGaps:
         moved[rows == hidden] = hidden_moved
         nodes = NodeTable(
             rows,
-            self._of.label[rows],
+            self._trajectories.label[rows],
             tuple(self._types[row] for row in rows),
             mean[:, :2],
             mean[:, 2:],
             np.where(np.isfinite(heading[rows]), heading[rows], np.arctan2(mean[:, 3], mean[:, 2])),
-            self._of.length[rows],
+            self._trajectories.length[rows],
             np.trace(state.covariance(rows)[:, 2:, 2:], axis1=1, axis2=2) / 2,
             moved,
             unseen=np.where(rows == hidden, unseen, 0.0),
@@ -155,4 +155,4 @@ class JointGaps:
 
     def _measure(self, state: JointKalmanFilter, rows: IntArray, k: int) -> float:
         """The log-likelihood of the positions of `rows` at moment k."""
-        return state.update(Measurements(rows, self._of.position[k, rows], _H, self._R)) if len(rows) else 0.0
+        return state.update(Measurements(rows, self._trajectories.position[k, rows], _H, self._R)) if len(rows) else 0.0

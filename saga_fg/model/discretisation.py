@@ -1,4 +1,4 @@
-r"""From a scene graph to the discrete dynamics of an interval, for any dt.
+r"""Discretisation of a scene graph: the dynamics of an interval, for any dt.
 
 Node i of the graph obeys, with K_ij the rate of edge j -> i,
 

@@ -1,6 +1,6 @@
 r"""Mixtures of motion: an interacting-multiple-model filter a node, matched in moments before nodes are coupled.
 
-A node rests, goes straight or turns: in mode r it moves as x' = F_r x + c_r + q_r, q_r ~ N(0, Q_r), and changes mode
+A node is stationary, goes straight or turns: in mode r it moves as x' = F_r x + c_r + q_r, q_r ~ N(0, Q_r), and changes mode
 as a Markov chain in continuous time. Its Gaussian of each mode, N(m_s, P_s) with weight mu_s, predicts by mixing
 (Blom and Bar-Shalom 1988; Bar-Shalom, Li and Kirubarajan 2001, section 11.6.6):
 

@@ -144,7 +144,7 @@ class SocialForce(Settings):
 
 
 def nearest_offset(offset: FloatArray, pieces: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """From the nearest point of pieces of lines (..., k, 4) to offset (..., 2), and whether it is within a piece."""
+    """Vectors (..., 2) to `offset` from the nearest point of segments (..., k, 4); True where that is no end point."""
     start, step = pieces[..., :2], pieces[..., 2:] - pieces[..., :2]
     squared = (step**2).sum(axis=-1)
     share = ((offset[..., None, :] - start) * step).sum(axis=-1) / np.where(squared > 0, squared, 1.0)

@@ -100,7 +100,7 @@ def least_total(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
 
 
 def cheapest_first(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
-    """As `least_total`, but the cheapest candidate first, which takes its row and its column from all others."""
+    """Assign greedily: like `least_total`, but the cheapest candidate of the rows and columns left comes first."""
     paying = (gain < 0).nonzero()[0]
     taken_rows: set[int] = set()
     taken_columns: set[int] = set()

@@ -61,8 +61,8 @@ class Odometry(Settings):
         """Motion of this epoch, with the covariance of its tangent."""
         ego = None if view.frame is None else view.frame.ego
         if ego is None or ego.odometry is None:
-            standing: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
-            return standing, self._covariance(self.unknown_speed * view.dt, self.unknown_turn * view.dt, planar)
+            stationary: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
+            return stationary, self._covariance(self.unknown_speed * view.dt, self.unknown_turn * view.dt, planar)
         reported = ego.odometry
         motion = _motion_of(reported, planar)
         covariance = reported.covariance

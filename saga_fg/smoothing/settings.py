@@ -51,7 +51,7 @@ class OfflineClass(Settings):
 
 @dataclass(frozen=True)
 class StitchingSettings(Settings):
-    """When two tracklets are one object."""
+    """Stitching of the tracklets of one object."""
 
     max_gap: NonNegative = setting(
         3.0, "longest gap between two tracklets of one object, s; higher: more links, right and wrong"

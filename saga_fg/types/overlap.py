@@ -1,4 +1,4 @@
-"""Overlap of oriented boxes: IoU in the plane and in space, generalised IoU, over all pairs at once.
+"""Overlap of oriented boxes: IoU in the plane and in space, generalised IoU, over many pairs at once.
 
 With footprints A and B (rectangles in the horizontal plane), areas |.|, C the convex hull of both:
 
@@ -53,16 +53,6 @@ def iou_3d(a: Boxes, b: Boxes) -> FloatArray:
     return result
 
 
-def bev_giou(a: Boxes, b: Boxes, reach: float = np.inf) -> FloatArray:
-    """(N, M) generalised IoU of the footprints; -1 where unknown or centres are over `reach` m apart."""
-    return _giou(a, b, reach, spatial=False)
-
-
-def giou_3d(a: Boxes, b: Boxes, reach: float = np.inf) -> FloatArray:
-    """(N, M) generalised IoU of the volumes; -1 where unknown or centres are over `reach` m apart horizontally."""
-    return _giou(a, b, reach, spatial=True)
-
-
 def paired_bev_iou(a: Boxes, b: Boxes) -> FloatArray:
     """(N,) IoU of the footprints of a[n] and b[n]; NaN where a size or heading is unknown."""
     common = paired_intersection(a, b)
@@ -77,7 +67,17 @@ def paired_iou_3d(a: Boxes, b: Boxes) -> FloatArray:
 
 def paired_giou_3d(a: Boxes, b: Boxes) -> FloatArray:
     """(N,) generalised IoU of the volumes of a[n] and b[n]; -1 where a size or heading is unknown."""
-    return _paired_giou(a, b, spatial=True)
+    known = np.isfinite(a.size + b.size).all(axis=1) & np.isfinite(a.yaw + b.yaw)
+    result = np.full(len(a), -1.0)
+    a, b = a.select(known), b.select(known)
+    common = np.zeros(len(a))
+    near = np.flatnonzero(_may_touch(a, b))
+    common[near] = paired_intersection(a.select(near), b.select(near))
+    common = common * _common_height(a, b)
+    hull = paired_hull(a, b) * _spanned_height(a, b)
+    union = _area(a) * a.size[:, 2] + _area(b) * b.size[:, 2] - common
+    result[known] = common / union - (hull - union) / hull
+    return result
 
 
 def touching_pairs(a: Boxes, b: Boxes) -> tuple[IntArray, IntArray]:
@@ -123,30 +123,6 @@ def _share_inside(start: FloatArray, edge: FloatArray, half: FloatArray) -> Floa
     enter = np.maximum(np.minimum(one, two).max(axis=2), 0.0)
     leave = np.minimum(np.maximum(one, two).min(axis=2), 1.0)
     return np.asarray(np.maximum(leave - enter, 0.0))
-
-
-def _giou(a: Boxes, b: Boxes, reach: float, spatial: bool) -> FloatArray:
-    result = np.full((len(a), len(b)), -1.0)
-    rows, columns = np.nonzero(_square_distances(a, b) <= reach**2)
-    result[rows, columns] = _paired_giou(a.select(rows), b.select(columns), spatial)
-    return result
-
-
-def _paired_giou(a: Boxes, b: Boxes, spatial: bool) -> FloatArray:
-    known = np.isfinite(a.size + b.size).all(axis=1) & np.isfinite(a.yaw + b.yaw)
-    result = np.full(len(a), -1.0)
-    a, b = a.select(known), b.select(known)
-    common = np.zeros(len(a))
-    near = np.flatnonzero(_may_touch(a, b))
-    common[near] = paired_intersection(a.select(near), b.select(near))
-    hull, area_a, area_b = paired_hull(a, b), _area(a), _area(b)
-    if spatial:
-        common = common * _common_height(a, b)
-        hull = hull * _spanned_height(a, b)
-        area_a, area_b = area_a * a.size[:, 2], area_b * b.size[:, 2]
-    union = area_a + area_b - common
-    result[known] = common / union - (hull - union) / hull
-    return result
 
 
 def paired_hull(a: Boxes, b: Boxes) -> FloatArray:

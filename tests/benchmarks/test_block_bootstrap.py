@@ -25,7 +25,7 @@ def test_equal_errors_do_not_change():
 
 
 def test_where_neither_errs_nothing_changes():
-    """What stands is annotated at one place, and predicted there."""
+    """A stationary object is annotated at one place, and predicted there."""
     a, b = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 2.0])
     found = relative_change_of_errors(a, b, [0, 0, 1], "median")
     assert (found.estimate, found.low, found.high) == (0.0, -0.5, 0.0)

@@ -59,7 +59,7 @@ def test_the_command_writes_figures_and_a_picture(tmp_path: Path) -> None:
 
 
 def test_frames_in_which_nobody_is_seen_are_predictions() -> None:
-    """Of two objects the one is hidden, and the other is missed now and then."""
+    """One of two objects is hidden, the other is missed now and then."""
     rows = {row.contender: row for row in bench_scaling(ScalingSettings((2,), 2, frames=60))}
     assert rows[JOINT].largest_difference < 1e-9
     assert all(np.isfinite(row.rmse) for row in rows.values())

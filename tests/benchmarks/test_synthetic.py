@@ -20,7 +20,7 @@ SHORT = SceneSettings(groups=2, members=3, seconds=6.0)
 
 
 def speeds_apart(coupling: float) -> float:
-    """How far velocities of a group spread, m/s, at the end of a scene."""
+    """Spread of the velocities of a group, m/s, at the end of a scene."""
     scene = sample_scene(replace(SHORT, coupling=coupling, seconds=12.0), 0)
     assert scene.ground_truth is not None
     velocity = scene.ground_truth[-1].boxes.velocity.reshape(2, 3, 2)

@@ -118,7 +118,7 @@ def test_odometry_without_errors_is_the_increment_between_two_poses():
 
 
 def test_noisy_increments_do_not_pull_at_the_scale():
-    """Where the motion is known, the best scale is the true one, however noisy the increments."""
+    """With known motion the best scale is the true one, for any noise of the increments."""
     rng = np.random.default_rng(2)
     n = 2000
     poses = np.tile(np.eye(4), (n + 1, 1, 1))

@@ -1,4 +1,4 @@
-"""What crashes GTSAM, or makes it answer wrongly without a word, ends as an exception here.
+"""Input that crashes GTSAM, or makes it answer wrongly without a word, raises an exception here.
 
 All of it happens in interpreters of their own, because the failure it guards against is the end of the interpreter.
 """
@@ -179,7 +179,7 @@ print(json.dumps(told))
 
 
 def test_traceback_of_a_faulty_function_can_be_printed(run_apart):
-    """What GTSAM lends to a callback must not be found, dangling, in the frames of a traceback."""
+    """Objects that GTSAM lends to a callback must not be found, dangling, in the frames of a traceback."""
     code = (
         SETTING
         + """

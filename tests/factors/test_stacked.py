@@ -139,7 +139,7 @@ def test_missing_or_mistyped_variables_are_named():
 
 
 def test_some_rows_need_the_variables_of_those_rows_alone():
-    """Of others they do not even have to be there."""
+    """Variables of other rows need not exist."""
     offsets = np.arange(6.0).reshape(3, 2)
     batch = ResidualFactors([[1], [2], [3]], (2,), lambda x: x - offsets, np.eye(2), robust=Robust("cauchy", 1.0))
     values = gtsam.Values()

@@ -32,7 +32,7 @@ const wait = setInterval(() => {
 
 
 def tried_in_browser(page: str, script: str, folder: Path) -> Any:
-    """What `script` puts into the object `found` once the page is ready; `faults` are its errors.
+    """Return the object `found` that `script` fills once the page is ready; `faults` are its errors.
 
     The test is skipped where there is no Chromium.
     """

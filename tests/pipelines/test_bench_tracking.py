@@ -105,7 +105,7 @@ def test_a_set_is_tracked_by_every_variant() -> None:
 
 
 def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is learned here is that nobody interacts: then saga is kf."""
+    """Learning finds no interactions here: then saga is kf."""
 
     def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
         return LearnedInteractions(learned_from=" ".join(recordings))

@@ -238,7 +238,7 @@ def test_an_output_that_cannot_be_written_is_noticed_before_any_work(
 
 
 def test_the_installed_command_runs_on_its_own(tmp_path: Path) -> None:
-    """As a process of its own: a clean stdout, no progress bar where stderr is no terminal."""
+    """A separate process: a clean stdout, no progress bar where stderr is no terminal."""
     run = subprocess.run([*SAGA_FG, "config", "--full"], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert run.stderr == ""
     assert json.dumps(yaml.safe_load(run.stdout)["tracker"]["max_delay"]) == "0.5"

@@ -1,4 +1,4 @@
-"""What a sensor takes the classes of a group for, learned from simulated traffic."""
+"""Confusion of the classes of a group by a sensor, learned from simulated traffic."""
 
 from dataclasses import replace
 

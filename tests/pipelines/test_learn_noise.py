@@ -28,7 +28,7 @@ WORST = 1.35  # factor between what was learned and the truth, at ranges where t
 
 @pytest.fixture(scope="module", params=[True, False], ids=["with truth", "without truth"])
 def learned(request: pytest.FixtureRequest) -> LearnedNoise:
-    """From a start that is wrong everywhere."""
+    """Noise learned from a start that is wrong everywhere."""
     start = load_config("simulated")
     wrong = Sensor(noise={DEFAULT: NoiseModel(position=0.3, range_noise=0.01, bearing_noise=0.01)})
     start = replace(start, sensors={DEFAULT: wrong})

@@ -1,4 +1,4 @@
-"""Which frames are taken in once, and up to which number a kept state is good."""
+"""Numbers of frames: each frame is taken in once, and a kept state is good up to a number."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ RED, GREEN, CAR = "traffic_light_red", "traffic_light_green", "car"
 
 
 def frame(time: float, *seen: tuple[str, float, float], road_map: RoadMap | None = None) -> Frame:
-    """What was detected at a place in the coordinates of the vehicle, which stands where the scene starts."""
+    """Detections in the coordinates of the vehicle, which is stationary at the origin of the scene."""
     boxes = Boxes.of([label for label, _, _ in seen], [[x, y, 0.0] for _, x, y in seen])
     pose = yaw_transform(*ORIGIN)
     return Frame(time, "camera", Detections(boxes, np.ones(len(seen))), pose, "ego", road_map=road_map)

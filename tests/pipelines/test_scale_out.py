@@ -34,7 +34,7 @@ def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int 
 
 
 def written(output: Path) -> dict[str, int]:
-    """When each file of a run was written, ns."""
+    """Times at which the files of a run were written, ns."""
     return {str(path): path.stat().st_mtime_ns for path in output.glob("*/*")}
 
 

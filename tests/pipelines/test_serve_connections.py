@@ -1,4 +1,4 @@
-"""What clients may do to a service on a socket, and to each other: not much."""
+"""Clients of a service on a socket can do little to it, and to each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a stream makes of the tracker's verdicts on times: the answers, the counts and the numbers of frames."""
+"""Verdicts of the tracker on times in a stream: the answers, the counts and the numbers of frames."""
 
 from __future__ import annotations
 

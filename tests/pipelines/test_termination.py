@@ -55,7 +55,7 @@ def in_session(session: int) -> list[str]:
 
 
 def there(folder: Path, pattern: str) -> list[Path]:
-    """What matches a pattern, in folders that may go while they are looked into."""
+    """Files that match a pattern, in folders that may vanish meanwhile."""
     try:
         return list(folder.glob(pattern))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""What the range rate of a radar is worth to the velocity of tracks, on simulated traffic."""
+"""Gain of the range rate of a radar for the velocity of tracks, on simulated traffic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a recorded scene to tracks at its moments: causal, at the right times, whatever the sensors' clocks."""
+"""Tracking of a recorded scene: causal, at the right times, for any clocks of the sensors."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def new_nodes(rng, ids, node_type):
 
 
 def sensor_says(rng, estimator, roster):
-    """What one sensor measures of some nodes: positions, velocities too, or odd combinations of components."""
+    """Measurements of some nodes by one sensor: positions, velocities too, or odd combinations of components."""
     updates = []
     kind = int(rng.integers(0, 3))
     for d in sorted({t.dim for t in roster.values()}):

@@ -23,7 +23,7 @@ def random_covariance(rng, count, dim, scale=1.0):
 
 
 def random_measurements(rng, nodes, dim, rows=2):
-    """Of random linear combinations of the states, each with its own noise."""
+    """Measurements of random linear combinations of the states, each with its own noise."""
     count = len(nodes)
     H = rng.normal(size=(count, rows, dim))
     return Measurements(nodes, rng.normal(size=(count, rows)) * 5, H, random_covariance(rng, count, rows, 0.2))
@@ -182,7 +182,7 @@ def tell(estimator, calls):
 
 
 def admissible(textbook, call, start):
-    """Whether a late measurement is of a time not before `start` at which its nodes were there."""
+    """True if a late measurement is of a time not before `start` at which its nodes were present."""
     name, *arguments = call
     if name != "update" or arguments[1] is None:
         return True

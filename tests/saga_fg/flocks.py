@@ -21,7 +21,7 @@ class Frame:
 
 
 def prior_deviation():
-    """Of a node's state at the start, (4,)."""
+    """Standard deviations (4,) of the initial state of a node."""
     return np.array([0.5, 0.5, 1.0, 1.0])
 
 

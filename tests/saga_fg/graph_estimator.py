@@ -26,7 +26,7 @@ class GraphEstimator:
         self.smoother.extend([DetectionFactors(measurements)])
 
     def marginalise(self, nodes):
-        """Who goes has no variable at the next epoch; the last one leaves with the lag."""
+        """Remove nodes: no variable at the next epoch; the last one leaves with the lag."""
         self.nodes = [node for node in self.nodes if node not in np.asarray(nodes)]
 
     def keys(self, nodes):

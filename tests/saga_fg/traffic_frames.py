@@ -39,7 +39,7 @@ def run(tracker, frames):
 
 
 def at_pose(world_frame, world_T_ego, coordinates, ego_T_sensor=None):
-    """The same frame as a moving vehicle tells it, in ego or sensor coordinates."""
+    """Return the frame as a moving vehicle reports it, in ego or sensor coordinates."""
     world_T_source = world_T_ego if coordinates == "ego" else world_T_ego @ ego_T_sensor
     detections = world_frame.detections.transformed(inverse_transform(world_T_source))
     return Frame(world_frame.timestamp, world_frame.sensor, detections, world_T_ego, coordinates)

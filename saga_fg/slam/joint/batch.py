@@ -59,7 +59,7 @@ def estimate_jointly(
         stationary = stationary_probabilities(record, path, slow, settings)
         seen = nearest_landmarks(landmarks, path, settings.max_landmark_distance)
         first = [None] if estimate is None else []
-        estimate = _solved(record, path, [*first, stationary], lanes, [seen, *new_providers()], settings)
+        estimate = _solve(record, path, [*first, stationary], lanes, [seen, *new_providers()], settings)
         estimate = replace(estimate, observations=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
@@ -81,7 +81,7 @@ def checked_landmarks(
     return landmarks or [()] * len(frames)
 
 
-def _solved(
+def _solve(
     record: Record,
     path: FloatArray,
     stationary: Sequence[Sequence[FloatArray] | None],

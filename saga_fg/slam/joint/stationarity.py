@@ -73,7 +73,7 @@ def stationary_probabilities(
 
     0 where there are too few detections. Between two detections it is the smaller one of theirs.
     """
-    seen = _placed(record, path, settings)
+    seen = _place(record, path, settings)
     p = _probabilities(seen, slow, settings, online)
     result = [np.zeros(len(now.objects.id)) for now in record]
     if not len(p):
@@ -131,7 +131,7 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
     return np.where(n1 > 0, p, 0.0)
 
 
-def _placed(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:
+def _place(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:
     row = np.repeat(np.arange(len(record)), [len(now.seen.id) for now in record]).astype(np.int64)
     place = [transform_points(pose, now.seen.z)[:, :2] for now, pose in zip(record, path, strict=True)]
     sight = [one - pose[:2, 3] for one, pose in zip(place, path, strict=True)]

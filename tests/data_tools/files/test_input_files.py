@@ -1,4 +1,4 @@
-"""What cannot be read, or would never end, is refused by every reader in one line that names it."""
+"""Every reader refuses files that cannot be read, or would never end, in one line that names them."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def box(x: float, y: float, length: float = 4.0, width: float = 2.0, height: flo
 
 
 def share(*boxes: Boxes, rays: int = 400) -> float:
-    """Of the first box, seen past the others."""
+    """Visible share of the first box, seen past the others."""
     return float(visible_share(EYE, Boxes.concatenate(boxes), np.array([0]), rays)[0])
 
 
@@ -51,7 +51,7 @@ def test_two_occluders_add_up_where_they_do_not_overlap() -> None:
 
 
 def test_a_low_occluder_throws_a_shadow_that_falls_with_range() -> None:
-    """From 2 m up past an edge 1 m high at 10 m one sees the ground at 20 m: half of 1 m is hidden at 15 m."""
+    """An eye 2 m up sees the ground at 20 m past an edge 1 m high at 10 m: half of 1 m is hidden at 15 m."""
     low = box(10, 0, length=0.01, width=6.0, height=1.0)
     assert share(box(15, 0, length=0.01, height=1.0), low) == pytest.approx(0.5, abs=0.01)
     assert share(box(19.9, 0, length=0.01, height=1.0), low) == pytest.approx(0.99, abs=0.01)

@@ -1,4 +1,4 @@
-"""What sensors report has the statistics their settings promise, within 4 standard errors of a fixed seed's draw."""
+"""Sensors report with the statistics of their settings, within 4 standard errors of a fixed seed's draw."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ def test_clusters_overlap_in_the_crowd():
 
 @pytest.mark.parametrize("name", [name for name in BAD if "mixed" not in name and "predict" not in name])
 def test_bad_input_changes_nothing(name):
-    """As in the conformance suite, which has one cluster; here there are several."""
+    """The bad input of the conformance suite, which has one cluster, with several clusters."""
     call, error, _ = BAD[name]
     estimator = BoundedKalmanFilter(hops=1, core=2)
     rng = np.random.default_rng(0)

@@ -57,7 +57,7 @@ def make(request):
 
 @pytest.fixture(params=ESTIMATORS)
 def recipe(request):
-    """How to make one, as text, for another interpreter."""
+    """Code that makes an estimator, as text, for another interpreter."""
     return request.param
 
 
@@ -207,7 +207,7 @@ def test_numbers_without_a_digit_left_do_no_harm(make, seed):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_every_moment_is_smoothed_as_by_rauch_tung_striebel(make_smoother, seed):
-    """Of those in the smoother's window, after every operation of a random program."""
+    """Moments in the smoother's window agree after every operation of a random program."""
     smoother, textbook = make_smoother(), TextbookEstimator()
     for operation in random_program(np.random.default_rng(200 + seed), moments=6):
         operation.run(smoother)
@@ -372,7 +372,7 @@ def test_what_a_node_told_of_its_neighbours_stays_when_it_leaves(make):
 
 
 def permuted(operation, rng):
-    """The same operation, its nodes told in another order."""
+    """Return the operation with its nodes in another order."""
     if isinstance(operation, Add):
         order = rng.permutation(len(operation.nodes))
         return Add(operation.nodes[order], operation.means[order], operation.covariances[order])
@@ -431,7 +431,7 @@ def test_rate_zero_is_independent_filters_exactly(make, seed):
 
 
 def only(operation, node):
-    """What an operation says of one node; None if nothing."""
+    """Return the part of an operation on one node; None if it has none."""
     if isinstance(operation, Predict):
         graph = operation.transition.graph
         rows = np.flatnonzero(graph.nodes == node)

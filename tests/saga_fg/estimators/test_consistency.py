@@ -21,7 +21,7 @@ TYPES = (CAR, CAR, BUS, CAR, BUS, CAR)
 
 
 def drawn_graph(rng):
-    """Whoever interacts, and how strongly, is drawn anew for every interval."""
+    """Edges and their rates, sampled anew for every interval."""
     nodes = node_table(rng, TYPES)
     edges = [
         *interaction_edges(rng, nodes, SharedVelocity(), 0.4, 3.0),

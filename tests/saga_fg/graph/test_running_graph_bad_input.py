@@ -245,7 +245,7 @@ def case(name, failures):
 
 
 def in_the_tracker(back_end, function, message):
-    """The same for an estimator of the tracker."""
+    """Check the message for an estimator of the tracker."""
     given = Given(lambda view, key: Additions())
     estimator = back_end([given])
     estimator.add([7, 12], np.ones((2, 4)), np.stack([np.eye(4)] * 2), {7: "car", 12: "car"})

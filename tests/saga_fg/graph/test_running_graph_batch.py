@@ -32,7 +32,7 @@ class Batch(GraphEstimator):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_random_programs_agree_with_the_textbook(seed):
-    """As far as a factor of the noise of 0.02 s of constant acceleration goes."""
+    """Agreement is limited by factors of the noise of 0.02 s of constant acceleration."""
     mean, joint, single = largest_errors(
         random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), Batch()
     )
@@ -193,7 +193,7 @@ def test_a_provider_sees_what_was_known_before_its_epoch():
 
 
 def test_what_is_marginalised_stays_known():
-    """The same at the end as of a whole graph, and after a pickle."""
+    """The last states are those of a whole graph, after a pickle too."""
     scene = sample_traffic(np.random.default_rng(1), frames=6)
     whole, shorter = (driven(BatchSolver(providers(scene)), scene) for _ in range(2))
     shorter.marginalise([key for key, one in shorter.graph().variables.items() if one.epoch < 3])

@@ -15,7 +15,7 @@ MILLISECONDS = (1e-3, 0.05, 1.0)
 
 
 def largest_errors(program, estimator):
-    """Of means in posterior sigmas, of joint and of single covariances relative, after every operation."""
+    """Largest errors after every operation: means in posterior sigmas, joint and single covariances relative."""
     textbook = TextbookEstimator()
     errors = np.zeros(3)
     for operation in program:

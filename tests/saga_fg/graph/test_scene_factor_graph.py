@@ -202,7 +202,7 @@ def test_providers_see_what_is_there():
 
 
 def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
-    """So that relinearisation is what the equality with Levenberg-Marquardt rests on."""
+    """Relinearisation is therefore needed for the equality with Levenberg-Marquardt."""
     scene = sample_traffic(np.random.default_rng(2), frames=6, cars=3, pedestrians=2)
     once = IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e9))
     _, smoother = driven()
@@ -216,7 +216,7 @@ def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
 
 
 def test_noise_of_a_millisecond_is_noise(one_bus_for_a_millisecond):
-    """That of constant acceleration falls with the fifth power of the interval, but no direction is without."""
+    """Noise of constant acceleration falls with the fifth power of the interval, but is regular."""
     kinds = [factor.provider for factor in one_bus_for_a_millisecond.graph().factors()]
     assert sorted(kinds) == ["interactions", "new objects"]
 

@@ -1,4 +1,4 @@
-"""What is learned of a sensor is what the data were drawn with, within the tolerance that their number allows."""
+"""Learned sensors equal those that the data were sampled from, within the tolerance that their number allows."""
 
 from dataclasses import replace
 

@@ -155,7 +155,7 @@ def test_two_half_steps_with_frozen_edges_agree_with_one_to_second_order(seed):
 
 @given(seeds, st.floats(0.01, 20))
 def test_leaders_that_nothing_acts_on_make_the_step_exact(seed, dt):
-    """What is left out is how the neighbours are acted on; where nothing acts on them, nothing is left out."""
+    """The step leaves out the edges on the neighbours; without any, nothing is left out."""
     rng = np.random.default_rng(seed)
     types = random_types(rng, 6)
     full = random_graph(rng, types)

@@ -94,7 +94,7 @@ def test_what_stands_is_told_from_what_drives():
 
 
 def test_who_walks_far_away_does_not_stand():
-    """Where the odometry is poor, a second of walking at 40 m is within its errors; it says nothing of cars."""
+    """A second of walking at 40 m is within the errors of poor odometry; it says nothing of cars."""
     t = 0.2 * np.arange(20)
     poses = np.stack([yaw_transform(10.0 * s) for s in t])
     frames = []

@@ -52,7 +52,7 @@ def test_a_window_of_seconds_is_nearly_the_batch() -> None:
 
 
 def test_what_leaves_the_window_stays_in_the_prior() -> None:
-    """Where everything is nearly linear, a short window gives the newest pose of a long one, and its covariance."""
+    """In a nearly linear problem a short window gives the newest pose and covariance of a long one."""
     frames, odometry, poses, _ = drive(n=14, parked=0, moving=3)
     reported = worse(odometry, np.random.default_rng(2))
     linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed={DEFAULT: 1e-6})  # nobody stands, no robust loss

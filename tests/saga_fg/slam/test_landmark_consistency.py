@@ -31,7 +31,7 @@ def drawn(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
 
 
 def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
-    """Of each kind the squared error of all its landmarks together and its dimension, and that of the last pose."""
+    """Squared error and dimension of all landmarks of each kind together, and squared error of the last pose."""
     rng = np.random.default_rng(seed)
     poles = np.array([[5.0, 6.0], [14.0, -7.0], [22.0, 6.5]]) + rng.uniform(-1, 1, (3, 2))
     walls = np.array([[0, -1, 0.05, 12], [-1, 0.1, 0, 45]])

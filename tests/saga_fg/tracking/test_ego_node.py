@@ -184,7 +184,7 @@ def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[object,
 
 
 def by_odometry(told: Frame, before: np.ndarray | None) -> Frame:
-    """The same in the vehicle's frame, which knows how it has moved and not where it is."""
+    """Return the frame in the coordinates of a vehicle that knows its odometry and not its pose."""
     seen_from = at_pose(told, told.world_T_ego, "ego")
     if before is None:
         return replace(seen_from, ego=EgoMeasurements())

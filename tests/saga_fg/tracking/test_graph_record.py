@@ -28,7 +28,7 @@ class Wall:
 
 
 def graphs(settings=None, tracker_providers=()):
-    """Of three cars in a row from 100 m on; the third is initiated with the third frame."""
+    """Graphs of three cars in a row from 100 m on; the third is initiated with the third frame."""
     events, settings = [], settings or TrackerSettings(edges=RULES)
     tracker = Tracker(settings, observer=Journal(settings, events.append), providers=tracker_providers)
     for k in range(4):

@@ -1,4 +1,4 @@
-"""Which boxes are hidden behind others."""
+"""Occlusion of boxes by others."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_the_world_may_be_turned_and_moved(turn, x, y):
 
 
 def existence(occlusion):
-    """Of a car that is not seen any more once another stands before it, and whether a sensor is said to have looked."""
+    """Existence of a car once another hides it, and the number of its misses."""
     settings = TrackerSettings(edges=(), existence=ExistenceSettings(occlusion_weight=occlusion, lifetime=np.inf))
     tracker = Tracker(settings)
     for k in range(15):

@@ -1,4 +1,4 @@
-"""What is told of the certainty of a position."""
+"""Reported covariance of a position."""
 
 import numpy as np
 import pytest

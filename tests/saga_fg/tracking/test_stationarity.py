@@ -24,7 +24,7 @@ def kinematics(position=(0.0, 0.0), velocity=(0.0, 0.0), P=0.04, P_velocity=4.0)
 
 
 def probabilities(frames, settings=SETTINGS):
-    """Of a single track, after every frame."""
+    """Stationarity of a single track after every frame."""
     tracker, found = Tracker(settings), []
     for f in frames:
         tracker.step(f)

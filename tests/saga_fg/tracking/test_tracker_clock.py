@@ -49,7 +49,7 @@ def test_one_broken_timestamp_changes_nothing(make, jump):
 @ALL
 @pytest.mark.parametrize("start", [1.7e9, 1e8, 3000.0, -5e8])
 def test_a_clock_that_was_set_is_followed(make, start):
-    """From seconds since boot to the epoch, and back."""
+    """The clock jumps from seconds since boot to the epoch, and back."""
     tracker = make()
     run(tracker, at(10.0, np.arange(10) / 10))
     told = verdicts(tracker, at(start, np.arange(5) / 10))
@@ -122,7 +122,7 @@ def test_after_a_single_frame_the_second_is_believed(make, wrong):
 
 @ALL
 def test_frames_that_are_sent_again_say_nothing_of_the_clock(make):
-    """As a client does that has lost its connection, and doesn't know what arrived."""
+    """A client that has lost its connection doesn't know what arrived, and sends again."""
     tracker = make()
     frames = at(0.0, np.arange(30) / 10)
     run(tracker, frames)

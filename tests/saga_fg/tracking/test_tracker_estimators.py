@@ -69,7 +69,7 @@ def test_looking_ahead_leaves_no_trace(estimator):
 
 @pytest.mark.parametrize("delay", [0.07, 0.9])
 def test_a_smoother_takes_late_frames_as_if_they_had_come_in_time(delay):
-    """Of independent objects, and so of frozen edges too, nothing tells afterwards what came when."""
+    """States of independent objects, and so with frozen edges, do not depend on the order of arrival."""
     in_order, arriving = traffic(2, delay)
     prompt, late, without = (tracker("fixed-lag", edges=(), lag=2.0) for _ in range(3))
     run(prompt, in_order)

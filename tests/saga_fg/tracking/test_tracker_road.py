@@ -102,7 +102,7 @@ def test_colours_are_no_tracks_and_without_a_map_no_nodes():
 
 @pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
 def test_every_estimator_tracks_the_road_alike(estimator):
-    """The same tracks from the same frames, roadside and cones included; late frames are left out of this."""
+    """All estimators give equal tracks of equal frames, map nodes and cones included; no frame is late."""
     frames = [
         replace(f, detections=Detections.concatenate([f.detections, cones()])) for f in queue_frames(duration=1.5)
     ]
