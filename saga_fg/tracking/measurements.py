@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.tracking.kinematics import RelativePositions
 from saga_fg.tracking.settings import ClassSettings
@@ -21,7 +22,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 from saga_fg.types.overlap import paired_bev_iou, touching_pairs
-from saga_fg.types.sensor import Sensor
 from saga_fg.types.signal import COLOUR_LABELS
 
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad

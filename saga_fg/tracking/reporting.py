@@ -9,7 +9,7 @@ as Gaussian as it assumes: the factor c, of sensor and class, corrects this, and
 of the latest detection. A detector that sees one side of a car misjudges its length, and with it the position of its
 centre along the heading u, in one frame as in the next. No filter averages that away: the position bias b. Both are for
 the report; the filter and the association, which compare detections with detections, do without them. c, b and their
-growth are the sensor's noise settings, see `saga_fg.types.sensor`.
+growth are the sensor's noise settings, see `saga_fg.model.sensor`.
 """
 
 from __future__ import annotations

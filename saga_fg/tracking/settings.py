@@ -11,7 +11,7 @@ from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion
 from saga_fg.model.modes import Mixture
-from saga_fg.model.node import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine

@@ -21,6 +21,7 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
@@ -38,7 +39,6 @@ from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
 from saga_fg.tracking.update import update_tracks
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
-from saga_fg.types.sensor import Sensor, sensor_model
 from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)

@@ -14,7 +14,8 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
+from saga_fg.model.sensor import Sensor
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
@@ -24,7 +25,6 @@ from saga_fg.tracking import Tracker
 from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import Sensor
 
 
 @dataclass(frozen=True, eq=False)

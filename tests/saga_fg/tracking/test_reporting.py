@@ -5,7 +5,7 @@ import pytest
 from traffic_frames import NAN, frame, run
 
 from saga_fg import Sensor, Tracker, TrackerSettings
-from saga_fg.types.sensor import NoiseModel
+from saga_fg.model.sensor import NoiseModel
 
 
 def told(noise, yaw=np.pi / 2, score=0.9):

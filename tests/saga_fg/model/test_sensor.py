@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import InputError, Sensor
+from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 from saga_fg.numerics.geometry import transform_points, yaw_transform
-from saga_fg.types.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 
 metres = st.floats(-200, 200)
 
