@@ -49,8 +49,8 @@ class GraphFilter(LatestMarginals):
     relinearised  keep the epoch before until the next one in any case, so that nonlinear motion is linearised anew
                where measurements put it; else it is linearised at the prediction, as by the extended Kalman filter
 
-    What is told and reported is the newest state, at any lag. The graph holds it under the keys of nodes and of what
-    is stationary; where noise is so small that factors would lose digits, it is predicted by covariances.
+    Estimates are those of the newest states, at any lag. A node whose state an interval leaves unchanged keeps its
+    variable. States whose noise is so small that factors would lose digits are predicted by covariances.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, relinearised: bool = False) -> None:
