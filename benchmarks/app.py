@@ -10,7 +10,7 @@ from benchmarks.scaling import scaling
 from benchmarks.smoothing import smoothing
 from benchmarks.streaming import streaming
 from benchmarks.synthetic import synthetic
-from pipelines.cli.reporting import new_command
+from pipelines.cli.console import new_command
 
 app = new_command()
 

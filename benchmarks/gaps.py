@@ -31,8 +31,8 @@ from data_tools.datasets.registry import dataset_source
 from data_tools.datasets.source import DatasetSource, names
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import load_config
 from pipelines.learning import trajectories

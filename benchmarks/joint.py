@@ -23,8 +23,8 @@ from data_tools.datasets.kitti import KittiTracking
 from data_tools.figures import FigureTable, cell, percent, write_figures
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.simulator import simulate_scene
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig, load_config
 from pipelines.slam.joint import JointRun, run_joint, street

@@ -22,8 +22,8 @@ from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_sce
 from data_tools.figures import FigureTable
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
+from pipelines.cli.console import working
 from pipelines.cli.options import Verbose
-from pipelines.cli.reporting import working
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import load_config
 from pipelines.process import one_thread

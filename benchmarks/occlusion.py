@@ -18,8 +18,8 @@ import typer
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, SceneMetrics, paired_bootstrap, scene_metrics
 from data_tools.simulator import SimulatorSettings, simulate_scene
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.tracking import Progress, track_scene

@@ -17,7 +17,8 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours, build_graph
 from saga_fg.model.interactions import NodeTable, SharedVelocity
-from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantVelocity, NodeType
+from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, TrackerSettings
@@ -25,7 +26,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import NoiseModel, Sensor
 
 LABEL = "car"
 SIZE = (4.5, 1.9, 1.6)

@@ -24,8 +24,8 @@ from data_tools.plots import png
 from pipelines.bench.contenders import Filter, Ours
 from pipelines.bench.flocks import DT, Flock, FlockFrame, flock
 from pipelines.bench.measuring import timed
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Verbose, counts
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.process import one_thread
 from pipelines.tracking import Progress

@@ -17,8 +17,8 @@ import typer
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.process import one_thread
 from pipelines.smoothing import SmoothConfig, load_smooth_config, smooth_known_objects

@@ -19,8 +19,8 @@ import typer
 
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
 from data_tools.figures import FigureTable, cell
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.process import one_thread, resident_memory
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels

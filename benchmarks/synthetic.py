@@ -25,8 +25,8 @@ from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sample
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress, track_scene

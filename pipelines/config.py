@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal
 
+from data_tools.files.error_messages import unknown_name
 from pipelines.configuration import load_settings, read_settings
+from saga_fg.errors import InputError
 from saga_fg.model.learned_interactions import LearnedInteractions
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.sensor import Sensor
 from saga_fg.settings import settings_group
 from saga_fg.tracking import (
     AssociationName,
@@ -23,10 +27,12 @@ from saga_fg.tracking import (
     TrackerSettings,
 )
 from saga_fg.types.by_class import DEFAULT, class_settings
-from saga_fg.types.sensor import Sensor
 
 Method = Literal["saga", "kf", "centerpoint"]
 Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]
+
+OTHER_FILES = {"smoothing": "saga-fg smooth", "tracking": "saga-fg smooth", "slam": "saga-fg slam"}
+"""Sections that only the files of other commands have."""
 
 
 @dataclass(frozen=True)
@@ -87,16 +93,27 @@ def load_interactions(path: Path) -> LearnedInteractions:
     return load_settings(LearnedInteractions, path)
 
 
+def shipped_settings(family: str, folder: str = ".") -> Traversable:
+    """The YAML file shipped for a kind of data, in a folder of `pipelines/configs`; `InputError` if there is none."""
+    there = {
+        Path(file.name).stem: file for file in (files("pipelines") / "configs" / folder).iterdir() if file.is_file()
+    }
+    if family not in there:
+        what = "kind of data" if folder == "." else f"kind of data for {folder}"
+        raise InputError(unknown_name(what, family, tuple(sorted(there))))
+    return there[family]
+
+
 def load_config(family: str | Path, path: Path | None = None) -> TrackConfig:
     """The defaults shipped for a kind of data, with what a YAML file overrides.
 
     family  name of a kind of data, or the path of a YAML file over the defaults of "file"
 
-    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    Raises `InputError` for an unknown kind, and naming the file and the dotted key of what is wrong in it.
     """
     if isinstance(family, Path):
         config = load_settings(TrackConfig, family, load_config("file"))
     else:
-        shipped = files("pipelines") / "configs" / f"{family}.yaml"
+        shipped = shipped_settings(family)
         config = read_settings(TrackConfig, shipped.read_text(encoding="utf-8"), shipped.name)
-    return config if path is None else load_settings(TrackConfig, path, config)
+    return config if path is None else load_settings(TrackConfig, path, config, OTHER_FILES)

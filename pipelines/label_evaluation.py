@@ -28,11 +28,11 @@ from pipelines.config import Method
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
+from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import gather_evidence
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.sensor import sensor_model
 
 DISTANCES = (0.5, 1.0, 2.0)  # m
 PRECISIONS = (0.9, 0.8, 0.7)

@@ -1,11 +1,11 @@
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
-from .model.node import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
+from .model.motion import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
+from .model.sensor import Sensor
 from .tracking import GreedyTracker, Tracker, TrackerSettings
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
-from .types.sensor import Sensor
 from .types.track import Track, Tracks
 
 __version__: str

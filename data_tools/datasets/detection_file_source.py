@@ -75,7 +75,7 @@ class DetectionFileSource(DatasetSource):
         if self.detections is None:
             return read_table_results(result, None)
         with self.open() as dataset:
-            return read_table_results(result, dataset)
+            return read_table_results(result, dataset, every_scene=True)
 
     def _table(self) -> str:
         if len(self.detections or ()) != 1:

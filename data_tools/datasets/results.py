@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
+
+log = logging.getLogger(__name__)
 
 _SAME_TIME = 1e-4  # s
 
@@ -29,12 +32,14 @@ class SceneResult:
     coasting: FloatArray | None = field(default=None, kw_only=True)
 
 
-def read_table_results(path: Path, dataset: Dataset | None) -> dict[str, SceneResult]:
-    """A table of tracks in the scenes of a dataset; rows of other scenes are left out.
+def read_table_results(path: Path, dataset: Dataset | None, every_scene: bool = False) -> dict[str, SceneResult]:
+    """A table of tracks in those scenes of a dataset that it has; rows of other scenes are left out.
+
+    every_scene  include scenes without a row, in which nothing was found; an empty table always has all scenes
 
     Without a dataset, the scenes are those of the table: their moments are the times of its rows, and the vehicle
-    stands amid all tracks. Raises `InputError` for a broken table, for one that has none of the scenes, and for times
-    that are no moments of their scene.
+    stands amid all tracks. Logs a warning where scenes are left out. Raises `InputError` for a broken table, for one
+    that has none of the scenes, and for times that are no moments of their scene.
     """
     rows = read_tracks(path)
     there = tuple(dict.fromkeys(rows.scene.tolist()))
@@ -42,7 +47,15 @@ def read_table_results(path: Path, dataset: Dataset | None) -> dict[str, SceneRe
         return {name: scene_result(_scene(rows, name), rows, path) for name in there}
     if there and not set(there) & set(dataset.scenes):
         raise InputError(f"{path}: {unknown_name('scene', there[0], dataset.scenes)}")
-    return {name: scene_result(dataset.scene(name), rows, path) for name in dataset.scenes}
+    chosen = [name for name in dataset.scenes if every_scene or not there or name in there]
+    if len(chosen) < len(dataset.scenes):
+        log.warning(
+            "%s: has tracks in %d of the %d scenes of the dataset, the others are left out",
+            path,
+            len(chosen),
+            len(dataset.scenes),
+        )
+    return {name: scene_result(dataset.scene(name), rows, path) for name in chosen}
 
 
 def _scene(rows: TrackRows, name: str) -> Scene:

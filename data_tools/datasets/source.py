@@ -188,11 +188,15 @@ class DatasetSource(ABC):
         return
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
-        """The result of any tracker by scene, with ground truth. Raises `InputError` for one missing or broken."""
+        """The result of any tracker by scene, with ground truth. Raises `InputError` for one missing or broken.
+
+        The scenes are those the result has; where the field `scenes` names some, all of these.
+        """
         from data_tools.datasets.results import read_table_results
 
+        named = isinstance(getattr(self, "scenes", None), str)
         with self.open(truth=self.has_truth) as dataset:
-            return read_table_results(result, dataset)
+            return read_table_results(result, dataset, every_scene=named)
 
     def evaluate(
         self,

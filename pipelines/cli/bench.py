@@ -8,7 +8,7 @@ from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
 from pipelines.cli.bench_tracking import tracking
-from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.console import ReportingGroup
 
 bench_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Verbose, counts
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, report, show_tables
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from data_tools.datasets.source import names
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.tables import JsonFile, MarkdownFile, report
 
 

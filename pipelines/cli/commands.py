@@ -8,12 +8,12 @@ import typer
 
 from pipelines.cli.bench import bench_app
 from pipelines.cli.config import config
+from pipelines.cli.console import new_command
 from pipelines.cli.demo import demo
 from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.explain import explain
 from pipelines.cli.learn import learn_app
 from pipelines.cli.report import report_app
-from pipelines.cli.reporting import new_command
 from pipelines.cli.serve import serve, status
 from pipelines.cli.simulate import simulate
 from pipelines.cli.slam import slam_app

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -49,8 +49,12 @@ POINTER = """\
 
 def config(
     kind: Annotated[
-        Literal["file", "nuscenes", "kitti", "simulated", "heterogeneous"],
-        typer.Option("--for", help="The kind of data whose shipped defaults to print."),
+        str,
+        typer.Option(
+            "--for",
+            help="Dataset whose shipped settings to print; or heterogeneous: traffic lights, cones, trailers.",
+            metavar="NAME",
+        ),
     ] = "file",
     full: Annotated[bool, typer.Option("--full", help="All settings, not only the five one changes first.")] = False,
     simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,
@@ -77,6 +81,7 @@ def config(
       saga-fg config --slam --for kitti                      # settings of `saga-fg slam`
       saga-fg config --limits                                # limits of `saga-fg serve`
     """
+    from data_tools.datasets.registry import dataset_source
     from data_tools.simulator import SimulatorSettings
     from pipelines.config import load_config
     from pipelines.configuration import load_settings, settings_reference, write_settings
@@ -94,7 +99,8 @@ def config(
         settings = load_settings(cls, file) if file else cls()
     else:
         load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
-        settings = load(kind, file)
+        family = kind if kind == "heterogeneous" else dataset_source(kind).family
+        settings = load(family, file)
     if markdown:
         text = settings_reference(type(settings))
     elif full:

@@ -70,7 +70,7 @@ def _command(
     hints = get_type_hints(run, localns={"DatasetSource": object}, include_extras=True)
     of_verb = [each.replace(annotation=hints[each.name]) for each in of_verb]
     reads_result = any(each.name == "result" for each in of_verb)
-    different = texts(source)
+    different = {"config": _config_text(source), **texts(source)}
     parameters = [
         _described(each, different[each.name]) if each.name in different else each
         for each in of_verb
@@ -99,6 +99,11 @@ def _command(
     text = f"{inspect.getdoc(run)}\n\n{inspect.getdoc(source)}\n\n{_examples(verb, source, examples)}"
     app.command(source.name, help=text, short_help=(inspect.getdoc(source) or "").partition("\n\n")[0])(command)
     return typer.main.get_command(app)
+
+
+def _config_text(source: Source) -> str:
+    fitting = f", those of {source.family}" if source.family != source.name else ""
+    return f"YAML file over the settings for {source.name}{fitting}; see `saga-fg config --for {source.name}`."
 
 
 def _broken(name: str, error: InputError) -> Any:

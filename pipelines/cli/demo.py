@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Scenario, Verbose
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.summary import counted
 from pipelines.cli.tables import show_tables
 

@@ -11,8 +11,8 @@ import typer
 
 from pipelines.cli import options
 from pipelines.cli import tracking_options as how
+from pipelines.cli.console import progress_bar, working
 from pipelines.cli.datasets import dataset_commands
-from pipelines.cli.reporting import progress_bar, working
 from pipelines.cli.tables import JsonFile, report
 from saga_fg.errors import InputError
 
@@ -49,6 +49,7 @@ def _evaluate(
 ) -> None:
     """Score tracks against the ground truth: by the dataset's official metrics or CLEAR, and by errors at the labels.
 
+    The scenes scored are those of the result, or those that are named.
     Where detections are given and the metrics are official, errors are those at the labels that detections match.
     """
     from data_tools.files.atomic_files import atomic_directory
@@ -88,7 +89,7 @@ def _tracked(
         runs = track_dataset(dataset, lambda: settings.new_tracker(method, recorder), progress=progress)
         result = Path(folder) / source.tracks_example
         source.write_tracks(result, dataset, ((run.scene, run.tracks) for run in runs))
-        return source.read_results(result), recorder.by_class
+        return source.restricted(dataset.scenes).read_results(result), recorder.by_class
 
 
 def _evaluate_labels(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli import options
+from pipelines.cli.console import ReportingGroup, progress_bar
 from pipelines.cli.datasets import Source, dataset_commands
-from pipelines.cli.reporting import ReportingGroup, progress_bar
 from pipelines.cli.summary import counted
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipelines.cli.reporting import set_up_logging
+from pipelines.cli.console import set_up_logging
 from saga_fg.errors import InputError
 
 Verbose = Annotated[

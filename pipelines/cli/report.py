@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli import options
+from pipelines.cli.console import working
 from pipelines.cli.datasets import dataset_commands
-from pipelines.cli.reporting import working
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.cli.reporting import progress_bar
+from pipelines.cli.console import progress_bar
 from pipelines.cli.summary import counted
 from saga_fg.errors import InputError
 

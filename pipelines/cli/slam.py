@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from pipelines.cli.reporting import ReportingGroup
+from pipelines.cli.console import ReportingGroup
 from pipelines.cli.slam_g2o import g2o
 from pipelines.cli.slam_generate import generate
 from pipelines.cli.slam_kitti import kitti

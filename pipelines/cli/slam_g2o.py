@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from pipelines.cli.console import working
 from pipelines.cli.options import Verbose
-from pipelines.cli.reporting import working
 from pipelines.cli.summary import counted
 
 Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]

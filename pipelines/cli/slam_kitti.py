@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from pipelines.cli.console import progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
-from pipelines.cli.reporting import progress_bar, working
 from pipelines.cli.summary import counted
 
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from pipelines.cli.console import working
 from pipelines.cli.options import Verbose
-from pipelines.cli.reporting import working
 from pipelines.cli.summary import counted
 
 

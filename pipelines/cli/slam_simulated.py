@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pipelines.cli.console import working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
-from pipelines.cli.reporting import working
 
 if TYPE_CHECKING:
     from saga_fg.slam.joint import Observations

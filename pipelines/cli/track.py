@@ -9,8 +9,8 @@ import typer
 
 from pipelines.cli import options
 from pipelines.cli import tracking_options as how
+from pipelines.cli.console import progress_bar
 from pipelines.cli.datasets import dataset_commands
-from pipelines.cli.reporting import progress_bar
 from pipelines.cli.scaling import RayAddress, Workers, at_scale, run_at_scale
 from pipelines.cli.summary import Summary
 

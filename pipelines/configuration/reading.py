@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -37,15 +37,29 @@ DEFAULT_ENTRY = "default"
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 
-def load_settings(cls: type[T], path: Path, base: T | None = None) -> T:
-    """The settings of a YAML file over `base` (default: `cls()`). Raises `InputError` naming file and dotted key."""
-    return read_settings(cls, read_text(path), str(path), base)
+def load_settings(cls: type[T], path: Path, base: T | None = None, other_files: Mapping[str, str] | None = None) -> T:
+    """The settings of a YAML file over `base` (default: `cls()`).
+
+    other_files  commands by the sections that only their files have, for the error
+
+    Raises `InputError` naming file and dotted key.
+    """
+    return read_settings(cls, read_text(path), str(path), base, other_files)
 
 
-def read_settings(cls: type[T], text: str, source: str = "configuration", base: T | None = None) -> T:
+def read_settings(
+    cls: type[T],
+    text: str,
+    source: str = "configuration",
+    base: T | None = None,
+    other_files: Mapping[str, str] | None = None,
+) -> T:
     """The settings of a YAML text; `source` is the name that errors give to it."""
     try:
         data = _Loader(text).get_single_data()
+        for section, command in (other_files or {}).items():
+            if isinstance(data, dict) and section in data:
+                raise InputError(f"{section}: unknown section, this is a file for `{command}`")
         return cast(T, _read(Section((cls,)), {} if data is None else data, cls() if base is None else base, ""))
     except InputError as error:
         raise InputError(f"{source}: {error}") from error

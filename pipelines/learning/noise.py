@@ -28,11 +28,11 @@ from saga_fg.learning import (
     sample_with_tracker,
     sample_with_truth,
 )
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
 from saga_fg.tracking import ClassSettings, Tracker
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.sensor import NoiseModel, Sensor, sensor_model
 
 log = logging.getLogger(__name__)
 

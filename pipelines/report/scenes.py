@@ -25,12 +25,12 @@ from pipelines.report.road import road_data
 from pipelines.tracking import TrackedScene
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantVelocity, NodeType
+from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
-from saga_fg.types.sensor import Sensor, sensor_model
 
 Rows = list[list[int | None]]
 Edges = tuple[IntArray, IntArray, FloatArray]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.config import Family, TrackConfig, load_config
+from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from saga_fg.errors import InputError
@@ -48,7 +48,7 @@ class SlamConfig(TrackConfig):
             raise InputError("tracker.providers: expected under slam, for a graph of vehicle and objects")
 
 
-def load_slam_config(family: Family, path: Path | None = None) -> SlamConfig:
+def load_slam_config(family: str | Path, path: Path | None = None) -> SlamConfig:
     """Return the defaults shipped for a kind of data, with the overrides of a YAML file.
 
     Raises `InputError` naming the file and the dotted key of an error in it.

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
-from pipelines.config import TrackConfig, load_config
+from pipelines.config import TrackConfig, load_config, shipped_settings
 from pipelines.configuration import load_settings, read_settings
+from saga_fg.model.sensor import Sensor
 from saga_fg.settings import settings_group
 from saga_fg.smoothing import SmoothingSettings
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.sensor import Sensor
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,9 @@ class SmoothConfig:
 def load_smooth_config(family: str | Path, path: Path | None = None) -> SmoothConfig:
     """The defaults shipped for a kind of data, with what a YAML file overrides; kinds are those of `load_config`.
 
-    Raises `InputError` naming the file and the dotted key of what is wrong in it.
+    Raises `InputError` for a kind that has none, and naming the file and the dotted key of what is wrong in it.
     """
-    shipped = files("pipelines") / "configs" / "smoothing" / f"{'file' if isinstance(family, Path) else family}.yaml"
+    shipped = shipped_settings("file" if isinstance(family, Path) else family, "smoothing")
     tracking = load_config(family)
     config = SmoothConfig(tracking=tracking, sensors=tracking.sensors)
     config = read_settings(SmoothConfig, shipped.read_text(encoding="utf-8"), shipped.name, config)

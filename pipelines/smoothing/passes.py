@@ -18,6 +18,7 @@ import numpy as np
 
 from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.graph import FactorProvider
+from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
@@ -43,7 +44,6 @@ from saga_fg.tracking.provider_names import new_provider
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
-from saga_fg.types.sensor import Sensor
 
 TRACKLET_SHARE = 0.5  # share of an object's least score that a tracklet needs to become part of one
 MAX_FREE_DISTANCE = 3.0  # between a state and a free detection assigned to it, m

@@ -28,7 +28,7 @@ from saga_fg.estimators.dynamics import Dynamics, identity
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.node import NodeType, NonlinearMotion
+from saga_fg.model.motion import NodeType, NonlinearMotion
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, held
 from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked

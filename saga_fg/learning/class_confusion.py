@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 from saga_fg.learning.truth_matches import match_to_truth
+from saga_fg.model.sensor import Sensor
 from saga_fg.types.dataset import Scene
-from saga_fg.types.sensor import Sensor
 
 FEWEST = 20  # detections of a class, for a row of its own
 

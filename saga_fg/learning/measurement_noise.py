@@ -16,8 +16,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.sensor import NoiseModel
 
 PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_score_growth=0.3)
 PRIOR_WIDTH = 1.0  # of the logarithms

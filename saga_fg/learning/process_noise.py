@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from saga_fg.errors import InputError
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 from saga_fg.types.by_class import DEFAULT
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from saga_fg.model.sensor import ScoreCalibration
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.types.sensor import ScoreCalibration
 
 PRIOR_MEAN = np.array([0.0, 1.0])  # offset, slope
 PRIOR_PRECISION = np.array([1 / 1.5**2, 1.0])

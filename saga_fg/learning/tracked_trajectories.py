@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
+from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import Sensor, sensor_model
 
 FEWEST_DETECTIONS = 5  # of a trajectory that counts as an object
 DETECTED_SHARE = 0.5  # of the frames in which it was in view, at least

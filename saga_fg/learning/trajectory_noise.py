@@ -23,10 +23,10 @@ from scipy.optimize import minimize
 from saga_fg.learning.measurement_noise import FEWEST, LEAST, PRIOR_WIDTH, robust_deviation
 from saga_fg.learning.process_noise import innovation_likelihood
 from saga_fg.learning.tracked_trajectories import DetectedTrajectory
+from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.types.by_class import class_settings
-from saga_fg.types.sensor import NoiseModel, Sensor, sensor_model
 
 POSITION = ("position", "range_noise", "bearing_noise")
 LONGEST = 40  # detections filtered in one piece: longer trajectories are cut, and side by side take less time

@@ -14,13 +14,13 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.process_noise import MeasuredTrajectory
+from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import Sensor, sensor_model
 
 GATE = 4.0  # m; poor sensors err by metres, and the fits allow for wrong matches
 

@@ -1,1 +1,1 @@
-"""The mathematical model: nodes, their motion, interactions, edge rules, landmarks; plain NumPy."""
+"""The mathematical model: nodes, their motion, interactions, edge rules, sensors, landmarks; plain NumPy."""

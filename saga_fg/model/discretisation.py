@@ -34,7 +34,7 @@ import scipy.linalg
 import scipy.sparse
 
 from saga_fg.errors import InputError
-from saga_fg.model.node import NodeType, distinct_types
+from saga_fg.model.motion import NodeType, distinct_types
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray

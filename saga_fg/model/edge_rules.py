@@ -20,7 +20,7 @@ from saga_fg.model.edge_features import EdgeFeatures, features_of
 from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity, applies
-from saga_fg.model.node import distinct_types
+from saga_fg.model.motion import distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes

@@ -20,7 +20,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.settings import (
     NonNegative,

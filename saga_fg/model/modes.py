@@ -42,7 +42,7 @@ import scipy.linalg
 from saga_fg.errors import InputError
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.node import ConstantAcceleration, ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import MatchedMotion, SceneGraph
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.numerics.arrays import FloatArray, IntArray

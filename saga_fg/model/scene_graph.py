@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids, checked_rows
 

@@ -26,7 +26,7 @@ from saga_fg.model.discretisation import discretise, joint_generator
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
 from saga_fg.model.interactions import NodeTable, applies, unit
-from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.scene_graph import Edges, SceneGraph

@@ -14,7 +14,7 @@ import numpy as np
 
 from saga_fg.model.edge_rules import EdgeRule, build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.smoothing.states import Lifespans, StateTable

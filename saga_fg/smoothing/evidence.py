@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
+from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
-from saga_fg.types.sensor import Sensor, sensor_model
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from factors import Robust
 from saga_fg.graph import FactorProvider
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
 from saga_fg.settings import (
     Fraction,
     NonNegative,

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
-from saga_fg.types.sensor import Sensor
 
 LEAST_BELIEF = 1e-3  # in each class of the group
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.errors import InputError
+from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.clock import Clock, TimeVerdict
@@ -20,7 +21,6 @@ from saga_fg.tracking.settings import GreedySettings
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.by_class import DEFAULT, class_numbers
 from saga_fg.types.frame import Frame
-from saga_fg.types.sensor import Sensor, sensor_model
 from saga_fg.types.track import Tracks
 
 NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 and (m/s)^2

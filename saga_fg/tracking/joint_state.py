@@ -18,7 +18,7 @@ from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
-from saga_fg.model.node import Motion, NodeType
+from saga_fg.model.motion import Motion, NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
 from saga_fg.numerics.geometry import yaw_transform

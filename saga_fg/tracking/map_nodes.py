@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.node import Motion, RandomWalk
+from saga_fg.model.motion import Motion, RandomWalk
+from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, of_classes
 from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.tracking.joint_state import JointTrackState
@@ -23,7 +24,6 @@ from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, RoadMap
-from saga_fg.types.sensor import Sensor
 from saga_fg.types.signal import COLOUR_LABELS, COLOURS, SignalSettings, colour_updated
 
 
@@ -34,7 +34,7 @@ def motion_of(settings: TrackerSettings, label: str) -> Motion:
     return class_settings(settings.classes, ClassSettings, label).motion
 
 
-GATE = 0.999  # share of true sightings of a light that may be its own
+GATE = 0.999  # gate probability of the detections of a light
 
 
 @dataclass(frozen=True)

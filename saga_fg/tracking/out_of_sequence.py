@@ -13,7 +13,7 @@ import numpy as np
 
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray
 

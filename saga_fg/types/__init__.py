@@ -1,1 +1,1 @@
-"""Values that go through the pipeline: boxes, frames of detections, sensors, road maps, tracks, datasets."""
+"""Values that go through the pipeline: boxes, frames of detections, road maps, tracks, datasets."""

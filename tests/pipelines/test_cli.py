@@ -85,6 +85,30 @@ def test_config_begins_with_five_settings_and_leads_to_all(kind: str, tmp_path: 
         assert saga_fg("config", "--full", "--for", kind_of_data, *option, "--config", path).stdout == defaults
 
 
+def test_config_knows_the_settings_of_every_dataset() -> None:
+    assert (
+        saga_fg("config", "--full", "--for", "argoverse2").stdout
+        == saga_fg("config", "--full", "--for", "nuscenes").stdout
+    )
+    assert saga_fg("config", "--full", "--for", "eth_ucy").stdout == saga_fg("config", "--full").stdout
+    assert "unknown dataset 'etc'" in saga_fg("config", "--for", "etc").stderr
+    assert "config --for argoverse2" in " ".join(saga_fg("track", "argoverse2", "--help").stdout.split())
+
+
+def test_a_kind_of_data_without_settings_of_smoothing_is_named() -> None:
+    result = saga_fg("config", "--smoothing", "--for", "heterogeneous")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: unknown kind of data for smoothing 'heterogeneous', expected one of: file")
+
+
+def test_a_file_for_another_command_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "smoothing.yaml"
+    path.write_text(saga_fg("config", "--smoothing").stdout)
+    result = saga_fg("config", "--config", path)
+    assert result.exit_code == 2
+    assert result.stderr == f"error: {path}: smoothing: unknown section, this is a file for `saga-fg smooth`\n"
+
+
 def test_config_prints_the_simulators_settings_and_markdown() -> None:
     assert "visible_share" in yaml.safe_load(saga_fg("config", "--full", "--simulator").stdout)
     assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout

@@ -19,8 +19,8 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
 from saga_fg import ConstantVelocity
 from saga_fg.learning import sample_with_truth
+from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.sensor import NoiseModel, Sensor
 
 WORLD = SimulatorSettings(duration=8.0)
 WORST = 1.35  # factor between what was learned and the truth, at ranges where traffic is

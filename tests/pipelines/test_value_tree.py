@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipelines.config import load_config
 from pipelines.serving.value_tree import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, InputError
-from saga_fg.model.node import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.traffic_flow import SpeedPrior
 

@@ -3,10 +3,10 @@
 import numpy as np
 
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.joint import OdometryIncrements
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.sensor import NoiseModel
 
 NOISE = 0.1  # m, of detections
 

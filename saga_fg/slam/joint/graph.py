@@ -36,7 +36,7 @@ from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import interval_factors
 from saga_fg.graph import EGO_ERROR, OBJECT, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.record import RecordedEpoch, RecordedObjects, motion_covariances

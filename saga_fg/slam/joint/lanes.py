@@ -35,7 +35,7 @@ from factors import Linearisable, Robust, lane_keeping_factors, prior_factor
 from factors.rotations import cross_matrix
 from saga_fg.graph import MAP_NODE, Additions, GraphView, NewVariable, key_of
 from saga_fg.model.interactions import POSITION
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.numerics.polyline import feet, on_it

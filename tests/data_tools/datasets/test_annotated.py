@@ -88,3 +88,21 @@ def test_the_folder_may_be_a_url(recordings: Path) -> None:
     pytest.importorskip("fsspec", reason="files by URL come with the extra remote")
     with EthUcySource(dataroot=f"file://{recordings}").open() as dataset:
         assert len(dataset.scene("hotel").frames) == 5
+
+
+def test_a_result_of_some_recordings_is_scored_on_these(recordings: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (recordings / "eth").mkdir()
+    (recordings / "eth" / "obsmat.txt").write_text((recordings / "hotel" / "obsmat.txt").read_text())
+    table = recordings / "tracks.csv"
+    rows = [f"hotel,{0.4 * k},1,pedestrian,{0.4 * k},2.0" for k in range(5)]
+    table.write_text("\n".join(["scene,timestamp,id,label,x,y", *rows]) + "\n")
+    source = EthUcySource(dataroot=str(recordings))
+    found = source.read_results(table)
+    assert list(found) == ["hotel"]
+    assert source.evaluate(found).programs["tracking"]["overall"]["mota"] == 1.0
+    assert "has tracks in 1 of the 2 scenes" in caplog.text
+    named = source.restricted(["eth", "hotel"]).read_results(table)
+    assert list(named) == ["eth", "hotel"]  # recordings that are named count although nothing was found in one
+    assert source.evaluate(named).programs["tracking"]["overall"]["mota"] == 0.5
+    table.write_text("scene,timestamp,id,label,x,y\n")
+    assert list(source.read_results(table)) == ["eth", "hotel"]

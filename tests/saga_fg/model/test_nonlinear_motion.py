@@ -22,7 +22,7 @@ from saga_fg.estimators import (
 from saga_fg.estimators.interval_dynamics import nonlinear_dynamics
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.node import RandomWalk
+from saga_fg.model.motion import RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.model.turning import Bicycle, CoordinatedTurn

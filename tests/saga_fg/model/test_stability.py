@@ -14,7 +14,7 @@ from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following, Neighbours, build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity
-from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.stability import highest_rate, require_stable
 from saga_fg.tracking import TrackerSettings

@@ -23,12 +23,12 @@ from saga_fg.graph import (
     NewVariable,
 )
 from saga_fg.model.landmarks.point import PointLandmark
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings, StationaryObjects
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
 from saga_fg.types.landmark import Observation
 from saga_fg.types.road_map import Lane
-from saga_fg.types.sensor import NoiseModel
 
 DT = 0.1
 START = (5.0, -3.0, 0.4)

@@ -7,7 +7,8 @@ import pytest
 
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
+from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
@@ -30,7 +31,6 @@ from saga_fg.smoothing import (
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import NoiseModel, Sensor
 
 SENSORS = {"default": Sensor({"default": NoiseModel(position=0.1)})}
 CLASSES = {"default": OfflineClass(acceleration_noise=0.5)}
@@ -89,7 +89,7 @@ def test_what_moves_otherwise_or_comes_too_late_is_new() -> None:
     assert joined(paths, StitchingSettings(max_gap=1.0)) == {0: 0, 1: 1}
 
 
-def test_an_object_claims_detections_before_its_birth_but_not_those_of_others() -> None:
+def test_an_object_claims_detections_before_its_initiation_but_not_those_of_others() -> None:
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (5, 0)), 1: line(0, 19, (0, 20), (5, 0))})
     tracked = np.where(evidence.moment < 2, -1, numbers)
     lifespans = lifespans_of(tracked, evidence.boxes.label, evidence.moment)

@@ -8,8 +8,9 @@ import pytest
 from factors import Robust
 from saga_fg.estimators import Gaussian, WindowedSmoother, kalman_predict, kalman_update, rts_smooth
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.node import NodeType
+from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.smoothing import (
     Evidence,
     Lifespans,
@@ -27,7 +28,6 @@ from saga_fg.smoothing.batch_states import UNKNOWN_POSITION
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.sensor import NoiseModel, Sensor
 
 SIGMA = 0.5
 SENSORS = {"default": Sensor({"default": NoiseModel(position=SIGMA)})}

@@ -16,11 +16,11 @@ from saga_fg import ConstantVelocity, Frame, InputError, Sensor, Tracker, Tracke
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE
 from saga_fg.model.edge_rules import Following
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Odometry, StartSettings
 from saga_fg.tracking import AssociationSettings, ClassSettings, EgoNodeSettings
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, OdometryIncrement
-from saga_fg.types.sensor import NoiseModel
 
 PLACE = np.array([4000.0, -7000.0])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])

@@ -5,8 +5,8 @@ import pytest
 from traffic_frames import NAN, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 from saga_fg import Detection, Detections, Frame, GreedyTracker, Sensor
+from saga_fg.model.sensor import Extrinsics
 from saga_fg.tracking import GreedySettings
-from saga_fg.types.sensor import Extrinsics
 
 TRUTH = straight([(0, 0), (20, 5)], [(8, 0), (4, 2)])
 TENTHS = np.arange(0, 2, 0.1)

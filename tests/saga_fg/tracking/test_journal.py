@@ -11,7 +11,7 @@ from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettin
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import NodeTable, SharedVelocity
-from saga_fg.model.node import ConstantVelocity, NodeType
+from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.tracking import Journal
 from saga_fg.tracking.edge_effects import edge_effects

@@ -7,8 +7,8 @@ import pytest
 from traffic_frames import at_pose, frame, straight, turning_vehicle
 
 from saga_fg import Boxes, Detection, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import Extrinsics, NoiseModel
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.sensor import Extrinsics, NoiseModel
 
 NAN = float("nan")
 RADAR = Sensor(noise={"default": NoiseModel(position=0.5, range_rate=0.1)})
@@ -44,7 +44,7 @@ def tracker(estimator="kalman", sensors=SENSORS):
     return Tracker(TrackerSettings(estimator=estimator), sensors)
 
 
-def test_a_birth_takes_the_component_along_the_line_of_sight():
+def test_a_new_track_takes_the_component_along_the_line_of_sight():
     tracks = tracker().step(radar_frame(0.0, [(30, 40)], [10.0]))
     sight = np.array([0.6, 0.8])
     assert tracks.boxes.velocity[0] == pytest.approx(10.0 * sight, abs=0.05)

@@ -5,7 +5,7 @@ import pytest
 from traffic_frames import frame, run, seen, straight
 
 from saga_fg import Sensor, Tracker, TrackerSettings
-from saga_fg.types.sensor import NoiseModel
+from saga_fg.model.sensor import NoiseModel
 
 WEAK = {"camera": Sensor(initiation="confirmed", noise={"default": NoiseModel(position=0.5)})}
 TENTHS = np.arange(0, 2, 0.1)

@@ -9,7 +9,7 @@ from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettin
 from saga_fg.model.cone_geometry import ConeGeometry
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.node import ConstantVelocity, RandomWalk
+from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine

@@ -15,10 +15,10 @@ from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import Boxes, Detection, Detections, Frame, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import JointKalmanFilter
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking import tracker as tracker_module
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
-from saga_fg.types.sensor import NoiseModel
 
 ESTIMATORS = ("kalman", "isam2", "fixed-lag")
 CARS = straight([(0.0, 0.0), (12.0, 0.0), (24.0, 0.0)], [(8.0, 0.0), (8.5, 0.0), (9.0, 0.0)])

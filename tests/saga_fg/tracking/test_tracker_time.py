@@ -5,8 +5,8 @@ import pytest
 from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.sensor import NoiseModel
 
 FAST = straight([(0.0, 0.0), (-25.0, 4.0)], [(20.0, 0.0), (22.0, 0.0)])
 SENSORS = {

@@ -1,4 +1,4 @@
-"""Node types: what the state of a node means, and how it moves on its own.
+"""Node types: the components of the state of a node, and the motion of a node on its own.
 
     dx/dt = A x + w,    E[w(t) w(s)^T] = Qc delta(t - s)
 
