@@ -31,7 +31,7 @@ class Post:
         self.scene = scene
 
     def factors(self, view: GraphView) -> Additions:
-        pose, key = self.scene.moments[view.epoch].pose, view.key(LANDMARK, 1, static=True)
+        pose, key = self.scene.frames[view.epoch].pose, view.key(LANDMARK, 1, static=True)
         bearing, distance = pose.bearing(POST).theta(), pose.range(POST)
         seen = bearing_range_factor(view.key(EGO_POSE, 0), key, bearing, distance, np.diag([0.02, 0.1]) ** 2)
         new = [] if view.static(LANDMARK) else [NewVariable(LANDMARK, 1, POST, static=True, label="post")]
@@ -42,7 +42,7 @@ def write_running_graph_pictures(folder: Path) -> None:
     """Both pictures."""
     scene = sample_traffic(np.random.default_rng(SEED), frames=5, cars=2, pedestrians=3, intervals=(0.6,))
     smoother = IncrementalSmoother([*providers(scene), Post(scene)], lag=0.5)
-    for moment in scene.moments:
+    for moment in scene.frames:
         smoother.step(moment.time)
     record = GraphRecord()
     record.add(smoother.graph(), covariance=smoother.covariance)

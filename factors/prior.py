@@ -2,8 +2,8 @@
 
     phi(x) = || x - m ||_P^2
 
-One variable's prior is the birth of a track. A joint prior over many keys, P being their full joint covariance, is what
-a filter knows of the past: all of it in one factor.
+One variable's prior is the initial state of a track. A joint prior over many keys, P being their full joint
+covariance, is what a filter knows of the past: all of it in one factor.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import numpy as np
 from data_tools.plots.birds_eye import ellipse_95
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
-COLOURS = {"interaction": "#4d4d4d", "detection": "#009e73", "birth": "#cc79a7", "marginal prior": "#8c8c8c"}
+COLOURS = {"interaction": "#4d4d4d", "detection": "#009e73", "initiation": "#cc79a7", "marginal prior": "#8c8c8c"}
 MORE = ("#d55e00", "#0072b2", "#e69f00", "#56b4e9", "#7b3294", "#a6761d", "#1b7837", "#b2182b")
 MARKERS = {"object": "o", "ego pose": "^", "known ego pose": "^", "landmark": "D", "map node": "s"}
 FACES = {"ego pose": "black", "known ego pose": "#9a9a9a", "landmark": "#e69f00", "map node": "#56b4e9"}

@@ -46,12 +46,12 @@ class Vehicles:
         self.start[:, 2] = SPEED
 
     def ids(self, frame: int) -> IntArray:
-        """Who is in each place."""
+        """Return the id of the vehicle in each place."""
         count = len(self.slots)
         return self.slots + count * ((frame + self.slots * self.life // count) // self.life if self.life else 0)
 
     def factors(self, view: GraphView) -> Additions:
-        """Positions, births, and interactions of those that were there before."""
+        """Positions, new objects, and interactions of those that were there before."""
         ids, old, Q = self.ids(view.epoch), self.ids(view.epoch - 1), process_noise(DT)
         there = self.start + view.time * np.array([SPEED, 0.0, 0.0, 0.0])
         noise = 0.3 * np.random.default_rng(view.epoch).normal(size=(len(ids), 2))
@@ -74,9 +74,9 @@ class Vehicles:
             if self.linear:
                 factors += _linear(now, last, behind, [OWN, LEADER], Q)
             elif len(behind):
-                law = interaction(SmoothDriver())
-                there[behind] = law.predict(x[behind], [x[behind - 1]], DT)
-                factors.append(law.factors(now[behind], last[behind], last[behind - 1, None], 4, DT, Q))
+                motion = interaction(SmoothDriver())
+                there[behind] = motion.predict(x[behind], [x[behind - 1]], DT)
+                factors.append(motion.factors(now[behind], last[behind], last[behind - 1, None], 4, DT, Q))
         return Additions(self._new(ids, there), factors)
 
     def _new(self, ids: IntArray, states: FloatArray) -> list[NewVariable]:
@@ -122,16 +122,16 @@ def windows(scenes: int, frames: int, seed: int) -> list[Row]:
     degrees = nodes = 0
     for k in range(scenes):
         scene = sample_traffic(np.random.default_rng([seed, k]), frames)
-        nodes = max(nodes, max(1 + len(moment.states) for moment in scene.moments))
+        nodes = max(nodes, max(1 + len(frame.states) for frame in scene.frames))
         lags = dict(zip(times, (None, LAG), strict=True))
         both = {name: IncrementalSmoother(providers(scene), lag) for name, lag in lags.items()}
         whole, window = both.values()
-        for moment in scene.moments:
+        for frame in scene.frames:
             for name, smoother in both.items():
-                times[name].append(timed(lambda smoother=smoother, t=moment.time: smoother.step(t)))  # type: ignore[misc]
+                times[name].append(timed(lambda smoother=smoother, t=frame.time: smoother.step(t)))  # type: ignore[misc]
             off += [_difference(whole, window, key) for key in _newest(whole)]
         for name, smoother in both.items():
-            error = np.concatenate([_error(smoother, key, scene.moments[-1]) for key in _newest(smoother)])
+            error = np.concatenate([_error(smoother, key, scene.frames[-1]) for key in _newest(smoother)])
             squares[name] += float(error @ np.linalg.solve(smoother.joint_covariance(_newest(smoother)), error))
         degrees += len(error)
     difference, band = np.concatenate(off), nees_band(degrees, 1, 0.99)
@@ -154,7 +154,7 @@ def _difference(whole: IncrementalSmoother, window: IncrementalSmoother, key: in
     return np.asarray(np.abs(way) / np.sqrt(np.diag(whole.covariance(key))))
 
 
-def _error(smoother: IncrementalSmoother, key: int, moment: SampledFrame) -> FloatArray:
+def _error(smoother: IncrementalSmoother, key: int, frame: SampledFrame) -> FloatArray:
     variable = smoother.graph().variable(key)
-    truth = moment.pose if variable.kind == EGO_POSE else moment.states[variable.id]
+    truth = frame.pose if variable.kind == EGO_POSE else frame.states[variable.id]
     return variable.type.local(smoother.state(key), truth)

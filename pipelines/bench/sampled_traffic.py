@@ -2,7 +2,7 @@
 cars that follow each other (intelligent driver) and pedestrians who keep apart (social force).
 
 Cars and pedestrians come and go, are missed now and then, and time is irregular. Three providers give the very factors
-that were drawn from to an estimator, so that its covariances must fit the errors.
+of the sampled model to an estimator, so that its covariances must fit the errors.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction
 from saga_fg.numerics.arrays import FloatArray
 
-START = np.diag([0.05, 0.05, 0.01]) ** 2
-ODOMETRY = np.diag([0.05, 0.03, 0.01]) ** 2
-SEEN = np.diag([0.15, 0.01]) ** 2
-BORN = np.diag([1.0, 1.0, 0.5, 0.5]) ** 2
+INITIAL_POSE_COVARIANCE = np.diag([0.05, 0.05, 0.01]) ** 2
+ODOMETRY_COVARIANCE = np.diag([0.05, 0.03, 0.01]) ** 2
+RANGE_BEARING_COVARIANCE = np.diag([0.15, 0.01]) ** 2
+INITIAL_STATE_COVARIANCE = np.diag([1.0, 1.0, 0.5, 0.5]) ** 2
 NOISE = 0.3  # spectral density of accelerations, m^2/s^3
 _FOLLOWING, _REPULSION = interaction(SmoothDriver()), interaction(SocialForce())
 States = dict[int, FloatArray]
@@ -42,8 +42,11 @@ def process_noise(dt: float) -> FloatArray:
 
 @dataclass
 class SampledFrame:
-    """States and pose as they are; the odometry since the moment before, prior means of objects that are new, and range
-    and bearing of those seen.
+    """True states and pose of a frame, with what an estimator is given.
+
+    dt, odometry    since the frame before, s
+    new             prior means of new objects
+    seen            range, m, and bearing, rad, of the detected objects
     """
 
     time: float
@@ -51,27 +54,32 @@ class SampledFrame:
     pose: gtsam.Pose2
     odometry: gtsam.Pose2
     states: States
-    born: States
+    new: States
     seen: States
 
 
 @dataclass
 class SampledTraffic:
-    """kinds: "car" or "pedestrian" by id; leaders: of cars by id; start: where the vehicle believes to be."""
+    """A sampled scene.
+
+    start       mean of the first pose of the vehicle
+    kinds       "car" or "pedestrian" by id
+    leaders     id of the car ahead, by id
+    """
 
     start: gtsam.Pose2
     kinds: dict[int, str] = field(default_factory=dict)
     leaders: dict[int, int] = field(default_factory=dict)
-    moments: list[SampledFrame] = field(default_factory=list)
+    frames: list[SampledFrame] = field(default_factory=list)
 
     def neighbours(self, node: int, present: Collection[int]) -> list[int]:
-        """Who acts on a node: a car's leader, all other pedestrians on a pedestrian."""
+        """Return the nodes that act on a node: the leader of a car, all other pedestrians on a pedestrian."""
         if self.kinds[node] == "car":
             return [self.leaders[node]] if self.leaders.get(node) in present else []
         return [other for other in sorted(present) if other != node and self.kinds[other] == "pedestrian"]
 
-    def law(self, node: int, near: Sequence[int]) -> NonlinearInteraction:
-        """The interaction function of a node with these neighbours; alone, everybody keeps going."""
+    def interaction(self, node: int, near: Sequence[int]) -> NonlinearInteraction:
+        """Return the interaction function of a node with these neighbours; without any it keeps its velocity."""
         if self.kinds[node] == "car" and near:
             return _FOLLOWING
         return _REPULSION
@@ -100,29 +108,31 @@ def sample_traffic(
         waiting[k] = np.concatenate([place, rng.normal(0, 0.6, 2)]), int(rng.integers(0, 4))
         scene.kinds[k] = "pedestrian"
     leaving = {node: int(rng.integers(frames // 2, 2 * frames)) for node in waiting}
-    time, pose = 0.0, scene.start.retract(np.linalg.cholesky(START) @ rng.normal(size=3))
+    time, pose = 0.0, scene.start.retract(np.linalg.cholesky(INITIAL_POSE_COVARIANCE) @ rng.normal(size=3))
     states: States = {}
     for k in range(frames):
         dt = float(rng.choice(intervals)) if k else 0.0
         time += dt
         step = gtsam.Pose2(8 * dt, 0, 0.05 * dt)
         if k:
-            pose = pose.compose(step).retract(np.linalg.cholesky(ODOMETRY) @ rng.normal(size=3))
+            pose = pose.compose(step).retract(np.linalg.cholesky(ODOMETRY_COVARIANCE) @ rng.normal(size=3))
         states = {node: x for node, x in states.items() if leaving[node] > k}
         moved = {}
         for node, x in states.items():
             near = scene.neighbours(node, states)
-            f = np.asarray(scene.law(node, near).predict(x, [states[other] for other in near], dt))
+            f = np.asarray(scene.interaction(node, near).predict(x, [states[other] for other in near], dt))
             moved[node] = f + np.linalg.cholesky(process_noise(dt)) @ rng.normal(size=4)
-        born = {node: x for node, (x, first) in waiting.items() if first == k and leaving[node] > k}
-        states = moved | {node: x + np.linalg.cholesky(BORN) @ rng.normal(size=4) for node, x in born.items()}
+        initial = {node: x for node, (x, first) in waiting.items() if first == k and leaving[node] > k}
+        states = moved | {
+            node: x + np.linalg.cholesky(INITIAL_STATE_COVARIANCE) @ rng.normal(size=4) for node, x in initial.items()
+        }
         seen = {}
         for node, x in states.items():
             if rng.random() < 0.8:
                 s = pose.transformTo(x[:2])
                 z = np.array([np.hypot(*s), np.arctan2(s[1], s[0])])
-                seen[node] = z + np.linalg.cholesky(SEEN) @ rng.normal(size=2)
-        scene.moments.append(SampledFrame(time, dt, pose, step, states, born, seen))
+                seen[node] = z + np.linalg.cholesky(RANGE_BEARING_COVARIANCE) @ rng.normal(size=2)
+        scene.frames.append(SampledFrame(time, dt, pose, step, states, initial, seen))
     return scene
 
 
@@ -136,17 +146,17 @@ class VehicleProvider:
 
     def factors(self, view: GraphView) -> Additions:
         """A prior at first, odometry later."""
-        moment, key = self.scene.moments[view.epoch], view.key(EGO_POSE, 0)
+        frame, key = self.scene.frames[view.epoch], view.key(EGO_POSE, 0)
         if view.epoch == 0:
             new = NewVariable(EGO_POSE, 0, self.scene.start, label="vehicle")
-            return Additions([new], [pose_prior_factor(key, self.scene.start.matrix(), START)])
+            return Additions([new], [pose_prior_factor(key, self.scene.start.matrix(), INITIAL_POSE_COVARIANCE)])
         before = view.before(EGO_POSE)[0].key
-        new = NewVariable(EGO_POSE, 0, view.state(before).compose(moment.odometry), label="vehicle")
-        return Additions([new], [between_factor(before, key, moment.odometry.matrix(), ODOMETRY)])
+        new = NewVariable(EGO_POSE, 0, view.state(before).compose(frame.odometry), label="vehicle")
+        return Additions([new], [between_factor(before, key, frame.odometry.matrix(), ODOMETRY_COVARIANCE)])
 
 
 class ObjectProvider:
-    """Births and interactions, those of one shape in one batch."""
+    """New objects and interactions, those of one shape in one batch."""
 
     name = "interactions"
 
@@ -154,28 +164,30 @@ class ObjectProvider:
         self.scene = scene
 
     def factors(self, view: GraphView) -> Additions:
-        """Of all objects that are there."""
-        moment, before = self.scene.moments[view.epoch], view.before(OBJECT)
+        """Return variables, priors and interactions of all present objects."""
+        frame, before = self.scene.frames[view.epoch], view.before(OBJECT)
         new: list[NewVariable] = []
         batches: dict[tuple[NonlinearInteraction, int], list[list[int]]] = {}
-        for node in moment.states:
+        for node in frame.states:
             label = self.scene.kinds[node]
-            if node in moment.born:
-                new.append(NewVariable(OBJECT, node, moment.born[node], label=label))
+            if node in frame.new:
+                new.append(NewVariable(OBJECT, node, frame.new[node], label=label))
                 continue
             near = self.scene.neighbours(node, before)
-            law, states = self.scene.law(node, near), [view.state(before[i].key) for i in (node, *near)]
-            new.append(NewVariable(OBJECT, node, law.predict(states[0], states[1:], moment.dt), label=label))
-            batches.setdefault((law, len(near)), []).append([node, *near])
-        born = list(moment.born)
+            motion, states = self.scene.interaction(node, near), [view.state(before[i].key) for i in (node, *near)]
+            new.append(NewVariable(OBJECT, node, motion.predict(states[0], states[1:], frame.dt), label=label))
+            batches.setdefault((motion, len(near)), []).append([node, *near])
+        initial = list(frame.new)
         factors: list[Any] = []
-        if born:
-            factors += prior_factors([view.key(OBJECT, i) for i in born], [moment.born[i] for i in born], BORN)
-        for (law, _), rows in batches.items():
+        if initial:
+            factors += prior_factors(
+                [view.key(OBJECT, i) for i in initial], [frame.new[i] for i in initial], INITIAL_STATE_COVARIANCE
+            )
+        for (motion, _), rows in batches.items():
             earlier = np.array([[before[i].key for i in row] for row in rows], dtype=np.uint64)
             now = [view.key(OBJECT, row[0]) for row in rows]
-            Q = process_noise(moment.dt)
-            factors.append(law.factors(now, earlier[:, 0], earlier[:, 1:], 4, moment.dt, Q))
+            Q = process_noise(frame.dt)
+            factors.append(motion.factors(now, earlier[:, 0], earlier[:, 1:], 4, frame.dt, Q))
         return Additions(new, factors)
 
 
@@ -188,15 +200,17 @@ class DetectionProvider:
         self.scene, self.robust = scene, robust
 
     def factors(self, view: GraphView) -> Additions:
-        """Of all objects that are seen."""
-        seen = self.scene.moments[view.epoch].seen
+        """Return the factors of all detected objects."""
+        seen = self.scene.frames[view.epoch].seen
         if not seen:
             return Additions()
         rows = np.array([[view.key(EGO_POSE, 0), view.key(OBJECT, node)] for node in seen], dtype=np.uint64)
         z = np.stack(list(seen.values()))
-        return Additions(factors=[relative_range_bearing_factors(rows, z, SEEN, 4, robust=self.robust)])
+        return Additions(
+            factors=[relative_range_bearing_factors(rows, z, RANGE_BEARING_COVARIANCE, 4, robust=self.robust)]
+        )
 
 
 def providers(scene: SampledTraffic, robust: Robust | None = None) -> list[FactorProvider]:
-    """The model that a scene was drawn from."""
+    """Return providers of the factors of the model that a scene was sampled from."""
     return [VehicleProvider(scene), ObjectProvider(scene), DetectionProvider(scene, robust)]

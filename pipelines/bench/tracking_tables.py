@@ -51,9 +51,9 @@ def _variants(result: SetResult) -> FigureTable:
 
 
 def _stages(result: SetResult) -> FigureTable:
-    told = {name: result.variants[name] for name in ("saga", "kf")}
-    stages = tuple(next(iter(told.values())).stages)
-    rows = tuple((name, *(cell(each.stages[stage], 2) for stage in stages)) for name, each in told.items())
+    compared = {name: result.variants[name] for name in ("saga", "kf")}
+    stages = tuple(next(iter(compared.values())).stages)
+    rows = tuple((name, *(cell(each.stages[stage], 2) for stage in stages)) for name, each in compared.items())
     return FigureTable(f"{result.name}: ms a frame by stage", ("method", *stages), rows)
 
 

@@ -1,4 +1,4 @@
-"""`saga-fg explain`: why a track was born, kept, updated, ended."""
+"""`saga-fg explain`: why a track was initiated, kept, updated, deleted."""
 
 from __future__ import annotations
 

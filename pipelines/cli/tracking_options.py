@@ -24,8 +24,9 @@ EstimatorOption = Annotated[
     EstimatorName | None,
     typer.Option(
         "--estimator",
-        help="kalman: joint filter; isam2: the same as a factor graph; fixed-lag: smoother of the last seconds. All "
-        "give the same tracks, but a late frame goes where it belongs with fixed-lag alone.  [default: as configured]",
+        help="kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph of "
+        "the last --lag seconds, which puts late frames where they belong. Other tracks are the same.  "
+        "[default: as configured]",
     ),
 ]
 LagOption = Annotated[

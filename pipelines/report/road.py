@@ -59,12 +59,12 @@ def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
     now: list[int | None] = [None] * len(lights)
     colours = []
     for boxes in detections:
-        sightings = boxes.select(np.flatnonzero(np.isin(boxes.label, COLOUR_LABELS)))
-        if len(lights) and len(sightings):
+        reported = boxes.select(np.flatnonzero(np.isin(boxes.label, COLOUR_LABELS)))
+        if len(lights) and len(reported):
             now = now.copy()
-            apart = np.linalg.norm(sightings.position[:, None, :2] - lights, axis=2)
+            apart = np.linalg.norm(reported.position[:, None, :2] - lights, axis=2)
             nearest = apart.argmin(axis=1)
-            for label, light, far in zip(sightings.label, nearest.tolist(), apart.min(axis=1), strict=True):
+            for label, light, far in zip(reported.label, nearest.tolist(), apart.min(axis=1), strict=True):
                 if far < reach:
                     now[light] = COLOUR_LABELS.index(str(label))
         colours.append(now)

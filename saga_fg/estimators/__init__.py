@@ -12,7 +12,7 @@ from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.estimators.kalman import JointKalmanFilter
 from saga_fg.estimators.measurements import Observations
-from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
+from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
 from saga_fg.estimators.protocol import Estimator, Measurements
 from saga_fg.estimators.recorded_smoother import SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings
@@ -22,7 +22,6 @@ from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 __all__ = [
     "BatchSmoother",
     "BatchSolver",
-    "Births",
     "BoundedKalmanFilter",
     "DetectionFactors",
     "Estimator",
@@ -37,6 +36,7 @@ __all__ = [
     "Interactions",
     "JointKalmanFilter",
     "Measurements",
+    "NewObjects",
     "Observations",
     "RelinearisationSettings",
     "SmoothedState",

@@ -49,14 +49,14 @@ class BayesTree:
         priors = tuple(variables.priors(x, np.arange(len(x.layout))))
         return BayesTree(gtsam.ISAM2(_parameters(qr)), variables, x.partition, priors, variables.dims(), {})
 
-    def with_births(self, x: BlockGaussian) -> BayesTree:
+    def with_new_nodes(self, x: BlockGaussian) -> BayesTree:
         """Add the nodes that `x` has at its end and the tree has not, independent of all others."""
         known, first = self.variables.partition.layout, self._next_key
         rows = np.arange(len(known), len(x.layout))
         scale = np.sqrt(x.variances()[known.size :])
         variables = self.variables.extended(x.layout, x.mean[known.size :], scale, first)
         new = {key: size for key, size in variables.dims().items() if key >= first}
-        factors = self.factors + tuple(variables.births(rows, x.covariances(rows)))
+        factors = self.factors + tuple(variables.node_priors(rows, x.covariances(rows)))
         return replace(self, variables=variables, components=x.partition, factors=factors, new=self.new | new)
 
     def with_measurements(self, rows: WhitenedMeasurements) -> BayesTree:

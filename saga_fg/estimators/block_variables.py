@@ -104,7 +104,7 @@ class BlockVariables:
                 factors.append(native_factor(self.keys[variables].tolist(), self.sizes[variables].tolist(), augmented))
         return factors
 
-    def births(self, rows: IntArray, covariances: FloatArray) -> list[gtsam.JacobianFactor]:
+    def node_priors(self, rows: IntArray, covariances: FloatArray) -> list[gtsam.JacobianFactor]:
         """Priors (k, d, d) of the nodes at `rows`, variables of their own that begin at their mean: one factor each."""
         k, d, _ = covariances.shape
         span = self.partition.layout.offsets[rows][:, None] + np.arange(d)

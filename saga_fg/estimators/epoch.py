@@ -22,7 +22,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Birth:
+class NewNodes:
     """Nodes that appear: ids (k,), means (k, d), covariances (k, d, d)."""
 
     nodes: IntArray
@@ -35,7 +35,7 @@ class Epoch:
     """time (s); new nodes, measurements, ids of the nodes that leave afterwards, interval to the next epoch."""
 
     time: float
-    births: tuple[Birth, ...] = ()
+    new_nodes: tuple[NewNodes, ...] = ()
     measurements: tuple[RecordedMeasurements, ...] = ()
     leaving: tuple[int, ...] = ()
     interval: IntervalDynamics | ZeroInterval | None = None
@@ -72,13 +72,13 @@ class FilterStep:
         """All nodes of the epoch, with those that leave afterwards."""
         return self.filtered.layout
 
-    def with_birth(self, birth: Birth) -> FilterStep:
+    def with_new_nodes(self, new: NewNodes) -> FilterStep:
         """Add new nodes."""
-        layout = self.layout.extended(birth.nodes, birth.means.shape[1])
-        prior = self.prior.extended(layout, birth.means, birth.covariances)
+        layout = self.layout.extended(new.nodes, new.means.shape[1])
+        prior = self.prior.extended(layout, new.means, new.covariances)
         if not self.gains:
             return replace(self, prior=prior, filtered=prior)
-        return replace(self, prior=prior, filtered=self.filtered.extended(layout, birth.means, birth.covariances))
+        return replace(self, prior=prior, filtered=self.filtered.extended(layout, new.means, new.covariances))
 
     def updated(self, recorded: RecordedMeasurements, mean: FloatArray | None = None) -> FilterStep:
         """Take in measurements, linearised at the joint state `mean` (the filter's own for None)."""
@@ -111,7 +111,7 @@ def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequen
     """Joint means of every epoch by the dynamics alone, without measurements."""
     means, mean = [], prior.mean
     for epoch, layout in zip(epochs, layouts, strict=True):
-        mean = np.concatenate([mean, *(birth.means.ravel() for birth in epoch.births)])
+        mean = np.concatenate([mean, *(new.means.ravel() for new in epoch.new_nodes)])
         means.append(mean)
         if epoch.interval is not None:
             leaving = layout.rows(epoch.leaving)
@@ -133,8 +133,8 @@ def filter_epochs(prior: BlockGaussian, epochs: list[Epoch], means: list[FloatAr
     for k, epoch in enumerate(epochs):
         mean = None if means is None else means[k]
         step = initial_step(prior)
-        for birth in epoch.births:
-            step = step.with_birth(birth)
+        for new in epoch.new_nodes:
+            step = step.with_new_nodes(new)
         for recorded in epoch.measurements:
             step = step.updated(recorded, mean)
         if epoch.interval is not None:

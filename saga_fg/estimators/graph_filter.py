@@ -1,7 +1,7 @@
 """The tracker's filter as a running graph, in which factors of users' own take part.
 
-The calls of an estimator become providers of an `IncrementalSmoother`: what is added is a birth, a prediction an epoch
-with its interaction factors, an update detections. Between them users' providers are asked.
+The calls of an estimator become providers of an `IncrementalSmoother`: `add` adds new objects, `predict` an epoch
+with its interaction factors, `update` detections. Between them users' providers are asked.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
+from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, predictors
@@ -118,7 +118,7 @@ class GraphFilter(LatestMarginals):
         if back:  # removed and added at the same epoch: iSAM2 has to forget them first
             smoother.marginalise(back)
             smoother.extend([])
-        smoother.extend([Births(added, mean, covariance, labels or {})])
+        smoother.extend([NewObjects(added, mean, covariance, labels or {})])
         self._layout, self._keys = layout, {**self._keys, **keys}
 
     def predict(self, transition: Transition) -> None:

@@ -25,7 +25,7 @@ from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
-from saga_fg.estimators.epoch import Birth, Epoch, filter_epochs
+from saga_fg.estimators.epoch import Epoch, NewNodes, filter_epochs
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
@@ -103,9 +103,9 @@ class IncrementalFilter(LatestMarginals):
             state = _moved(state, ZeroInterval())
         state, x = _solved(state)
         x = x.extended(x.layout.extended(added, mean.shape[1]), mean, covariance)
-        birth = Birth(added, mean, covariance)
-        epochs = state.with_newest(replace(state.newest, births=(*state.newest.births, birth)))
-        tree = None if state.tree is None else state.tree.with_births(x)
+        new = NewNodes(added, mean, covariance)
+        epochs = state.with_newest(replace(state.newest, new_nodes=(*state.newest.new_nodes, new)))
+        tree = None if state.tree is None else state.tree.with_new_nodes(x)
         self._state = replace(state, live=live, tree=tree, x=x, epochs=epochs)
 
     def predict(self, transition: Transition) -> None:

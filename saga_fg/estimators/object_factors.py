@@ -1,6 +1,6 @@
 """Objects in the running graph: their factors, the providers of these, and the graph of a recording.
 
-    prior        || x_i - m ||_P                             `Births`; one joint factor for a component at the start
+    prior        || x_i - m ||_P                             `NewObjects`; one joint factor for a component at the start
     interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}     `Interactions`, one n-ary factor a node and interval
     detection    || z - H x_i ||_R                           `DetectionFactors`, one a measurement
 
@@ -96,10 +96,10 @@ def recording_factors(
         factors: dict[str, Factors] = {
             "interactions": moved,
             "prior": _prior_factors(prior, keys) if k == 0 and len(prior.layout) else [],
-            "births": [
+            "new objects": [
                 factor
-                for birth in epoch.births
-                for factor in prior_factors([keys[n] for n in birth.nodes.tolist()], birth.means, birth.covariances)
+                for new in epoch.new_nodes
+                for factor in prior_factors([keys[n] for n in new.nodes.tolist()], new.means, new.covariances)
             ],
             "detections": [factor for one in epoch.measurements for factor in measurement_factors(keys, one)],
         }
@@ -217,14 +217,14 @@ def _of_row(blocks: Blocks, row: int) -> list[tuple[int, FloatArray]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Births:
+class NewObjects:
     """New objects, independent of all others: ids (k,), means (k, d), covariances (k, d, d); labels by id."""
 
     nodes: IntArray
     means: FloatArray
     covariances: FloatArray
     labels: Mapping[int, str] = field(default_factory=dict)
-    name: str = "births"
+    name: str = "new objects"
     internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:

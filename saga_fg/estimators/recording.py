@@ -24,7 +24,7 @@ from saga_fg.estimators.backward import (
     smoothed_means,
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.epoch import Birth, Epoch, FilterStep, dead_reckoned, filter_epochs, initial_step
+from saga_fg.estimators.epoch import Epoch, FilterStep, NewNodes, dead_reckoned, filter_epochs, initial_step
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
@@ -147,10 +147,10 @@ class Recording:
             return
         if np.isin(added, self._epochs[-1].leaving).any():  # removed and added at the same time: another epoch
             self._begin_epoch(ZeroInterval())
-        birth, epoch = Birth(added, mean, covariance), self._epochs[-1]
+        new, epoch = NewNodes(added, mean, covariance), self._epochs[-1]
         if len(self._steps) == len(self._epochs):
-            self._steps[-1] = self._steps[-1].with_birth(birth)
-        self._epochs[-1] = replace(epoch, births=(*epoch.births, birth))
+            self._steps[-1] = self._steps[-1].with_new_nodes(new)
+        self._epochs[-1] = replace(epoch, new_nodes=(*epoch.new_nodes, new))
         self._layouts[-1] = self._layouts[-1].extended(added, mean.shape[1])
         self._changed()
 
@@ -211,7 +211,7 @@ class Recording:
         self.solve()
         self._prior = self._steps[k].prior
         first = replace(self._steps[k], carried=len(self._prior.layout))
-        self._epochs = [replace(self._epochs[k], births=()), *self._epochs[k + 1 :]]
+        self._epochs = [replace(self._epochs[k], new_nodes=()), *self._epochs[k + 1 :]]
         self._layouts, self._steps = self._layouts[k:], [first, *self._steps[k + 1 :]]
         self._nonlinear = not all(epoch.linear for epoch in self._epochs)
         self._changed()

@@ -15,7 +15,7 @@ from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.box_filter import MOVING
 
-BIRTH_SPEED = 10.0  # standard deviation of a velocity component before the second measurement, m/s
+INITIAL_SPEED_DEVIATION = 10.0  # standard deviation of a velocity component before the second measurement, m/s
 
 
 class FilteredTrajectories(NamedTuple):
@@ -41,13 +41,13 @@ def filter_independently(
     followed = np.full((K, N), np.nan)
     diffusion = ConstantVelocity(1.0).diffusion[2:, 2:] * acceleration_noise[:, None, None]
     R = position_noise**2 * np.eye(2)
-    birth = np.diag(np.repeat([position_noise**2, BIRTH_SPEED**2], 2))
+    initial = np.diag(np.repeat([position_noise**2, INITIAL_SPEED_DEVIATION**2], 2))
     before = np.zeros(N, dtype=bool)
     for k in range(K):
         seen = np.isfinite(trajectories.position[k, :, 0])
         again, new = np.flatnonzero(seen & before), np.flatnonzero(seen & ~before)
         mean[k, new, :2], mean[k, new, 2:] = trajectories.position[k, new], 0.0
-        P[k, new], followed[k, new] = birth, 0.0
+        P[k, new], followed[k, new] = initial, 0.0
         if len(again):
             dt = trajectories.time[k] - trajectories.time[k - 1]
             F = np.eye(4) + dt * np.eye(4, k=2)

@@ -13,7 +13,7 @@ import numpy as np
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.learning.gap_prediction import SUBSTEPS, TURNS_ABOVE
 from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments
-from saga_fg.learning.independent_filter import BIRTH_SPEED, FilteredTrajectories
+from saga_fg.learning.independent_filter import INITIAL_SPEED_DEVIATION, FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import EdgeRule, build_graph
@@ -45,7 +45,7 @@ class JointGaps:
         self._R = position_noise**2 * np.eye(2)
         by_class = {c: NodeType(c, ConstantVelocity(noise.get(c, noise[DEFAULT]))) for c in set(trajectories.label)}
         self._types = [by_class[c] for c in trajectories.label]
-        self._initial = np.diag(np.repeat([position_noise**2, BIRTH_SPEED**2], 2))
+        self._initial = np.diag(np.repeat([position_noise**2, INITIAL_SPEED_DEVIATION**2], 2))
 
     def errors(self, gaps: GapSample, settings: GapSettings) -> FloatArray:
         """Position errors (W, S), m, of the predictions through the gaps."""

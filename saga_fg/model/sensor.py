@@ -55,8 +55,12 @@ class NoiseModel(Settings):
     bearing_noise: NonNegative = setting(
         0.0, "standard deviation across the line of sight per m of range, rad; usual 0 to 0.01"
     )
-    velocity: Positive = setting(1.0, "standard deviation of a component of a measured velocity, m/s")
-    range_rate: Positive = setting(0.5, "standard deviation of a measured range rate, m/s")
+    velocity: Positive = setting(
+        1.0, "standard deviation of a component of a measured velocity, m/s; higher: measured velocities count less"
+    )
+    range_rate: Positive = setting(
+        0.5, "standard deviation of a measured range rate, m/s; usual 0.1 to 1; higher: range rates count less"
+    )
     low_score_growth: NonNegative = setting(
         0.0, "growth of all deviations at low scores, by the factor 1 + growth * (1 - probability); usual 0 to 3"
     )
@@ -64,16 +68,19 @@ class NoiseModel(Settings):
         1.0, "factor on the standard deviation reported for a position; higher: wider reported ellipses"
     )
     reported_low_score_growth: Annotated[float, Range(-0.99)] = setting(
-        0.0, "growth of the reported deviation at low scores, by 1 + growth * (1 - probability); above -1"
+        0.0, "growth of the reported deviation at low scores, by 1 + growth * (1 - probability); above -1, 0: none"
     )
     position_bias: NonNegative = setting(
-        0.0, "standard deviation of the error that all detections of one object share, m; added to reports only"
+        0.0,
+        "standard deviation of the error that all detections of an object share, m; in reports only; usual 0 to 0.3",
     )
     position_bias_growth: NonNegative = setting(
-        0.0, "growth of position_bias at low scores, by the factor 1 + growth * (1 - probability)"
+        0.0, "growth of position_bias at low scores, by the factor 1 + growth * (1 - probability); 0: none"
     )
-    yaw: Positive = setting(0.2, "standard deviation of a measured heading, rad")
-    height: Positive = setting(0.2, "standard deviation of the height of a centre, m")
+    yaw: Positive = setting(0.2, "standard deviation of a measured heading, rad; higher: headings are smoothed more")
+    height: Positive = setting(
+        0.2, "standard deviation of the height of a centre, m; higher: heights are smoothed more"
+    )
 
 
 @dataclass(frozen=True)
@@ -90,9 +97,16 @@ class ScoreCalibration(Settings):
 class FieldOfView(Settings):
     """The field of view of a sensor, in its own frame."""
 
-    min_azimuth: Finite = setting(-np.pi, "smallest azimuth, from straight ahead, left positive, rad")
-    max_azimuth: Finite = setting(np.pi, "largest azimuth, rad")
-    max_range: PositiveOrInf = setting(80.0, "largest range, m")
+    min_azimuth: Finite = setting(
+        -np.pi, "smallest azimuth, from straight ahead, left positive, rad; misses beyond do not count"
+    )
+    max_azimuth: Finite = setting(
+        np.pi, "largest azimuth, from straight ahead, left positive, rad; misses beyond do not count"
+    )
+    max_range: PositiveOrInf = setting(
+        80.0,
+        "largest range, m; misses beyond do not count; usual 40 to 120; higher: distant tracks die of misses sooner",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -109,13 +123,13 @@ class FieldOfView(Settings):
 
 
 @dataclass(frozen=True)
-class Extrinsics:
+class Extrinsics(Settings):
     """Pose of the sensor on the vehicle, ego_T_sensor, for detections given in sensor coordinates."""
 
-    x: float = setting(0.0, "position ahead, m")
-    y: float = setting(0.0, "position to the left, m")
-    z: float = setting(0.0, "position up, m")
-    yaw: float = setting(0.0, "heading, left positive, rad")
+    x: Finite = setting(0.0, "position of the sensor ahead of the vehicle's origin, m; usual -2 to 4")
+    y: Finite = setting(0.0, "position of the sensor to the left of the vehicle's origin, m; usual -1 to 1")
+    z: Finite = setting(0.0, "position of the sensor above the vehicle's origin, m; usual 0 to 2.5")
+    yaw: Finite = setting(0.0, "heading of the sensor in the vehicle's frame, rad; 0: ahead, higher: further left")
 
     @property
     def ego_T_sensor(self) -> FloatArray:
@@ -131,25 +145,29 @@ class Sensor(Settings):
         lambda: {DEFAULT: NoiseModel()}, "measurement noise by class; the entry named default serves all others"
     )
     use_velocity: bool = setting(True, "use velocities and range rates, where they are measured")
-    max_speed: PositiveOrInf = setting(150.0, "ignore measured velocities and range rates above this, m/s")
+    max_speed: PositiveOrInf = setting(
+        150.0, "ignore measured velocities and range rates above this, m/s; .inf: use all"
+    )
     detection_probability: Fraction = setting(
         0.9, "probability that a visible object in the field of view is detected; higher: misses count more"
     )
     class_detection_probability: Mapping[str, Fraction] = settings_group(
-        dict, "detection probability by class, where it differs"
+        dict, "detection probability by class, where it differs; usual 0.5 to 0.95; higher: misses count more"
     )
     score: Literal["probability", "logit"] = setting("probability", "meaning of the detector's scores")
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()},
         "calibration of the scores by class; the entry named default serves all others",
     )
-    class_accuracy: float = setting(
-        0.9, "probability that the class of a detection is right, else another of its group (tracker.class_groups)"
+    class_accuracy: Fraction = setting(
+        0.9, "probability that a detection has the right class of its group (tracker.class_groups); usual 0.7 to 0.99"
     )
     confusion: Mapping[str, Mapping[str, float]] = settings_group(
         dict, "by true class, counts or shares of the classes it is detected as; used in place of class_accuracy"
     )
-    colour_accuracy: Fraction = setting(0.9, "probability that the reported colour of a traffic light is right")
+    colour_accuracy: Fraction = setting(
+        0.9, "probability that the reported colour of a traffic light is right; higher: beliefs change faster"
+    )
     clutter_area: PositiveOrInf | None = setting(
         None, "area over which false detections spread, m^2; null: that of `tracker.association`"
     )
@@ -159,13 +177,13 @@ class Sensor(Settings):
     field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can detect")
     extrinsics: Extrinsics = settings_group(Extrinsics, "pose on the vehicle, for detections in sensor coordinates")
     time_offset: Annotated[float, Range(-LATEST, LATEST)] = setting(
-        0.0, "added to the sensor's timestamps to get the time of measurement, s"
+        0.0, "added to the sensor's timestamps to get the time of measurement, s; usual -0.1 to 0"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 < self.class_accuracy < 1:
-            raise InputError(f"class_accuracy: expected a chance inside 0 to 1, got {self.class_accuracy!r}")
+            raise InputError(f"class_accuracy: expected a probability inside 0 to 1, got {self.class_accuracy!r}")
         for label, taken_for in self.confusion.items():
             if not all(0 <= share < math.inf for share in taken_for.values()) or sum(taken_for.values()) == 0:
                 raise InputError(f"confusion.{label}: expected shares >= 0, some above, got {dict(taken_for)!r}")
@@ -249,11 +267,11 @@ class Sensor(Settings):
 
     def covariance_calibration(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
         """For reported covariances of positions (N,): the factor on deviations, and the deviation of the bias, m."""
-        scale, shared, scale_growth, shared_growth = self.deviations(
+        scale, bias, scale_growth, bias_growth = self.deviations(
             label, "reported_deviation_scale", "position_bias", "reported_low_score_growth", "position_bias_growth"
         )
         doubt = 1 - probability
-        return scale * (1 + scale_growth * doubt), shared * (1 + shared_growth * doubt)
+        return scale * (1 + scale_growth * doubt), bias * (1 + bias_growth * doubt)
 
     def in_world(self, frame: Frame) -> Detections:
         """The detections of a frame of this sensor, in world coordinates; `InputError` where the pose is unknown."""

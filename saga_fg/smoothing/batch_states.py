@@ -1,6 +1,6 @@
 r"""States of all objects at all moments of a recording, given all of its detections.
 
-    prior         position unknown, velocity as at a birth                 first moment of an object
+    prior         position unknown, velocity as of a new track             first moment of an object
     interaction   || x_i(k+1) - sum_j F_ij x_j(k) - b_i ||_{Q_i}            every interval, edges frozen
     detection     rho( || z - H x_i(k) ||_R )                              every assigned detection
     stationary    || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object is stationary
@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from factors import Robust
-from saga_fg.estimators import BatchSmoother, Births, Measurements, SmoothedState, WindowedSmoother
+from saga_fg.estimators import BatchSmoother, Measurements, NewObjects, SmoothedState, WindowedSmoother
 from saga_fg.graph import FactorProvider
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import VELOCITY
@@ -107,19 +107,19 @@ def _epochs(
                 graph, diffusion_scale=np.where(still, stationary.settings.noise_scale, graph.diffusion_scale)
             )
             transition = discretise(graph, float(evidence.times[k] - evidence.times[k - 1]))
-        born = np.flatnonzero(lifespans.first == k)
-        P = np.zeros((len(born), 4, 4))
+        new = np.flatnonzero(lifespans.first == k)
+        P = np.zeros((len(new), 4, 4))
         P[:, :2, :2] = UNKNOWN_POSITION**2 * np.eye(2)
-        P[:, 2:, 2:] = velocity_prior[born]
-        births = Births(lifespans.id[born], np.concatenate([start[born], np.zeros((len(born), 2))], axis=1), P)
-        present = np.concatenate([present, born])
+        P[:, 2:, 2:] = velocity_prior[new]
+        new_objects = NewObjects(lifespans.id[new], np.concatenate([start[new], np.zeros((len(new), 2))], axis=1), P)
+        present = np.concatenate([present, new])
         measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
         pinned = lifespans.id[present][stationary.at(k, lifespans.id[present])]
         if len(pinned):
             H, R = types[0].selector(VELOCITY), stationary.settings.velocity_deviation**2 * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lifespans.last[present] == k
-        yield RecordingEpoch(k, transition, births, measured, lifespans.id[present[gone]])
+        yield RecordingEpoch(k, transition, new_objects, measured, lifespans.id[present[gone]])
         present = present[~gone]
 
 
@@ -131,7 +131,7 @@ def _smoothed(epochs: Iterable[RecordingEpoch], smoother: BatchSmoother | Window
         begin = epoch.moment - count
         if epoch.transition is not None:
             smoother.predict(epoch.transition)
-        smoother.add(epoch.births.nodes, epoch.births.means, epoch.births.covariances)
+        smoother.add(epoch.new_objects.nodes, epoch.new_objects.means, epoch.new_objects.covariances)
         for measurements in epoch.measurements:
             smoother.update(measurements)
         smoother.marginalise(epoch.gone)

@@ -1,7 +1,7 @@
 """A recording as a running graph, in which factors of users' own take part.
 
-Objects are variables by id and moment, with the births, interactions and detections of the smoother in NumPy, and start
-where that has found them, which is where they are without the users' factors. `BatchSolver` solves everything at once.
+Objects are variables by id and moment, with the new objects, interactions and detections of the smoother in NumPy, and
+start at its result, the states without the users' factors. `BatchSolver` solves everything at once.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.estimators import BatchSolver, Births, DetectionFactors, Interactions, Measurements
+from saga_fg.estimators import BatchSolver, DetectionFactors, Interactions, Measurements, NewObjects
 from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -28,7 +28,7 @@ class RecordingEpoch:
 
     moment: int
     transition: Transition | None
-    births: Births
+    new_objects: NewObjects
     measurements: Sequence[Measurements]
     gone: IntArray
 
@@ -66,9 +66,9 @@ def states_in_graph(
         rows = start.at(epoch.moment)
         states = dict(zip(start.id[rows].tolist(), start.mean[rows], strict=True))
         moved = [] if epoch.transition is None else [_At(Interactions(epoch.transition), states)]
-        born = _At(replace(epoch.births, labels=labels), states)
+        new = _At(replace(epoch.new_objects, labels=labels), states)
         solver.step(
-            float(evidence.times[epoch.moment]), [*moved, born, *map(DetectionFactors, epoch.measurements), *providers]
+            float(evidence.times[epoch.moment]), [*moved, new, *map(DetectionFactors, epoch.measurements), *providers]
         )
     if not solver.solve().converged:
         log.warning("the states with the factors of %s have not settled", ", ".join(one.name for one in providers))

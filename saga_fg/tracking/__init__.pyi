@@ -1,4 +1,4 @@
-from .clock import TimeVerdict
+from .clock import ClockSettings, TimeVerdict
 from .greedy import GreedyTracker
 from .journal import Journal
 from .names import AssociationName, EstimatorName
@@ -6,14 +6,13 @@ from .observer import Observer, Stage, TrackerView
 from .settings import (
     AssociationSettings,
     ClassSettings,
-    ClockSettings,
     EgoNodeSettings,
     ExistenceSettings,
     GreedySettings,
-    StationaritySettings,
     TrackerSettings,
     TrafficFlowSettings,
 )
+from .stationarity import StationaritySettings
 from .tracker import Tracker
 
 __all__ = [

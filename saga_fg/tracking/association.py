@@ -98,7 +98,7 @@ def match(
     predicted     boxes of the n tracks at the time of the frame, world
     P             (n, 2, 2) covariance of their positions
     expected      (n,) chance that the track is detected: its existence times the sensor's detection probability
-    clutter_area  of the module, m^2
+    clutter_area  area over which false detections spread, m^2: that of the sensor, else of the settings
     cross         covariances between the positions of tracks, for the method `graph`
     evidence      of classes, where detectors mistake some for each other
     """

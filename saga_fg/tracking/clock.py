@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from saga_fg.tracking.settings import ClockSettings
+from saga_fg.settings import PositiveInt, PositiveOrInf, Settings, setting
 
 REMEMBERED = 200  # accepted frames, by which sensors and repeated frames are recognised
 
@@ -31,6 +31,18 @@ TimeVerdict = Literal["accepted", "late", "unconfirmed", "set_ahead", "set_back"
 the clock was first set to the frame's time."""
 Stamp = tuple[str, float]
 """Sensor and time of a frame, s."""
+
+
+@dataclass(frozen=True)
+class ClockSettings(Settings):
+    """Handling of implausible timestamps."""
+
+    max_jump: PositiveOrInf = setting(
+        10.0, "leave out a frame further than this from the newest until a second confirms its time, s; usual 2 to 30"
+    )
+    reset_after: PositiveInt = setting(
+        3, "set the clock back after this many frames in a row in which the time of a sensor decreases; usual 2 to 10"
+    )
 
 
 @dataclass(frozen=True)

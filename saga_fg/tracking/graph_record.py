@@ -21,7 +21,12 @@ from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFacto
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.observer import TrackerView
 
-OWN = {"interactions": "interaction", "detections": "detection", "births": "birth", "marginals": "marginal prior"}
+OWN = {
+    "interactions": "interaction",
+    "detections": "detection",
+    "new objects": "initiation",
+    "marginals": "marginal prior",
+}
 """Kinds of the factors that the toolkit's own providers add, by provider."""
 KNOWN_POSE = "known ego pose"  # no variable
 
@@ -95,7 +100,7 @@ def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -
         for row in now.matching.track.tolist():
             record.factor("detection", [row])
         for row in range(n - len(now.initiated), n):
-            record.factor("birth", [row])
+            record.factor("initiation", [row])
         if now.measurements.viewpoint is not None:
             record.node(KNOWN_POSE, "vehicle", time, now.measurements.viewpoint[:2])
     return {"nodes": record.nodes, "factors": record.factors}

@@ -34,7 +34,7 @@ def motion_of(settings: TrackerSettings, label: str) -> Motion:
     return class_settings(settings.classes, ClassSettings, label).motion
 
 
-GATE = 0.999  # share of true sightings of a light that may be its own
+GATE = 0.999  # gate probability of the detections of a light
 
 
 @dataclass(frozen=True)

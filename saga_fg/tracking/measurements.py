@@ -113,22 +113,23 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
 
 
 def suppress_duplicates(
-    boxes: Boxes, probability: FloatArray, distance: FloatArray, shadow: FloatArray, ratio: FloatArray
+    boxes: Boxes, probability: FloatArray, distance: FloatArray, weak_distance: FloatArray, weak_ratio: FloatArray
 ) -> IntArray:
     """Rows of the boxes that stay, ascending, after suppression within the classes.
 
-    boxes (n); probability, distance (m), shadow (m), ratio, each (n,). Greedy from the most probable down, so that a
-    suppressed box suppresses no other.
+    boxes (n); probability (n,); of their classes nms_distance (n,), weak_nms_distance (n,), m, and weak_nms_ratio (n,).
+    Greedy from the most probable down, so that a suppressed box suppresses no other.
     """
     if len(boxes) < 2:
         return np.arange(len(boxes))
     position = boxes.position[:, :2]
-    pairs = cKDTree(position).query_pairs(float(max(distance.max(), shadow.max())), output_type="ndarray")
+    pairs = cKDTree(position).query_pairs(float(max(distance.max(), weak_distance.max())), output_type="ndarray")
     a, b = pairs[:, 0], pairs[:, 1]
     apart = np.hypot(*(position[a] - position[b]).T)
     strong, weak = _ordered(a, b, probability)
     duplicate = apart < np.minimum(distance[a], distance[b])
-    duplicate |= (apart < np.minimum(shadow[a], shadow[b])) & (probability[weak] < ratio[strong] * probability[strong])
+    much_weaker = probability[weak] < weak_ratio[strong] * probability[strong]
+    duplicate |= (apart < np.minimum(weak_distance[a], weak_distance[b])) & much_weaker
     rival = (boxes.label[a] == boxes.label[b]) & duplicate
     return _survivors(strong[rival], weak[rival], probability)
 

@@ -2,13 +2,13 @@ r"""Report: the tracks of sufficient existence that were detected recently, with
 
     score       p ( hits / (opportunities + prior_opportunities) )^w           when detected; while coasting times r and
                                                                    coasting_score_factor
-    P_reported  = ( c (1 + h (1 - p)) )^2 P + ( e (1 + g (1 - p)) )^2 u u^T
+    P_reported  = ( c (1 + h (1 - p)) )^2 P + ( b (1 + g (1 - p)) )^2 u u^T
 
 A filter's noise is wider than its errors where it also has to let the right detections through the gate, which are not
 as Gaussian as it assumes: the factor c, of sensor and class, corrects this, and h its dependence on the probability p
 of the latest detection. A detector that sees one side of a car misjudges its length, and with it the position of its
-centre along the heading u, in one frame as in the next. No filter averages that away: the shared error e. Both are for
-the report; the filter and the association, which compare detections with detections, do without them. c, e and their
+centre along the heading u, in one frame as in the next. No filter averages that away: the position bias b. Both are for
+the report; the filter and the association, which compare detections with detections, do without them. c, b and their
 growth are the sensor's noise settings, see `saga_fg.model.sensor`.
 """
 
@@ -21,6 +21,11 @@ from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.track import Tracks
+
+
+def mark_ready(state: TrackerState) -> None:
+    """Mark the tracks whose velocity is now known well enough to report them from here on."""
+    state.table.ready |= state.reported_kinematics().speed_deviation <= state.settings.report_speed_deviation_below
 
 
 def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
@@ -52,12 +57,12 @@ def reported_score(
     return np.asarray(table.score * certainty * hit_ratio * np.where(coasting, unseen, 1.0))
 
 
-def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, shared: FloatArray) -> FloatArray:
+def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
     """Reported covariances (n, 2, 2), m^2, of positions.
 
-    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, shared (n,) error, m. Where the heading is unknown, half of
-    the shared variance goes to each axis.
+    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, bias (n,) its deviation, m. Where the heading is unknown,
+    half of the variance of the bias goes to each axis.
     """
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
     direction = np.where(np.isfinite(yaw)[:, None, None], ahead[:, :, None] * ahead[:, None], np.eye(2) / 2)
-    return np.asarray(scale[:, None, None] ** 2 * P + shared[:, None, None] ** 2 * direction)
+    return np.asarray(scale[:, None, None] ** 2 * P + bias[:, None, None] ** 2 * direction)

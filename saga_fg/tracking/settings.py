@@ -29,7 +29,9 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
+from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName, EstimatorName
+from saga_fg.tracking.stationarity import StationaritySettings
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.road_map import RoadMap
 from saga_fg.types.signal import SignalSettings
@@ -61,7 +63,11 @@ class ClassSettings(Settings):
     weak_nms_distance: NonNegative = setting(
         0.0, "discard a detection this close to a much more probable one, m; usual 1 to 4, 0: never"
     )
-    weak_nms_ratio: Fraction = setting(0.5, "much more probable: the other has less than this share of its probability")
+    weak_nms_ratio: Fraction = setting(
+        0.5,
+        "discard the weaker of two detections within weak_nms_distance if its probability is below this "
+        "share of the other's; higher: more are discarded",
+    )
     merge_distance: NonNegative = setting(
         0.0, "delete a coasting track when a detected track of its class is closer than this, m; 0: never"
     )
@@ -101,13 +107,19 @@ class AssociationSettings(Settings):
         1.0, "weight of the distances between objects with method graph; 0: none, 1: as the model says"
     )
     clutter_area: PositiveOrInf = setting(
-        math.inf, "area over which false detections spread, m^2; usual 3000 to 10000; .inf: accept any pair in the gate"
+        math.inf,
+        "area over which false detections spread, m^2; usual 3000 to 10000; higher: more doubtful pairs "
+        "match; .inf: all in the gate",
     )
     existence_weight: NonNegative = setting(
-        0.3, "weight of the existence probability of a track in the cost; 0: none, 1: as the model says"
+        0.3,
+        "weight of a track's existence probability in the cost of leaving it unmatched; 0: none, 1: as the "
+        "model says; without effect while clutter_area is .inf",
     )
     score_weight: NonNegative = setting(
-        0.5, "weight of the probability of a detection in the cost; 0: none, 1: as the model says"
+        0.5,
+        "weight of a detection's probability in the cost of leaving it unmatched; 0: none, 1: as the model "
+        "says; without effect while clutter_area is .inf",
     )
 
 
@@ -122,10 +134,14 @@ class ExistenceSettings(Settings):
         0.2, "detection probability that leaves the existence unchanged; higher: weak detections count against"
     )
     report_above: Fraction = setting(
-        0.0, "report tracks from this existence probability on; usual 0 to 0.99; higher: fewer, surer tracks"
+        0.0,
+        "report tracks from this existence probability on; usual 0 to confirm_above; a confirmed track is "
+        "always reported; higher: tracks are reported later, fewer false ones",
     )
     confirm_above: Fraction = setting(
-        0.9, "confirm a track at this existence probability: misses no longer delete it, only time does"
+        0.9,
+        "confirm a track at this existence probability: it is reported, and misses no longer delete it, "
+        "only time does; usual 0.8 to 0.99; higher: fewer false tracks, more lost ones",
     )
     prior_opportunities: NonNegative = setting(
         0.0, "missed detection opportunities that each new track starts with in its hit ratio; usual 0 to 1"
@@ -154,53 +170,25 @@ class TrafficFlowSettings(Settings):
     """Prior speed of a new track from traffic that heads the same way, see `saga_fg.tracking.traffic_flow`."""
 
     weight: NonNegative = setting(0.0, "weight of one neighbour against the prior without traffic; 0: off, usual 5")
-    ahead_scale: PositiveOrInf = setting(15.0, "sigma of the kernel on the distance along the heading, m")
-    lateral_scale: PositiveOrInf = setting(
-        2.0, "sigma of the kernel on the distance across the heading, m; about half a lane"
+    ahead_scale: PositiveOrInf = setting(
+        15.0, "sigma of the kernel on the distance along the heading, m; higher: traffic further ahead counts"
     )
-    heading_scale: PositiveOrInf = setting(0.3, "sigma of the kernel on the difference of headings, rad")
+    lateral_scale: PositiveOrInf = setting(
+        2.0, "sigma of the kernel on the distance across the heading, m; usual half a lane; higher: other lanes count"
+    )
+    heading_scale: PositiveOrInf = setting(
+        0.3, "sigma of the kernel on the difference of headings, rad; higher: traffic that turns counts"
+    )
     spread: NonNegative = setting(
         2.0, "standard deviation of the difference between the speeds of neighbours, m/s; higher: a weaker prior"
     )
     max_speed_deviation: PositiveOrInf = setting(
-        1.5, "use only tracks whose speed has a standard deviation below this, m/s"
+        1.5, "use only tracks whose speed has a standard deviation below this, m/s; higher: more, less certain speeds"
     )
-    memory: NonNegative = setting(5.0, "remember where tracks have passed for this long, s; usual 5 to 10")
-
-
-@dataclass(frozen=True)
-class StationaritySettings(Settings):
-    """Probability that an object is stationary, see `saga_fg.tracking.stationarity`."""
-
-    prior: Fraction = setting(
-        0.0, "share of new objects that are stationary; 0: off; usual 0.5 where many cars are parked"
-    )
-    start_rate: NonNegative = setting(
-        0.02, "rate at which stationary objects start to move, 1/s; higher: departing cars are followed sooner"
-    )
-    stop_rate: NonNegative = setting(0.05, "rate at which moving objects stop, 1/s")
-    drift: NonNegative = setting(0.02, "standard deviation of the drift of a stationary position in one second, m")
-    noise_scale: Fraction = setting(
-        0.05, "factor on the process noise of a surely stationary object; lower: steadier velocities, later departures"
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.prior == 1 or self.noise_scale == 0:
-            raise InputError(
-                "prior and noise_scale: expected a prior below 1 and a scale above 0, since everything may move"
-            )
-
-
-@dataclass(frozen=True)
-class ClockSettings(Settings):
-    """Handling of implausible timestamps, see `saga_fg.tracking.clock`."""
-
-    max_jump: PositiveOrInf = setting(
-        10.0, "leave out a frame further than this from the newest time until a second frame confirms its time, s"
-    )
-    reset_after: PositiveInt = setting(
-        3, "set the clock back after this many frames in a row in which the time of a sensor decreases"
+    memory: NonNegative = setting(
+        5.0,
+        "remember where tracks have passed for this long, s; usual 5 to 10; higher: older traffic counts, "
+        "0: only present",
     )
 
 
@@ -212,8 +200,8 @@ class EgoNodeSettings(Settings):
         False, "true: estimate the ego pose with the objects, by factor providers; false: use that of the frames"
     )
     label: str = setting("car", "class of the ego vehicle in edge rules")
-    length: Positive = setting(4.5, "length of the ego vehicle, m")
-    deviation: Positive = setting(0.02, "standard deviation of the ego position about its pose, m")
+    length: Positive = setting(4.5, "length of the ego vehicle, m; usual 4 to 5")
+    deviation: Positive = setting(0.02, "standard deviation of the ego position about its pose, m; usual 0.01 to 0.1")
 
 
 @dataclass(frozen=True)
@@ -246,7 +234,9 @@ class TrackerSettings(Settings):
         lambda: None, "lights, stop lines, lanes and walls in world coordinates; null: those that frames bring along"
     )
     estimator: EstimatorName = setting(
-        "kalman", "kalman: fastest; isam2: graph of the whole past; fixed-lag: graph of a window, which smooths"
+        "kalman",
+        "kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph "
+        "of the last `lag` seconds, exact for late frames",
     )
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, of saga_fg.providers or your own"
@@ -269,10 +259,12 @@ class TrackerSettings(Settings):
         math.inf, "first report a track when its velocity is known to this standard deviation, m/s; .inf: at once"
     )
     score_memory: NonNegative = setting(
-        0.15, "time for which the latest detection of each sensor counts in the score of a track, s; about one frame"
+        0.15,
+        "time for which the latest detection of each sensor counts in a track's score, s; usual one frame; "
+        "higher: intermittent detections keep their score longer",
     )
     confirming_detections: PositiveInt = setting(
-        3, "detections that confirm a track initiated by a sensor with `initiation: confirmed`"
+        3, "detections that confirm a track initiated by a sensor with `initiation: confirmed`; usual 2 to 5"
     )
     unconfirmed_score_factor: Fraction = setting(
         0.0, "factor on the score of tracks that wait for confirmation; 0: do not report them"
@@ -282,7 +274,8 @@ class TrackerSettings(Settings):
         0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
     )
     max_out_of_view: PositiveOrInf = setting(
-        0.5, "delete a track this long after it left every sensor's field of view, s"
+        0.5,
+        "delete a track this long after it left every sensor's field of view, s; usual 0.2 to 2; higher: kept longer",
     )
     report_coasting: NonNegative = setting(
         0.6, "report a track for this long after its last detection, s; higher: fewer gaps, more false positives"

@@ -26,13 +26,43 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import mahalanobis_of_pairs
 from saga_fg.numerics.columns import Columns
+from saga_fg.settings import Fraction, NonNegative, Settings, setting
 from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.tracking.settings import StationaritySettings
 
 _MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
+
+
+@dataclass(frozen=True)
+class StationaritySettings(Settings):
+    """Probability that an object is stationary."""
+
+    prior: Fraction = setting(
+        0.0, "share of new objects that are stationary; 0: off; usual 0.5 where many cars are parked"
+    )
+    start_rate: NonNegative = setting(
+        0.02, "rate at which stationary objects start to move, 1/s; higher: departing cars are followed sooner"
+    )
+    stop_rate: NonNegative = setting(
+        0.05,
+        "rate at which moving objects stop, 1/s; usual 0.02 to 0.1; higher: slow objects are held as stationary sooner",
+    )
+    drift: NonNegative = setting(
+        0.02, "standard deviation of the drift of a stationary position in one second, m; usual 0 to 0.1"
+    )
+    noise_scale: Fraction = setting(
+        0.05, "factor on the process noise of a surely stationary object; lower: steadier velocities, later departures"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.prior == 1 or self.noise_scale == 0:
+            raise InputError(
+                "prior and noise_scale: expected a prior below 1 and a scale above 0, since everything may move"
+            )
 
 
 @dataclass(eq=False)

@@ -27,7 +27,7 @@ class TrackTable(Columns):
     existence         (n,) probability that the track is a real object
     score             (n,) probability of its latest detection
     covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
-    position_bias      (n,) error of the position that all detections of the track share, m
+    position_bias     (n,) standard deviation of the position error that all its detections share, m
     last_detected     (n,) time of its latest detection
     last_in_view      (n,) time when it was last inside a sensor's field of view
     confirmed         (n,) whether misses no longer delete it

@@ -1,8 +1,9 @@
 """The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
-    predict (with the graph) -> associate -> update -> existence -> initiate -> delete -> report
+    predict (prediction, ego_node) -> measure (measurements, map_nodes) -> associate (association) -> update (update)
+    -> existence (existence) -> initiate (initiation) -> delete (deletion) -> report (reporting)
 
-(figure 2 of Sani and Anand, arXiv 2411.03702). Each step is a module of its own name. Without edge rules this is the
+(figure 2 of Sani and Anand, arXiv 2411.03702), in brackets the modules of each stage. Without edge rules this is the
 classical tracker of independent Kalman filters, by the same code.
 """
 
@@ -33,11 +34,10 @@ from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.prediction import predict
 from saga_fg.tracking.provider_names import new_provider
-from saga_fg.tracking.reporting import report_tracks
-from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.tracking.reporting import mark_ready, report_tracks
+from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
 from saga_fg.tracking.update import update_tracks
-from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.track import Tracks
 
@@ -74,9 +74,8 @@ class Tracker:
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.observer = observer
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        self._clock_settings = replace(self.settings.clock, max_jump=self.max_jump)
         self._state = TrackerState(self.settings, self.rules, self.providers)
-        self._failed = False  # the latest step
+        self._last_step_failed = False
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far.
@@ -93,27 +92,30 @@ class Tracker:
         except BaseException as error:
             if self.providers and isinstance(error, ProviderError | UndeterminedError):  # tracks are not to blame
                 raise
-            again, self._failed = self._failed, isinstance(error, Exception)
-            if not (again and self._failed and len(self._state)):
+            failed_before, self._last_step_failed = self._last_step_failed, isinstance(error, Exception)
+            if not (failed_before and self._last_step_failed and len(self._state)):
                 raise
-            state = self._state.copied()
-            state.clear()
-            reported = self._step(state, frame)  # unless the frame is to blame
+            state, reported = self._step_without_tracks(frame)
             log.warning("tracks %s are deleted, they can't go on: %s", self._state.table.id.tolist(), error)
-        self._state, self._failed = state, False
+        self._state, self._last_step_failed = state, False
         return reported
+
+    def _step_without_tracks(self, frame: Frame) -> tuple[TrackerState, Tracks]:
+        """Take a frame into a copy of the state without its tracks; fails where the frame is to blame."""
+        state = self._state.copied()
+        state.clear()
+        return state, self._step(state, frame)
 
     def _step(self, state: TrackerState, frame: Frame) -> Tracks:
         """Take a frame into a state."""
         sensor = self.sensor(frame.sensor)
         timestamp = frame.timestamp + sensor.time_offset
-        if state.keep_time(timestamp, frame.sensor, self._clock_settings, self.max_delay):
-            state.assignment = self._take_in(state, frame, sensor, state.relative(timestamp))
-        else:
-            state.assignment = Assignment.empty()
+        if state.accept_time(timestamp, frame.sensor, self.max_jump, self.max_delay):
+            return self._process_frame(state, frame, sensor, state.relative(timestamp))
+        state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
 
-    def _take_in(self, state: TrackerState, frame: Frame, sensor: Sensor, time: float) -> Assignment:
+    def _process_frame(self, state: TrackerState, frame: Frame, sensor: Sensor, time: float) -> Tracks:
         """Predict to the `time` of a frame, s from the state's start, unless it is in the past, and use the frame."""
         if state.joint.empty:
             state.set_origin(frame)
@@ -152,12 +154,15 @@ class Tracker:
         state.joint.set_frame(None, state.origin)
         self._notify("initiate", state, frame.sensor, measurements, matching, rows)
         ids = np.concatenate([state.table.id[matching.track], state.table.id[len(state) - len(rows) :]])
+        state.assignment = Assignment(ids, measurements.row[np.concatenate([matching.detection, rows])])
 
         delete_tracks(state)
-        state.table.ready |= state.reported_kinematics().speed_deviation <= self.settings.report_speed_deviation_below
         self._notify("delete", state, frame.sensor, measurements, matching)
+
+        mark_ready(state)
+        reported = report_tracks(state, state.clock.newest)
         self._notify("report", state, frame.sensor, measurements, matching)
-        return Assignment(ids, measurements.row[np.concatenate([matching.detection, rows])])
+        return reported
 
     def _notify(self, stage: Stage, state: TrackerState, sensor: str, *results: Any) -> None:
         if self.observer is not None:
@@ -194,10 +199,6 @@ class Tracker:
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
         return sensor_model(self.sensors, name)
-
-    def class_settings(self, label: str) -> ClassSettings:
-        """The settings of a class."""
-        return class_settings(self.settings.classes, ClassSettings, label)
 
     @property
     def assignment(self) -> Assignment:
@@ -237,8 +238,8 @@ class Tracker:
     @property
     def max_jump(self) -> float:
         """Distance from the newest frame from which another has to be confirmed, s; tracks can outlive shorter ones."""
-        lives = [c.max_coasting for c in self.settings.classes.values() if math.isfinite(c.max_coasting)]
-        return max(self.settings.clock.max_jump, *lives, 0.0)
+        max_coastings = [c.max_coasting for c in self.settings.classes.values() if math.isfinite(c.max_coasting)]
+        return max(self.settings.clock.max_jump, *max_coastings, 0.0)
 
     @property
     def max_delay(self) -> float:

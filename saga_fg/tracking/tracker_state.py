@@ -1,6 +1,12 @@
 """All that a tracker knows at one time: the tracks, the map, the vehicle, traffic and the clock.
 
 The steps of `saga_fg.tracking.tracker` change a state; a copy goes its own way, and a snapshot is a plain value.
+Times, in s:
+
+    timestamp     of a frame, with the sensor's time offset; on the clock of the recording
+    time          the same from `start` on, as returned by `relative`
+    state.time    time of the estimates, that of the newest frame used
+    clock.newest  its timestamp, about start + state.time; frames before it are late
 """
 
 from __future__ import annotations
@@ -8,7 +14,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,7 +30,7 @@ from saga_fg.tracking.ego_node import EgoNode
 from saga_fg.tracking.joint_state import JointTrackState, new_estimator
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.map_nodes import MapNodes, motion_of
-from saga_fg.tracking.settings import ClassSettings, ClockSettings, TrackerSettings
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic_flow import TrafficFlowPrior
 from saga_fg.types.boxes import Boxes
@@ -146,12 +152,12 @@ class TrackerState:
             place = frame.detections.boxes.position[0, :2]
         self.origin = np.round(place)
 
-    def keep_time(self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float) -> bool:
-        """Judge the time of a frame, s; return whether it is to be used.
+    def accept_time(self, timestamp: float, sensor: str, max_jump: float, max_delay: float) -> bool:
+        """Judge the time of a frame, s; return whether it is to be used; `max_jump` in place of the clock's own.
 
         Where the clock was set back, all tracks are deleted; where it was set ahead, those that coast for too long.
         """
-        before = self.clock.newest
+        before, settings = self.clock.newest, replace(self.settings.clock, max_jump=max_jump)
         verdict, self.clock = self.clock.judged(timestamp, sensor, settings, max_delay)
         self.time_verdict = verdict
         if verdict in ("late", "unconfirmed"):

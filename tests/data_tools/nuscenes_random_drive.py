@@ -91,7 +91,7 @@ def _scene(
     tables["instance"] += [{"token": f"{scene}-i{n}", "category_token": kind} for n, kind in enumerate(kinds)]
     track = [f"t{n}" for n in range(objects)]
     level = rng.choice([0.3, 0.5, 0.7, 0.9], objects)
-    births, deaths = rng.integers(-3, samples // 2, objects), rng.integers(samples // 2, samples + 3, objects)
+    appearing, leaving = rng.integers(-3, samples // 2, objects), rng.integers(samples // 2, samples + 3, objects)
     for k, token in enumerate(tokens):
         at = {"token": token, "timestamp": int(times[k])}
         after = tokens[k + 1] if k + 1 < samples else ""
@@ -110,7 +110,7 @@ def _scene(
         position = position + 0.5 * speed
         results[token] = []
         for n, kind in enumerate(kinds):
-            if not births[n] <= k <= deaths[n] or (kind == "vehicle.truck" and k % 4 == 2):
+            if not appearing[n] <= k <= leaving[n] or (kind == "vehicle.truck" and k % 4 == 2):
                 continue  # a truck's annotations have gaps
             yaw = 0.1 * n
             shape = {"size": [2.0, 5.0, 2.0], "rotation": [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]}

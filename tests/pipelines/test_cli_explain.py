@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_life_of_a_track_is_told_from_birth_to_end(folder: Path, tmp_path: Path) -> None:
+def test_the_life_of_a_track_is_told_from_initiation_to_end(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "events.json"
     result = saga_fg("explain", folder / "tracks.csv", "--track", "b-2", "--json", file)
     assert result.exit_code == 0, result.output
@@ -128,7 +128,7 @@ def test_graphs_that_are_not_there(
 
 
 def test_a_graph_that_nobody_wrote(tmp_path: Path) -> None:
-    for broken in ({"nodes": 3, "factors": []}, {"nodes": [], "factors": [{"kind": "birth", "nodes": [4]}]}, {}):
+    for broken in ({"nodes": 3, "factors": []}, {"nodes": [], "factors": [{"kind": "initiation", "nodes": [4]}]}, {}):
         event = {"scene": "a", "event": "graph", "time": 1.0, "sensor": "lidar", **broken}
         (tmp_path / "t.csv.journal.jsonl").write_text(json.dumps(event) + "\n")
         done = saga_fg("explain", tmp_path / "t.csv", "--graph", "--output", tmp_path / "g.png")

@@ -89,3 +89,19 @@ def test_providers_have_settings_of_their_own() -> None:
 def test_settings_of_providers_that_make_no_sense(provider: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_settings(TrackConfig, f"tracker: {{estimator: isam2, providers: [{provider}]}}")
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("extrinsics: {x: .nan}", "sensors.lidar.extrinsics: x: expected a finite number, got nan"),
+        ("extrinsics: {yaw: .inf}", "sensors.lidar.extrinsics: yaw: expected a finite number, got inf"),
+        ("class_accuracy: .nan", "sensors.lidar: class_accuracy: expected a number from 0 to 1, got nan"),
+    ],
+)
+def test_a_sensor_that_is_not_finite_is_refused_with_file_and_key(tmp_path: Path, setting: str, message: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"sensors:\n  lidar:\n    {setting}\n")
+    with pytest.raises(InputError) as caught:
+        load_config("nuscenes", path)
+    assert str(caught.value) == f"{path}: {message}"

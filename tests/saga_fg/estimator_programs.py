@@ -72,7 +72,7 @@ class TextbookEstimator:
         self.x = Gaussian(np.concatenate([x.mean, np.ravel(means)]), P[P.shape[0] - len(P) :, : len(P)])
         self.keys += [int(node) for node in nodes]
         self.dims += [means.shape[1]] * len(nodes)
-        if self.predicted:  # births belong to the prior of their moment, which does not correlate them with the others
+        if self.predicted:  # new nodes belong to the prior of their moment, uncorrelated with the others
             old = self.predicted[-1]
             self.predicted[-1] = Gaussian(
                 np.concatenate([old.mean, np.ravel(means)]), scipy.linalg.block_diag(old.covariance, *covariances)
@@ -137,7 +137,7 @@ def random_covariance(rng, dim, deviation):
     return P * scale[:, None] * scale
 
 
-def births(rng, ids, node_type):
+def new_nodes(rng, ids, node_type):
     """Priors of new nodes, a few metres and metres per second uncertain."""
     d = node_type.dim
     covariances = np.stack([random_covariance(rng, d, 2.0) for _ in ids])
@@ -169,7 +169,7 @@ def sensor_says(rng, estimator, roster):
 def random_program(
     rng, moments=6, kinds=(CAR, BUS, TRAM, CONE), intervals=(0.02, 0.1, 0.37, 0.5, 1.2), max_rate=1.0, density=0.3
 ):
-    """Births, predictions with a graph that changes every time, updates by several sensors, misses and deaths.
+    """New nodes, predictions with a graph that changes every time, several sensors, misses and leaving nodes.
 
     Measurements scatter about what a textbook estimator that runs along expects, as those of a real sensor do.
     """
@@ -190,7 +190,7 @@ def random_program(
             if count:
                 ids = [int(next_id + 3 * k) for k in range(count)]
                 next_id += 3 * count
-                do(births(rng, ids, node_type))
+                do(new_nodes(rng, ids, node_type))
                 roster.update(dict.fromkeys(ids, node_type))
         for _ in range(int(rng.integers(0, 3))):
             for update in sensor_says(rng, along, roster):

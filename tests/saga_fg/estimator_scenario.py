@@ -81,7 +81,7 @@ class Step:
     """A moment of the textbook's record."""
 
     time: float
-    births: list = field(default_factory=list)
+    new_nodes: list = field(default_factory=list)
     seen: list = field(default_factory=list)
     gone: list = field(default_factory=list)
     transition: object = None
@@ -94,7 +94,7 @@ class Textbook:
         self.steps = [Step(0.0)]
 
     def add(self, nodes, means, covariances):
-        self.steps[-1].births.append((list(nodes), np.asarray(means), np.asarray(covariances)))
+        self.steps[-1].new_nodes.append((list(nodes), np.asarray(means), np.asarray(covariances)))
 
     def predict(self, transition):
         self.steps[-1].transition = transition
@@ -121,7 +121,7 @@ class Textbook:
         x, live, total = Gaussian(np.empty(0), np.empty((0, 0))), {}, 0.0
         filtered, predicted, transitions, places = [], [], [], []
         for k, step in enumerate(self.steps):
-            for nodes, means, covariances in step.births:
+            for nodes, means, covariances in step.new_nodes:
                 for node, mean, covariance in zip(nodes, means, covariances, strict=True):
                     live[node] = np.arange(len(x.mean), len(x.mean) + len(mean))
                     x = Gaussian(

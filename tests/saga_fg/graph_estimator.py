@@ -3,7 +3,7 @@
 import numpy as np
 
 from saga_fg.estimators import IncrementalSmoother
-from saga_fg.estimators.object_factors import Births, DetectionFactors, Interactions
+from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
 from saga_fg.graph import OBJECT, key_of
 
 
@@ -16,7 +16,7 @@ class GraphEstimator:
         self.nodes = []
 
     def add(self, nodes, means, covariances):
-        self.smoother.extend([Births(nodes, means, covariances)])
+        self.smoother.extend([NewObjects(nodes, means, covariances)])
         self.nodes += [int(node) for node in nodes]
 
     def predict(self, transition):

@@ -83,7 +83,7 @@ def crossing(closed):
 
 
 def road_program(rng, moments=6):
-    """What an estimator is told of `crossing`: births, changing edges, a sighting now and then, a cone that goes."""
+    """What an estimator is told of `crossing`: new nodes, changing edges, a sighting now and then, a cone that goes."""
     nodes = crossing(0.5)
     moving, standing = (np.flatnonzero([kind is which for kind in nodes.types]) for which in (CAR, STANDING))
     means = np.concatenate([nodes.position, nodes.velocity], axis=1)

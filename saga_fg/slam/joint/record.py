@@ -22,6 +22,7 @@ from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.tracking import Tracker
+from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.types.frame import Detections, Frame
 
@@ -121,7 +122,7 @@ class EpochRecorder:
     def _objects(self, seen: RecordedDetections, label: list[str]) -> RecordedObjects:
         for name in label:
             if name not in self._types:
-                motion = self._tracker.class_settings(name).motion
+                motion = motion_of(self._tracker.settings, name)
                 self._types[name] = NodeType(type(motion).__name__, motion)
         return RecordedObjects(seen.id, tuple(self._types[name] for name in label), tuple(label))
 

@@ -5,7 +5,7 @@ import pickle
 import gtsam
 import numpy as np
 import pytest
-from estimator_programs import TextbookEstimator, births, random_program, run
+from estimator_programs import TextbookEstimator, new_nodes, random_program, run
 from flocks import flock, prior_deviation
 from graph_keys import keys_of
 from hypothesis import given, settings
@@ -35,7 +35,7 @@ def test_components_no_larger_than_a_cluster_are_exact(seed):
     rng = np.random.default_rng(seed)
     bounded, exact = BoundedKalmanFilter(hops=4, core=5), JointKalmanFilter()
     for estimator in (bounded, exact):
-        births(np.random.default_rng(seed), list(range(60)), CAR).run(estimator)
+        new_nodes(np.random.default_rng(seed), list(range(60)), CAR).run(estimator)
     for _ in range(5):
         transition = discretise(platoons(rng, 12, 5), 0.3)
         seen = np.flatnonzero(rng.random(60) < 0.7)
@@ -152,7 +152,7 @@ def test_a_crossing_crowd_does_not_let_clusters_grow():
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 2), st.integers(1, 4), st.integers(0, 2), st.floats(0.05, 0.6))
 def test_covariances_are_positive_definite(seed, hops, core, patience, density):
-    """Births, deaths, misses, states of several sizes, graphs that change entirely from step to step."""
+    """New and leaving nodes, misses, states of several sizes, graphs that change entirely from step to step."""
     rng = np.random.default_rng(seed)
     estimator = BoundedKalmanFilter(hops=hops, core=core, patience=patience)
     for operation in random_program(rng, moments=6, density=density, max_rate=2.0):
@@ -198,7 +198,7 @@ def crowd(seed=0, n=14):
     estimator = BoundedKalmanFilter(hops=1, core=3)
     types = tuple((CAR, BUS, CAR, CONE)[k % 4] for k in range(n))
     for node, node_type in enumerate(types):
-        births(rng, [node], node_type).run(estimator)
+        new_nodes(rng, [node], node_type).run(estimator)
     for _ in range(3):
         estimator.predict(discretise(random_graph(rng, types, density=0.12), 0.3))
         estimator.update(measured([0, 2, 4]))
@@ -218,8 +218,8 @@ def test_bad_input_changes_nothing(name):
     call, error, _ = BAD[name]
     estimator = BoundedKalmanFilter(hops=1, core=2)
     rng = np.random.default_rng(0)
-    births(rng, [4, 7, 9, 15, 16], CAR).run(estimator)
-    births(rng, [8], BUS).run(estimator)
+    new_nodes(rng, [4, 7, 9, 15, 16], CAR).run(estimator)
+    new_nodes(rng, [8], BUS).run(estimator)
     types = (CAR, CAR, CAR, CAR, CAR, BUS)
     estimator.predict(discretise(random_graph(rng, types, [4, 7, 9, 15, 16, 8], 0.3), 0.4))
     state = estimator.snapshot()
@@ -266,7 +266,7 @@ def test_what_a_node_told_of_a_neighbour_in_another_cluster_stays_when_it_leaves
     left = []
     for told in (True, False):
         estimator = BoundedKalmanFilter(hops=1, core=1)
-        births(np.random.default_rng(1), list(range(12)), CAR).run(estimator)
+        new_nodes(np.random.default_rng(1), list(range(12)), CAR).run(estimator)
         estimator.predict(chain)
         if told:
             estimator.update(Measurements([0], np.ones((1, 4)), np.eye(4), 0.01 * np.eye(4)))

@@ -19,7 +19,7 @@ from estimator_programs import (
     Predict,
     TextbookEstimator,
     Update,
-    births,
+    new_nodes,
     random_program,
     run,
 )
@@ -112,7 +112,7 @@ def in_step(program, estimator, tolerance=TOLERANCE, textbook=None):
 
 @pytest.mark.parametrize("seed", range(25))
 def test_random_programs_agree_with_the_textbook(make, seed):
-    """Changing graphs of nodes of mixed sizes, several sensors, misses, births and deaths, irregular intervals."""
+    """Changing graphs of nodes of mixed sizes, several sensors, misses, new and leaving nodes, irregular intervals."""
     in_step(random_program(np.random.default_rng(seed), moments=7), make())
 
 
@@ -187,7 +187,7 @@ def test_numbers_without_a_digit_left_do_no_harm(make, seed):
     rng = np.random.default_rng(seed)
     estimator = make()
     nodes = np.arange(4)
-    births(rng, nodes.tolist(), CAR).run(estimator)
+    new_nodes(rng, nodes.tolist(), CAR).run(estimator)
     target, source = np.array([0, 1, 2, 3, 0, 1]), np.array([1, 0, 3, 2, 2, 3])
     apart = rng.normal(size=(6, 4, 4)) + np.eye(4)
     edges = Edges("repulsion", target, source, np.full(6, 0.05), apart, -apart[::-1], np.zeros((6, 4)))
@@ -202,7 +202,7 @@ def test_numbers_without_a_digit_left_do_no_harm(make, seed):
         assert np.array_equal(estimator.joint_mean(nodes), before[0])
         assert np.array_equal(estimator.joint_covariance(nodes), before[1])
     estimator.marginalise(nodes)
-    in_step([births(rng, [901, 902], CAR), Update(measured([901]))], estimator)
+    in_step([new_nodes(rng, [901, 902], CAR), Update(measured([901]))], estimator)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -334,14 +334,14 @@ def test_an_estimator_of_nothing(make):
 def test_a_node_that_left_may_come_back_as_a_new_one(make):
     rng = np.random.default_rng(5)
     program = [
-        births(rng, [1, 2], CAR),
+        new_nodes(rng, [1, 2], CAR),
         Predict(discretise(random_graph(rng, (CAR, CAR), [2, 1], 1.0), 0.5)),
         Marginalise(np.array([1])),
-        births(rng, [1], BUS),
+        new_nodes(rng, [1], BUS),
         Predict(discretise(random_graph(rng, (BUS, CAR), [1, 2], 1.0), 0.5)),
         Update(Measurements(np.array([1]), np.zeros((1, 2)), np.eye(2, 6), np.eye(2))),
         Marginalise(np.array([1, 2])),
-        births(rng, [2], TRAM),
+        new_nodes(rng, [2], TRAM),
     ]
     in_step(program, make())
 
@@ -349,8 +349,8 @@ def test_a_node_that_left_may_come_back_as_a_new_one(make):
 def test_all_nodes_may_leave(make):
     rng = np.random.default_rng(6)
     estimator = make()
-    in_step([births(rng, [1, 2], CAR), Marginalise(np.array([2, 1]))], estimator)
-    in_step([births(rng, [5], CONE), Update(Measurements([5], [[1.0, 2.0]], np.eye(2), np.eye(2)))], estimator)
+    in_step([new_nodes(rng, [1, 2], CAR), Marginalise(np.array([2, 1]))], estimator)
+    in_step([new_nodes(rng, [5], CONE), Update(Measurements([5], [[1.0, 2.0]], np.eye(2), np.eye(2)))], estimator)
 
 
 def test_what_a_node_told_of_its_neighbours_stays_when_it_leaves(make):
@@ -358,7 +358,7 @@ def test_what_a_node_told_of_its_neighbours_stays_when_it_leaves(make):
     rng = np.random.default_rng(7)
     told, untold = make(), make()
     for estimator in (told, untold):
-        births(np.random.default_rng(1), [1, 2], CAR).run(estimator)
+        new_nodes(np.random.default_rng(1), [1, 2], CAR).run(estimator)
         graph = random_graph(np.random.default_rng(2), (CAR, CAR), [1, 2], 1.0)
         Predict(discretise(graph, 1.0)).run(estimator)
     told.update(Measurements([1], rng.normal(size=(1, 4)), np.eye(4), 0.01 * np.eye(4)))
@@ -461,7 +461,7 @@ def filled(make):
     rng = np.random.default_rng(0)
     estimator = make()
     for node, node_type in zip(IDS, MIXED, strict=True):
-        births(rng, [node], node_type).run(estimator)
+        new_nodes(rng, [node], node_type).run(estimator)
     estimator.predict(discretise(random_graph(rng, MIXED, IDS, 0.7), 0.4))
     estimator.update(Measurements([4, 16], rng.normal(size=(2, 2)), np.eye(2, 4), 0.2 * np.eye(2)))
     return estimator
@@ -477,21 +477,45 @@ def measured(nodes, d=4, **columns):
     return Measurements(**({"nodes": nodes, "z": np.zeros((m, 2)), "H": np.eye(2, d), "R": np.eye(2)} | columns))
 
 
-def born(nodes, d=4, mean=0.0, P=None):
+def added(nodes, d=4, mean=0.0, P=None):
     P = np.eye(d) if P is None else np.asarray(P)
     return nodes, np.full((len(nodes), d), mean), np.tile(P, (len(nodes), 1, 1))
 
 
 BAD = {
-    "add: known already": (lambda e: e.add(*born([5, 8])), InputError, "node 8 is in the estimator already"),
-    "add: twice in one call": (lambda e: e.add(*born([5, 5])), InputError, "nodes: expected unique ids, 5 occurs more"),
-    "add: NaN mean": (lambda e: e.add(*born([5], mean=np.nan)), InputError, r"means\[0, 0\]: expected a finite number"),
-    "add: infinite mean": (lambda e: e.add(*born([5], mean=np.inf)), InputError, "means.*expected a finite number"),
-    "add: NaN covariance": (lambda e: e.add(*born([5], P=np.full((4, 4), np.nan))), InputError, "covariances.*finite"),
-    "add: singular covariance": (lambda e: e.add(*born([5], P=np.zeros((4, 4)))), InputError, "positive definite"),
-    "add: indefinite covariance": (lambda e: e.add(*born([5], P=-np.eye(4))), InputError, "positive definite"),
+    "add: known already": (lambda e: e.add(*added([5, 8])), InputError, "node 8 is in the estimator already"),
+    "add: twice in one call": (
+        lambda e: e.add(*added([5, 5])),
+        InputError,
+        "nodes: expected unique ids, 5 occurs more",
+    ),
+    "add: NaN mean": (
+        lambda e: e.add(*added([5], mean=np.nan)),
+        InputError,
+        r"means\[0, 0\]: expected a finite number",
+    ),
+    "add: infinite mean": (
+        lambda e: e.add(*added([5], mean=np.inf)),
+        InputError,
+        "means.*expected a finite number",
+    ),
+    "add: NaN covariance": (
+        lambda e: e.add(*added([5], P=np.full((4, 4), np.nan))),
+        InputError,
+        "covariances.*finite",
+    ),
+    "add: singular covariance": (
+        lambda e: e.add(*added([5], P=np.zeros((4, 4)))),
+        InputError,
+        "positive definite",
+    ),
+    "add: indefinite covariance": (
+        lambda e: e.add(*added([5], P=-np.eye(4))),
+        InputError,
+        "positive definite",
+    ),
     "add: asymmetric covariance": (
-        lambda e: e.add(*born([5], P=np.eye(4) + np.eye(4, k=1))),
+        lambda e: e.add(*added([5], P=np.eye(4) + np.eye(4, k=1))),
         InputError,
         r"covariances\[0\]: expected a symmetric matrix",
     ),
@@ -501,9 +525,21 @@ BAD = {
         r"covariances: expected shape \(1, 4, 4\), got \(1, 6, 6\)",
     ),
     "add: flat mean": (lambda e: e.add([5], np.zeros(4), np.eye(4)[None]), InputError, "means: expected shape"),
-    "add: too few means": (lambda e: e.add(*born([5])[:1], *born([5, 6])[1:]), InputError, "means: expected shape"),
-    "add: ids that are no integers": (lambda e: e.add([5.5], *born([5])[1:]), InputError, "nodes: expected a list of"),
-    "add: ids that are no list": (lambda e: e.add(5, *born([5])[1:]), InputError, "nodes: expected a list of integers"),
+    "add: too few means": (
+        lambda e: e.add(*added([5])[:1], *added([5, 6])[1:]),
+        InputError,
+        "means: expected shape",
+    ),
+    "add: ids that are no integers": (
+        lambda e: e.add([5.5], *added([5])[1:]),
+        InputError,
+        "nodes: expected a list of",
+    ),
+    "add: ids that are no list": (
+        lambda e: e.add(5, *added([5])[1:]),
+        InputError,
+        "nodes: expected a list of integers",
+    ),
     "predict: a node missing": (lambda e: e.predict(transition([4, 8, 15])), InputError, "expected 4 nodes, got 3"),
     "predict: an unknown node": (
         lambda e: e.predict(transition([4, 8, 15, 99])),
@@ -596,7 +632,7 @@ def test_bad_input_ends_in_one_exception_and_changes_nothing(make, name):
     assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
     assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
     for either in (estimator, untouched):
-        births(np.random.default_rng(3), [23], TRAM).run(either)
+        new_nodes(np.random.default_rng(3), [23], TRAM).run(either)
         either.predict(discretise(random_graph(np.random.default_rng(4), (*MIXED, TRAM), [*IDS, 23], 0.5), 0.2))
         either.update(measured([4, 16]))
         either.marginalise([8])

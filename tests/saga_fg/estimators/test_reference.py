@@ -1,6 +1,6 @@
 """The textbook against something plainer still: one Gaussian over the states of all times, conditioned at once.
 
-Stacked over all times, x = M w with w = (births, process noises) independent, so that x ~ N(m, M W M^T) and
+Stacked over all times, x = M w with w = (initial states, process noises) independent, so that x ~ N(m, M W M^T) and
 z = H x + v give the posterior of the whole trajectory, and the likelihood of all measurements, by one formula each.
 """
 
@@ -16,7 +16,7 @@ from saga_fg.estimators import Gaussian, kalman_predict, kalman_update, rts_smoo
 
 
 class Step(NamedTuple):
-    """One step: x <- F x + b + q with F (D_k+1, D_k), births in the rows of zeros; then z = H x + v."""
+    """One step: x <- F x + b + q with F (D_k+1, D_k), new nodes in the rows of zeros; then z = H x + v."""
 
     F: np.ndarray
     b: np.ndarray
@@ -36,9 +36,9 @@ def problem(rng, steps=5):
     alive, recorded = 2, []
     for k in range(steps):
         dead = int(rng.integers(0, 2)) if k and alive > 1 else 0
-        born = int(rng.integers(0, 2)) if k else alive
+        new = int(rng.integers(0, 2)) if k else alive
         stay = alive - dead if k else 0
-        before, after = 2 * alive if k else 0, 2 * (stay + born)
+        before, after = 2 * alive if k else 0, 2 * (stay + new)
         F, b, Q = np.zeros((after, before)), np.zeros(after), np.zeros((after, after))
         old = 2 * stay
         F[:old, :old] = np.eye(old) + 0.3 * rng.normal(size=(old, old))
@@ -50,7 +50,7 @@ def problem(rng, steps=5):
         m = int(rng.integers(0, 4))
         H, R = rng.normal(size=(m, after)), covariance(rng, m, 0.5)
         recorded.append(Step(F, b, Q, rng.normal(size=m), H, R))
-        alive = stay + born
+        alive = stay + new
     return recorded
 
 
@@ -107,7 +107,7 @@ def test_filter_smoother_and_likelihood_are_those_of_the_whole_trajectory(seed):
         assert np.allclose(filtered[k].mean, up_to_now[start[k] :], rtol=1e-7, atol=1e-8)
 
 
-def test_the_problems_have_births_and_deaths():
+def test_the_problems_have_new_and_leaving_nodes():
     shapes = {s.F.shape for seed in range(20) for s in problem(np.random.default_rng(seed))[1:]}
     assert any(rows > columns for rows, columns in shapes)
     assert any(rows < columns for rows, columns in shapes)

@@ -70,7 +70,7 @@ def test_a_queue_is_the_same_in_every_order(order):
 @pytest.mark.parametrize("kinds", [(CAR, CONE), (CAR, BUS, TRAM, CONE), (CAR, POLE)])
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_happens_the_answer_is_the_same(order, kinds, seed):
-    """Births, deaths, mixed sizes; noise without variance and badly scaled noise fall back on the order of time."""
+    """New and leaving nodes, mixed sizes; zero-variance and badly scaled noise fall back on the order of time."""
     calls = random_scenario(np.random.default_rng(seed), frames=8, kinds=kinds, density=0.15).calls
     sparse, in_time = BatchSmoother(likelihoods=False, order=order), BatchSmoother(order="time")
     for estimator in (sparse, in_time):

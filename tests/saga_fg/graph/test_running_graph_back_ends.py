@@ -80,7 +80,7 @@ class Surroundings:
 @pytest.mark.parametrize("name", ["isam2", "fixed-lag"])
 @pytest.mark.parametrize("seed", range(5))
 def test_linear_factors_of_providers_lead_to_one_estimate(seed, name):
-    """Objects, the vehicle and a landmark: births, deaths, factors that couple components, in changing graphs."""
+    """Objects, the vehicle and a landmark: new and leaving nodes, factors that couple components."""
     told = [Surroundings(), Surroundings()]
     kalman, other = JointKalmanFilter(told[:1]), BACK_ENDS[name](told[1:])
     apart = TextbookEstimator()

@@ -56,7 +56,7 @@ def apart(one, other):
 
 
 def driven(estimator, scene):
-    for moment in scene.moments:
+    for moment in scene.frames:
         estimator.step(moment.time)
     return estimator
 
@@ -93,7 +93,7 @@ def test_graduated_non_convexity_does_not_care_for_outliers(seed, loss):
     rng = np.random.default_rng(seed)
     clean = sample_traffic(rng, frames=8, cars=3, pedestrians=2)
     spoilt, wrong = copy.deepcopy(clean), 0
-    for moment, without in zip(spoilt.moments, clean.moments, strict=True):
+    for moment, without in zip(spoilt.frames, clean.frames, strict=True):
         for node in list(without.seen):
             if rng.random() < (0.2 if loss == "truncated" else 0.1):
                 moment.seen[node] = moment.seen[node] + [rng.uniform(3, 8), rng.choice([-0.3, 0.3])]
@@ -178,7 +178,7 @@ class Curious:
 def test_a_provider_sees_what_was_known_before_its_epoch():
     scene, curious = sample_traffic(np.random.default_rng(4), frames=5), Curious()
     estimators = [make([*providers(scene), curious]) for make in (BatchSolver, lambda p: IncrementalSmoother(p, None))]
-    for k, moment in enumerate(scene.moments):
+    for k, moment in enumerate(scene.frames):
         answers = []
         for estimator in estimators:
             curious.known, curious.fails = [], k == 3

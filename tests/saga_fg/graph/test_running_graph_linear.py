@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from estimator_programs import Predict, TextbookEstimator, Update, births, random_program
+from estimator_programs import Predict, TextbookEstimator, Update, new_nodes, random_program
 from graph_estimator import GraphEstimator
 from random_graphs import CAR, CONE, random_graph
 
@@ -37,7 +37,7 @@ def largest_errors(program, estimator):
 @pytest.mark.parametrize("lag", LAGS)
 @pytest.mark.parametrize("seed", range(10))
 def test_random_programs_agree_with_the_textbook(seed, lag):
-    """Births, deaths, misses, several sensors, graphs that change, nodes of four kinds."""
+    """New and leaving nodes, misses, several sensors, graphs that change, nodes of four kinds."""
     mean, joint, single = largest_errors(
         random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), GraphEstimator(lag)
     )
@@ -64,7 +64,7 @@ def test_a_long_program_does_not_drift_away():
 def test_many_nodes_that_hang_together():
     """Eliminated by Cholesky, which keeps half the digits."""
     rng, ids = np.random.default_rng(5), list(range(25))
-    program = [births(rng, ids, CAR)]
+    program = [new_nodes(rng, ids, CAR)]
     for _ in range(5):
         seen = np.array(ids)[rng.random(25) < 0.6]
         measured = Measurements(seen, 10 * rng.normal(size=(len(seen), 2)), np.eye(2, 4), 0.2 * np.eye(2))

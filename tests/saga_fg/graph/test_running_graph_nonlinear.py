@@ -36,7 +36,7 @@ def off(smoother, values):
 def test_every_frame_equals_levenberg_marquardt_on_everything(seed):
     scene = sample_traffic(np.random.default_rng(seed), frames=7, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=None)
-    for moment in scene.moments:
+    for moment in scene.frames:
         smoother.step(moment.time)
         whole = smoother.graph().copy()
         whole.moved_to(whole.base)  # where everything was first put
@@ -48,7 +48,7 @@ def test_every_frame_equals_levenberg_marquardt_on_everything(seed):
 def test_gtsams_own_solver_finds_the_same():
     scene = sample_traffic(np.random.default_rng(0), frames=7, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=None)
-    for moment in scene.moments:
+    for moment in scene.frames:
         smoother.step(moment.time)
     graph, parameters = smoother.graph(), gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-12)
@@ -62,12 +62,12 @@ def test_robust_losses_are_weighted_anew(seed):
     """A tenth of the detections far off; iteratively reweighted least squares comes nearer by a factor a time."""
     rng = np.random.default_rng(seed)
     scene = sample_traffic(rng, frames=5, cars=3, pedestrians=2)
-    for moment in scene.moments:
+    for moment in scene.frames:
         for node in moment.seen:
             if rng.random() < 0.1:
                 moment.seen[node] = moment.seen[node] + np.array([4.0, 0.2])
     robust, plain = (IncrementalSmoother(providers(scene, loss), lag=None) for loss in (Robust("cauchy", 2.0), None))
-    for moment in scene.moments:
+    for moment in scene.frames:
         robust.step(moment.time)
         plain.step(moment.time)
         assert off(robust, robust.graph().copy().solve(EXACT).values) < 3e-3
@@ -81,9 +81,9 @@ def test_with_a_lag_errors_are_as_large_as_their_covariance_says(lag):
     for seed in range(30):
         scene = sample_traffic(np.random.default_rng(1000 + seed), frames=10, cars=3, pedestrians=2)
         smoother = IncrementalSmoother(providers(scene), lag=lag)
-        for moment in scene.moments:
+        for moment in scene.frames:
             smoother.step(moment.time)
-        last, graph = scene.moments[-1], smoother.graph()
+        last, graph = scene.frames[-1], smoother.graph()
         keys = [variable.key for kind in (EGO_POSE, OBJECT) for variable in graph.of(kind, graph.epoch).values()]
         truth = {OBJECT: last.states, EGO_POSE: {0: last.pose}}
         errors = []
@@ -98,10 +98,10 @@ def test_with_a_lag_errors_are_as_large_as_their_covariance_says(lag):
 
 @pytest.mark.parametrize("lag", [0.0, 0.5])
 def test_the_graph_stays_as_large_as_the_lag(lag):
-    """Factors and variables, those that iSAM2 holds among them, over 120 frames with births and deaths."""
+    """Factors and variables, those that iSAM2 holds among them, over 120 frames with new and leaving nodes."""
     scene = sample_traffic(np.random.default_rng(7), frames=120, cars=3, pedestrians=3, intervals=(0.1,))
     smoother, sizes = IncrementalSmoother(providers(scene), lag, RelinearisationSettings(threshold=0.1)), []
-    for moment in scene.moments:
+    for moment in scene.frames:
         smoother.step(moment.time)
         graph = smoother.graph()
         held = smoother._engine.isam.getFactorsUnsafe().size()
@@ -119,7 +119,7 @@ def test_what_goes_in_acts():
 
     def newest(made):
         smoother = IncrementalSmoother(made)
-        for moment in scene.moments:
+        for moment in scene.frames:
             smoother.step(moment.time)
         return {one.id: smoother.state(one.key) for one in smoother.graph().of(OBJECT, 7).values()}
 

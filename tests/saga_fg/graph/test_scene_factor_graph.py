@@ -62,7 +62,7 @@ def test_keys_in_words_and_those_that_are_none():
 def driven(lag=None, frames=6, seed=2):
     scene = sample_traffic(np.random.default_rng(seed), frames=frames, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=lag)
-    for moment in scene.moments[:-1]:
+    for moment in scene.frames[:-1]:
         smoother.step(moment.time)
     return scene, smoother
 
@@ -73,7 +73,7 @@ def test_a_pickled_graph_goes_on_as_the_smoother_itself(lag):
     again = IncrementalSmoother(providers(scene), lag=lag)
     again.restore(pickle.loads(pickle.dumps(smoother.snapshot())))
     for one in (smoother, again):
-        one.step(scene.moments[-1].time)
+        one.step(scene.frames[-1].time)
     assert again.graph().variables.keys() == smoother.graph().variables.keys()
     for key, variable in smoother.graph().variables.items():
         P = smoother.covariance(key)
@@ -88,7 +88,7 @@ def test_a_snapshot_does_not_change_when_the_smoother_goes_on():
     key = next(key for key, one in snapshot.variables.items() if one.kind == EGO_POSE)
     names, pose = [str(factor) for factor in snapshot.factors()], snapshot.state(key)
     P = solution.covariance([key])
-    smoother.step(scene.moments[-1].time)
+    smoother.step(scene.frames[-1].time)
     assert [str(factor) for factor in snapshot.factors()] == names
     assert snapshot.state(key).equals(pose, 0.0)
     np.testing.assert_array_equal(solution.covariance([key]), P)
@@ -206,7 +206,7 @@ def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
     scene = sample_traffic(np.random.default_rng(2), frames=6, cars=3, pedestrians=2)
     once = IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e9))
     _, smoother = driven()
-    for moment in scene.moments[:-1]:
+    for moment in scene.frames[:-1]:
         once.step(moment.time)
     off = [
         np.abs(one.type.local(smoother.state(key), once.state(key)) / np.sqrt(np.diag(smoother.covariance(key)))).max()
@@ -218,7 +218,7 @@ def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
 def test_noise_of_a_millisecond_is_noise(one_bus_for_a_millisecond):
     """That of constant acceleration falls with the fifth power of the interval, but no direction is without."""
     kinds = [factor.provider for factor in one_bus_for_a_millisecond.graph().factors()]
-    assert sorted(kinds) == ["births", "interactions"]
+    assert sorted(kinds) == ["interactions", "new objects"]
 
 
 @pytest.fixture

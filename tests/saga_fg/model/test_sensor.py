@@ -131,3 +131,16 @@ def test_a_rear_sensor_sees_across_the_seam():
 def test_all_round_means_all_round():
     around = 20 * np.stack([np.cos(np.linspace(-4, 4, 50)), np.sin(np.linspace(-4, 4, 50))], axis=-1)
     assert Sensor().sees(around, np.eye(4)).all()
+
+
+@pytest.mark.parametrize("key", ["x", "y", "z", "yaw"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_extrinsics_are_finite(key, value):
+    with pytest.raises(InputError, match=f"^{key}: expected a finite number, got"):
+        Extrinsics(**{key: value})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.1, 0.0, 1.0, 1.1])
+def test_the_accuracy_of_classes_is_a_probability_inside_0_to_1(value):
+    with pytest.raises(InputError, match=r"^class_accuracy: expected"):
+        Sensor(class_accuracy=value)

@@ -89,7 +89,7 @@ def test_what_moves_otherwise_or_comes_too_late_is_new() -> None:
     assert joined(paths, StitchingSettings(max_gap=1.0)) == {0: 0, 1: 1}
 
 
-def test_an_object_claims_detections_before_its_birth_but_not_those_of_others() -> None:
+def test_an_object_claims_detections_before_its_initiation_but_not_those_of_others() -> None:
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (5, 0)), 1: line(0, 19, (0, 20), (5, 0))})
     tracked = np.where(evidence.moment < 2, -1, numbers)
     lifespans = lifespans_of(tracked, evidence.boxes.label, evidence.moment)

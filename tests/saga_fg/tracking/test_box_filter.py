@@ -12,7 +12,7 @@ NAN = float("nan")
 angles = st.floats(-3.1, 3.1)
 
 
-def born(size=(4.0, 2.0, 1.5), weight=0.5, z=1.0, z_noise=0.2, yaw=0.0, yaw_noise=0.3):
+def new_box(size=(4.0, 2.0, 1.5), weight=0.5, z=1.0, z_noise=0.2, yaw=0.0, yaw_noise=0.3):
     return BoxFilter.initiated(
         np.array([size]), np.array([weight]), np.array([z]), np.array([z_noise]), np.array([yaw]), np.array([yaw_noise])
     )
@@ -33,14 +33,14 @@ def update(box, size=(4.0, 2.0, 1.5), weight=0.5, z=1.0, z_noise=0.2, yaw=NAN, y
 def test_size_is_the_mean_weighted_by_probability():
     sizes = np.array([[4.0, 2.0, 1.5], [5.0, 2.2, 1.4], [4.4, 1.8, 1.7]])
     weights = np.array([0.5, 0.9, 0.2])
-    box = born(sizes[0], weights[0])
+    box = new_box(sizes[0], weights[0])
     for size, weight in zip(sizes[1:], weights[1:], strict=True):
         update(box, size, weight)
     assert box.size[0] == pytest.approx(np.average(sizes, axis=0, weights=weights))
 
 
 def test_the_mean_forgets_after_many_detections():
-    box = born(size=(1.0, 1.0, 1.0))
+    box = new_box(size=(1.0, 1.0, 1.0))
     for _ in range(200):
         update(box, size=(4.0, 2.0, 1.5))
     for _ in range(200):
@@ -49,7 +49,7 @@ def test_the_mean_forgets_after_many_detections():
 
 
 def test_an_unknown_size_counts_for_nothing():
-    box = born(size=(NAN, NAN, NAN), weight=0.9)
+    box = new_box(size=(NAN, NAN, NAN), weight=0.9)
     assert np.isnan(box.size).all()
     update(box, size=(NAN, NAN, NAN), weight=0.9)
     update(box, size=(4.0, 2.0, 1.5), weight=0.5)
@@ -61,7 +61,7 @@ def test_an_unknown_size_counts_for_nothing():
 
 
 def test_height_is_a_scalar_kalman_filter():
-    box = born(z=1.0, z_noise=0.2)
+    box = new_box(z=1.0, z_noise=0.2)
     box.predict(0.5, np.array([0.0]))
     prior = 0.2**2 + HEIGHT_DRIFT**2 * 0.5
     assert box.z_variance[0] == pytest.approx(prior)
@@ -73,14 +73,14 @@ def test_height_is_a_scalar_kalman_filter():
 
 @given(angles, st.floats(-1.5, 1.5), st.sampled_from([0.0, np.pi, -np.pi, 2 * np.pi]))
 def test_a_heading_half_a_turn_off_is_turned_to_the_side_of_the_estimate(yaw, difference, flip):
-    box = born(yaw=yaw, yaw_noise=0.3)
+    box = new_box(yaw=yaw, yaw_noise=0.3)
     update(box, yaw=float(wrap_angle(yaw + difference + flip)), yaw_noise=0.3)
     assert float(wrap_angle(box.yaw[0] - (yaw + difference / 2))) == pytest.approx(0, abs=1e-9)
     assert box.yaw_variance[0] == pytest.approx(0.3**2 / 2)
 
 
 def test_an_unknown_heading_stays_unknown_until_measured():
-    box = born(yaw=NAN, yaw_noise=np.pi)
+    box = new_box(yaw=NAN, yaw_noise=np.pi)
     update(box, yaw=NAN)
     box.face_motion(np.array([[5.0, 0.0]]))
     assert np.isnan(box.yaw).all()
@@ -92,7 +92,7 @@ def test_an_unknown_heading_stays_unknown_until_measured():
 
 
 def test_headings_face_a_clear_motion():
-    box = born(yaw=0.3)
+    box = new_box(yaw=0.3)
     for velocity, yaw in (
         ((-1.0, 0.0), 0.3),
         ((0.0, -5.0), 0.3),
@@ -104,7 +104,7 @@ def test_headings_face_a_clear_motion():
 
 
 def test_only_hidden_headings_turn_with_the_predicted_course():
-    box = born(yaw=0.1).extended(born(yaw=0.1)).extended(born(yaw=0.1))
+    box = new_box(yaw=0.1).extended(new_box(yaw=0.1)).extended(new_box(yaw=0.1))
     before = np.array([[5.0, 0.0], [5.0, 0.0], [0.5, 0.0]])  # the last one all but stands
     after = np.stack([before[:, 0] * np.cos(0.2), before[:, 0] * np.sin(0.2)], axis=-1)
     box.turn_with(before, after, np.array([True, False, True]))
@@ -112,13 +112,13 @@ def test_only_hidden_headings_turn_with_the_predicted_course():
 
 
 def test_the_heading_drifts():
-    box = born(yaw_noise=0.3)
+    box = new_box(yaw_noise=0.3)
     box.predict(2.0, np.array([0.5]))
     assert box.yaw_variance[0] == pytest.approx(0.3**2 + 0.5**2 * 2.0)
 
 
 def test_only_the_rows_named_are_touched():
-    box = born().extended(born(z=3.0)).extended(born(yaw=1.0))
+    box = new_box().extended(new_box(z=3.0)).extended(new_box(yaw=1.0))
     update(box, size=(9.0, 9.0, 9.0), z=5.0, yaw=0.2, row=1)
     assert box.size[[0, 2]].tolist() == [[4.0, 2.0, 1.5]] * 2
     assert box.z[[0, 2]].tolist() == [1.0, 1.0]
@@ -129,7 +129,7 @@ def test_only_the_rows_named_are_touched():
 
 
 def test_the_front_is_where_most_detections_say_it_is():
-    box = born(yaw=3.0, weight=0.9)  # the first one is wrong
+    box = new_box(yaw=3.0, weight=0.9)  # the first one is wrong
     update(box, yaw=3.0 - np.pi, weight=0.8)
     assert float(wrap_angle(box.yaw[0] - 3.0)) == pytest.approx(0, abs=1e-9)
     update(box, yaw=3.0 - np.pi, weight=0.8)
@@ -141,7 +141,7 @@ def test_the_front_is_where_most_detections_say_it_is():
 
 
 def test_a_clear_motion_outvotes_the_detections():
-    box = born(yaw=0.0, weight=0.9)
+    box = new_box(yaw=0.0, weight=0.9)
     box.face_motion(np.array([[-5.0, 0.0]]))
     update(box, yaw=0.0, weight=0.9)
     assert abs(float(wrap_angle(box.yaw[0]))) == pytest.approx(np.pi)

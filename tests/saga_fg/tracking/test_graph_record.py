@@ -28,7 +28,7 @@ class Wall:
 
 
 def graphs(settings=None, tracker_providers=()):
-    """Of three cars in a row from 100 m on; the third is born with the third frame."""
+    """Of three cars in a row from 100 m on; the third is initiated with the third frame."""
     events, settings = [], settings or TrackerSettings(edges=RULES)
     tracker = Tracker(settings, observer=Journal(settings, events.append), providers=tracker_providers)
     for k in range(4):
@@ -45,9 +45,9 @@ def named(graph, kind):
 
 def test_a_tracker_tells_the_graph_of_every_frame():
     first, _, third, last = graphs()
-    assert named(first, "birth") == [["car 1 at 0.00 s"], ["car 2 at 0.00 s"]]
+    assert named(first, "initiation") == [["car 1 at 0.00 s"], ["car 2 at 0.00 s"]]
     assert named(first, "interaction") == []
-    assert named(third, "birth") == [["car 3 at 0.20 s"]]
+    assert named(third, "initiation") == [["car 3 at 0.20 s"]]
     assert named(third, "detection") == [["car 1 at 0.20 s"], ["car 2 at 0.20 s"]]
     interactions = {nodes[0]: nodes[1:] for nodes in named(last, "interaction")}
     assert interactions["car 2 at 0.30 s"] == ["car 2 at 0.20 s", "car 1 at 0.20 s"]
@@ -72,7 +72,7 @@ def test_factors_of_users_are_in_it_under_their_names():
 def test_any_running_graph_is_listed_factor_for_factor():
     scene = sample_traffic(np.random.default_rng(0), frames=4, intervals=(0.5,))
     smoother, record = IncrementalSmoother(providers(scene), lag=None), GraphRecord()
-    for moment in scene.moments:
+    for moment in scene.frames:
         smoother.step(moment.time)
     graph = smoother.graph()
     record.add(graph, origin=(10.0, 20.0), covariance=smoother.covariance)

@@ -44,7 +44,7 @@ def tracker(estimator="kalman", sensors=SENSORS):
     return Tracker(TrackerSettings(estimator=estimator), sensors)
 
 
-def test_a_birth_takes_the_component_along_the_line_of_sight():
+def test_a_new_track_takes_the_component_along_the_line_of_sight():
     tracks = tracker().step(radar_frame(0.0, [(30, 40)], [10.0]))
     sight = np.array([0.6, 0.8])
     assert tracks.boxes.velocity[0] == pytest.approx(10.0 * sight, abs=0.05)

@@ -24,7 +24,7 @@ def test_the_error_that_all_detections_share_is_along_the_heading_and_not_filter
     assert added == pytest.approx(np.diag([0.0, (0.3 * (1 + 2.0 * 0.1)) ** 2]), abs=1e-6)
 
 
-def test_a_shared_error_of_unknown_direction_is_the_same_in_all():
+def test_a_bias_of_unknown_direction_is_the_same_in_all():
     plain, car = told(NoiseModel(position_bias=0.3), yaw=NAN)
     assert car.position_covariance[0] - plain.position_covariance[0] == pytest.approx(0.045 * np.eye(2))
 

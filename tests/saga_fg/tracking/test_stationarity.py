@@ -127,7 +127,7 @@ def test_snapshots_and_looking_ahead_keep_the_belief():
         assert columns(tracker.step(f)) == columns(other.step(f))
 
 
-def test_a_measured_velocity_at_birth_is_believed():
+def test_a_measured_velocity_of_a_new_track_is_believed():
     fast = frame(0.0, [(0.0, 0.0)], velocity=(12.0, 0.0))
     tracks = Tracker(SETTINGS, {"default": Sensor()}).step(fast)
     assert tracks.boxes.velocity[0] == pytest.approx([12.0, 0.0], abs=0.05)

@@ -1,4 +1,4 @@
-"""The tracker: one object followed, births, coasting and deaths, coordinates, classes."""
+"""The tracker: one object followed, initiation, coasting and deletion, coordinates, classes."""
 
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def test_an_unmeasured_velocity_is_unknown_along_the_heading_and_small_across():
     assert unknown == pytest.approx(25.0 * np.eye(2))
 
 
-# births, coasting, deaths
+# initiation, coasting, deletion
 
 
 def test_tracks_are_born_where_no_track_explains_a_detection():
@@ -340,9 +340,9 @@ def test_the_tracker_tells_which_detection_went_where():
         return dict(zip(tracker.assignment.detection.tolist(), tracker.assignment.id.tolist(), strict=True))
 
     tracker = Tracker(settings(initiation_score=0.5, min_score=0.1))
-    born = told(0.0, ((0, 0), 0.05), ((9, 0), 0.9), ((0, 9), 0.9))
-    assert born.keys() == {1, 2}  # the first is too weak for anything
+    initiated = told(0.0, ((0, 0), 0.05), ((9, 0), 0.9), ((0, 9), 0.9))
+    assert initiated.keys() == {1, 2}  # the first is too weak for anything
     later = told(0.1, ((0, 9.1), 0.9), ((50, 0), 0.9), ((9.1, 0), 0.9))
-    assert (later[0], later[2]) == (born[2], born[1])
-    assert later[1] not in born.values()
+    assert (later[0], later[2]) == (initiated[2], initiated[1])
+    assert later[1] not in initiated.values()
     assert told(0.2) == {}

@@ -51,7 +51,7 @@ def agree(first, second, tolerance):
 @pytest.mark.parametrize("estimator", ESTIMATORS[1:])
 @pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
 def test_every_estimator_gives_the_same_tracks(estimator, edges):
-    """Births, a death, two sensors, two motion models, frames a little late but none by more than the filters take."""
+    """New tracks, a deletion, two sensors, two motion models, frames as late as the filters take."""
     in_order, _ = traffic(0)
     reference, other = tracker(edges=edges), tracker(estimator, edges=edges)
     for f in in_order:
