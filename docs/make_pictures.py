@@ -49,7 +49,7 @@ def main() -> None:
         run = run_joint(simulate_scene(street(), 0), load_config("simulated"), JointSettings(), "lidar", 0)
         write_joint(Path(folder) / "joint", run)
         shutil.copy(Path(folder) / "joint" / "above.png", HERE / "joint_above.png")
-        scans = SimulatedScans(seed=0, count=40, kerbs=True)
+        scans = SimulatedScans(seed=0, count=40, curbs=True)
         write_lidar_slam(Path(folder) / "slam", lidar_slam(scans), scans)
         shutil.copy(Path(folder) / "slam" / "above.png", HERE / "slam_above.png")
 

@@ -27,7 +27,7 @@ from saga_fg.types.boxes import Boxes
 class StaticWorld:
     """Static objects on the level ground z = 0, in world coordinates.
 
-    boxes  walls, houses, parked vehicles, kerbs
+    boxes  walls, houses, parked vehicles, curbs
     poles  (M, 4) x, y, radius, height, m; upright cylinders from the ground
     """
 

@@ -86,7 +86,9 @@ class Mixture(Settings):
         5.0, "mean time in a mode before a change to another one, s; usual 2 to 10; higher: rarer changes"
     )
     unused_deviation: Positive = setting(
-        0.3, "standard deviation of a component while its mode does not use it, such as a turn rate, in its unit"
+        0.3,
+        "standard deviation of a component while its mode does not use it, such as a turn rate, in its "
+        "unit; higher: freer when the mode changes to one that does",
     )
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from data_tools.lidar import read_scan
-from data_tools.simulator.street import KERB, SimulatedScans, drive
+from data_tools.simulator.street import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.lidar_results import covered_spans, write_lidar_slam
@@ -74,12 +74,12 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
 
 
 def test_road_lines_are_found_where_the_road_ends() -> None:
-    scans = SimulatedScans(0, 16, kerbs=True)
+    scans = SimulatedScans(0, 16, curbs=True)
     settings = LidarSlamSettings(loop_closures=False)
     edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == LINE]
     assert len(edges) == 2
-    for mark in edges:  # the lines y = KERB and y = -KERB
-        truth = np.array([np.pi / 2 * np.sign(mark.state[0]), KERB])
+    for mark in edges:  # the lines y = CURB and y = -CURB
+        truth = np.array([np.pi / 2 * np.sign(mark.state[0]), CURB])
         off = mark.state - truth
         assert off @ np.linalg.solve(mark.covariance, off) < chi2.ppf(0.9999, 2)
         assert abs(off[1]) < 0.2

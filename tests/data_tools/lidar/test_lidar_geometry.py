@@ -22,7 +22,7 @@ from data_tools.lidar import (
 from data_tools.lidar.clusters import l_shape_heading
 from data_tools.lidar.voxels import clusters_from_above
 from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
-from data_tools.simulator.street import KERB, SENSOR_HEIGHT, street
+from data_tools.simulator.street import CURB, SENSOR_HEIGHT, street
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -191,10 +191,10 @@ def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
     assert straight_lines(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
 
 
-def test_kerbs_of_a_simulated_street_are_straight_lines() -> None:
+def test_curbs_of_a_simulated_street_are_straight_lines() -> None:
     for seed in range(3):
-        points = seen(street(seed, kerbs=True), seed).points
+        points = seen(street(seed, curbs=True), seed).points
         edges = straight_lines(extract_curbs(points, segment_ground(points).height), 2)
         assert edges
         for edge in edges:
-            np.testing.assert_allclose(np.abs(edge.ends[:, 1]), KERB, atol=0.35)
+            np.testing.assert_allclose(np.abs(edge.ends[:, 1]), CURB, atol=0.35)

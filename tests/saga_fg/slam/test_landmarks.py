@@ -135,7 +135,7 @@ def test_what_was_seen_side_by_side_is_never_one() -> None:
 @pytest.mark.parametrize("way", [0.0, np.pi / 2, np.pi, -np.pi + 1e-3], ids=lambda way: f"{way:.3f} rad")
 @pytest.mark.parametrize("side", [4.0, 0.0])
 def test_an_edge_is_one_whichever_way_its_normal_points(way: float, side: float) -> None:
-    """A kerb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
+    """A curb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
     kind, R = LineLandmark(), 0.01 * np.eye(2)
     ekf = EkfSlam(np.eye(4), 1e-6 * np.eye(6))
     for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
