@@ -1,9 +1,9 @@
 """LiDAR SLAM with objects: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
 
 The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.slam.joint` (detections,
-interactions, objects that stand) are solved as one. Its moments are the keyframes, and scans in between where the
-vehicle is slow, since objects move while it is stationary. Poses are those of the sensor; detections are brought into its
-frame.
+interactions, stationary objects) are solved as one. Its moments are the keyframes, and scans in between where the
+vehicle is slow, since objects move while it is stationary. Poses are those of the sensor; detections are brought into
+its frame.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 r"""Mixtures of motion: an interacting-multiple-model filter a node, matched in moments before nodes are coupled.
 
-A node is stationary, goes straight or turns: in mode r it moves as x' = F_r x + c_r + q_r, q_r ~ N(0, Q_r), and changes mode
-as a Markov chain in continuous time. Its Gaussian of each mode, N(m_s, P_s) with weight mu_s, predicts by mixing
+A node is stationary, goes straight or turns: in mode r it moves as x' = F_r x + c_r + q_r, q_r ~ N(0, Q_r), and changes
+mode as a Markov chain in continuous time. Its Gaussian of each mode, N(m_s, P_s) with weight mu_s, predicts by mixing
 (Blom and Bar-Shalom 1988; Bar-Shalom, Li and Kirubarajan 2001, section 11.6.6):
 
     w_sr = mu_s Pi_sr(dt),   mu_r <- sum_s w_sr,   N(m_r0, P_r0) matches the moments of sum_s w_sr N(m_s, P_s) / mu_r
