@@ -30,9 +30,11 @@ class ConeGeometry(Settings):
     clearance: Positive = setting(
         1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m; usual 1.5 to 2"
     )
-    preview: Positive = setting(1.5, "time by which drivers look ahead along the line, s")
-    reach: Positive = setting(45.0, "ignore cones further ahead, m")
-    corridor: Positive = setting(6.0, "ignore cones further aside, m")
+    preview: Positive = setting(
+        1.5, "time by which drivers look ahead along the line, s; usual 0.5 to 3; higher: vehicles move aside earlier"
+    )
+    reach: Positive = setting(45.0, "ignore cones further ahead, m; usual 20 to 60; higher: more cones count")
+    corridor: Positive = setting(6.0, "ignore cones further aside, m; usual 3 to 8; higher: cones of other lanes count")
     classes: tuple[str, ...] = setting(CONES, "classes of objects that form a line")
 
 

@@ -23,7 +23,10 @@ from saga_fg.settings import NonNegative, Settings, setting, settings_group
 
 def information_setting() -> Any:
     """The field of an edge rule that holds its `EdgeInformation`."""
-    return settings_group(lambda: None, "edges count by what they have to tell; null: whatever is known of their ends")
+    return settings_group(
+        lambda: None,
+        "weight edges by their information gain, as edges into well-known velocities tell little; null: full weight",
+    )
 
 
 def weighted_by_gain(

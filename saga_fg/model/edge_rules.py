@@ -72,8 +72,12 @@ class Neighbours(Settings):
     speed_scale: PositiveOrInf = setting(
         3.0, "sigma of the kernel on the difference of velocities, m/s; .inf: no kernel"
     )
-    max_distance: NonNegative = setting(20.0, "no edge beyond this distance, m")
-    min_speed: NonNegative = setting(1.0, "no edge to or from objects slower than this, m/s")
+    max_distance: NonNegative = setting(
+        20.0, "no edge beyond this distance, m; usual 10 to 40; higher: more edges, slower"
+    )
+    min_speed: NonNegative = setting(
+        1.0, "no edge to or from objects slower than this, m/s; usual 0.5 to 2; higher: slow traffic is left alone"
+    )
     max_degree: NonNegativeInt = setting(4, "largest number of edges into one object, the strongest; higher: slower")
     information_gain: EdgeInformation | None = information_setting()
     parked: bool = setting(
@@ -116,10 +120,16 @@ class Following(Settings):
     rate: NonNegative = setting(
         0.5, "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1"
     )
-    max_gap: NonNegative = setting(40.0, "no edge from a leader further ahead than this, centre to centre, m")
+    max_gap: NonNegative = setting(
+        40.0,
+        "no edge from a leader further ahead than this, centre to centre, m; usual 20 to 80; higher: more "
+        "edges, slower",
+    )
     gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m; .inf: no kernel")
     lateral_scale: PositiveOrInf = setting(
-        1.2, "sigma of the kernel on the leader's lateral offset, m; about a third of a lane"
+        1.2,
+        "sigma of the kernel on the leader's lateral offset, m; usual a third of a lane; higher: leaders in "
+        "adjacent lanes count, too",
     )
     heading_scale: PositiveOrInf = setting(
         0.4, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
@@ -177,8 +187,12 @@ class Repulsion(Settings):
 
     interaction: SocialForce = settings_group(SocialForce, "the repulsive force")
     rate: NonNegative = setting(1.0, "factor on the force, 1/s; 1: all of it")
-    max_distance: NonNegative = setting(4.0, "no edge beyond this distance, m")
-    max_degree: NonNegativeInt = setting(4, "largest number of sources of one object, the nearest")
+    max_distance: NonNegative = setting(
+        4.0, "no edge beyond this distance, m; usual 2 to 6; higher: more edges, slower"
+    )
+    max_degree: NonNegativeInt = setting(
+        4, "largest number of sources of one object, the nearest; usual 2 to 8; higher: slower"
+    )
     classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
     sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
 

@@ -50,17 +50,27 @@ class IntelligentDriver(Settings):
     """
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
-    free_speed: Positive = setting(15.0, "v_free: desired speed on a free road, m/s; about the speed limit")
+    free_speed: Positive = setting(
+        15.0, "v_free: desired speed on a free road, m/s; usual the speed limit; higher: vehicles speed up further"
+    )
     headway: Positive = setting(1.0, "T: desired time headway, s; usual 0.8 to 2; higher: larger gaps")
     standstill_gap: NonNegative = setting(2.0, "s0: gap at rest, bumper to bumper, m; usual 1 to 3")
     acceleration: Positive = setting(1.0, "a: maximum acceleration, m/s^2; usual 0.5 to 2")
     deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2; usual 1 to 3")
-    max_deceleration: Positive = setting(6.0, "limit of the deceleration, m/s^2")
-    stop_time: Positive = setting(0.4, "t_stop: time constant with which the last of the speed fades, s")
+    max_deceleration: Positive = setting(
+        6.0, "limit of the deceleration, m/s^2; usual 4 to 8; higher: harder braking is predicted"
+    )
+    stop_time: Positive = setting(
+        0.4, "t_stop: time constant with which the last of the speed fades, s; usual 0.2 to 1; higher: slower stops"
+    )
     hidden_vehicle_gap: PositiveOrInf = setting(
         7.0, "gap that may hold an undetected vehicle, into which nobody speeds up, m; .inf: there are none"
     )
-    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau has the full acceleration of the law, s")
+    time_constant: Positive = setting(
+        1.0,
+        "tau: an edge of rate 1 / tau has the full acceleration of the law, s; higher: edges of one rate "
+        "act more strongly",
+    )
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """f (E,) without an undetected vehicle in the gap; v, w >= 0 m/s, s m."""

@@ -110,11 +110,17 @@ class CarFollowing(Settings):
     time_constant: PositiveOrInf = setting(
         4.0, "tau: time constant with which a wrong gap closes, s; usual 1 to 10; .inf: share speeds only"
     )
-    headway: NonNegative = setting(0.0, "growth of the desired gap with the follower's speed, s; usual 0 to 2")
+    headway: NonNegative = setting(
+        0.0, "growth of the desired gap with the follower's speed, s; usual 0 to 2; higher: larger gaps at speed"
+    )
     gap: Literal["present", "standstill"] = setting(
         "present", "desired gap: present: that of the present estimate; standstill: standstill_gap + headway * speed"
     )
-    standstill_gap: NonNegative = setting(2.0, "gap at rest with gap: standstill, bumper to bumper, m; usual 1 to 3")
+    standstill_gap: NonNegative = setting(
+        2.0,
+        "gap at rest, bumper to bumper, m; used only with gap: standstill; usual 1 to 3; higher: followers "
+        "keep further back",
+    )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))

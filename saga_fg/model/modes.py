@@ -55,9 +55,18 @@ _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurem
 class Stationary(Settings):
     """Motion of an object at rest: its position drifts, its velocity decays."""
 
-    drift: NonNegative = setting(0.2, "standard deviation of the drift of the position in one second, m")
-    speed: Positive = setting(0.1, "standard deviation of a component of the velocity, m/s")
-    stop_time: Positive = setting(0.1, "time constant with which the velocity fades, s")
+    drift: NonNegative = setting(
+        0.2,
+        "standard deviation of the drift of the position in one second, m; usual 0.05 to 0.5; higher: slow "
+        "objects fit it, too",
+    )
+    speed: Positive = setting(
+        0.1,
+        "standard deviation of a component of the velocity, m/s; usual 0.05 to 0.3; higher: slow objects fit it, too",
+    )
+    stop_time: Positive = setting(
+        0.1, "time constant with which the velocity fades, s; usual 0.1 to 1; higher: it comes to rest later"
+    )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -86,7 +95,9 @@ class Mixture(Settings):
         5.0, "mean time in a mode before a change to another one, s; usual 2 to 10; higher: rarer changes"
     )
     unused_deviation: Positive = setting(
-        0.3, "standard deviation of a component while its mode does not use it, such as a turn rate, in its unit"
+        0.3,
+        "standard deviation of a component while its mode does not use it, such as a turn rate, in its "
+        "unit; higher: freer when the mode changes to one that does",
     )
 
     def __post_init__(self) -> None:

@@ -50,8 +50,12 @@ class Attached(Settings):
     interaction: RigidCoupling = settings_group(RigidCoupling, "interaction function of the edges, which go both ways")
     attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects")
     carriers: tuple[str, ...] = setting(("truck",), "classes of the objects they are attached to")
-    rate: NonNegative = setting(3.0, "strength of an edge, 1/s")
-    max_gap: NonNegative = setting(2.0, "largest distance between centres beyond half of both lengths, m")
+    rate: NonNegative = setting(3.0, "strength of an edge, 1/s; usual 1 to 5; higher: held together more firmly")
+    max_gap: NonNegative = setting(
+        2.0,
+        "largest distance between centres beyond half of both lengths, m; usual 1 to 3; higher: looser "
+        "pairs are coupled, too",
+    )
     heading_scale: PositiveOrInf = setting(
         0.5, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
     )

@@ -40,7 +40,11 @@ class CoordinatedTurn(Settings):
     turn_noise: NonNegative = setting(
         0.05, "spectral density of the random walk of the turn rate, rad^2/s^3; higher: turns are followed faster"
     )
-    initial_turn_rate_deviation: Positive = setting(0.2, "standard deviation of the turn rate of a new object, rad/s")
+    initial_turn_rate_deviation: Positive = setting(
+        0.2,
+        "standard deviation of the turn rate of a new object, rad/s; usual 0.1 to 0.5; higher: first turns "
+        "are followed faster",
+    )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -78,8 +82,14 @@ class Bicycle(Settings):
     steering_noise: NonNegative = setting(
         0.02, "spectral density of the random walk of the steering angle, rad^2/s; higher: turns are followed faster"
     )
-    wheelbase: Positive = setting(2.8, "distance between the axles, m")
-    initial_steering_deviation: Positive = setting(0.1, "standard deviation of the steering angle of a new object, rad")
+    wheelbase: Positive = setting(
+        2.8, "distance between the axles, m; usual 2.5 to 3; higher: the same steering angle turns less"
+    )
+    initial_steering_deviation: Positive = setting(
+        0.1,
+        "standard deviation of the steering angle of a new object, rad; usual 0.05 to 0.3; higher: first "
+        "turns are followed faster",
+    )
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -30,9 +30,15 @@ class OfflineClass(Settings):
         1.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 2; lower: smoother paths"
     )
     position_bias: NonNegative = setting(
-        0.1, "standard deviation of the error that all detections of one object share, m"
+        0.1,
+        "standard deviation of the position error that all detections of one object share, m; usual 0 to "
+        "0.3; higher: wider reported ellipses",
     )
-    min_heading_speed: Positive = setting(2.0, "speed from which the direction of motion gives the heading, m/s")
+    min_heading_speed: Positive = setting(
+        2.0,
+        "speed from which the direction of motion gives the heading, m/s; usual 1 to 3; higher: detected "
+        "headings count for longer",
+    )
     stationary_speed: NonNegative = setting(
         0.5, "smoothed speed below which an object may be stationary, m/s; usual 0.1 to 1"
     )
@@ -60,29 +66,38 @@ class StitchingSettings(Settings):
     miss_cost: NonNegative = setting(
         0.3, "cost of a frame in the gap that should have shown the object, nats; higher: fewer links"
     )
-    gate: Fraction = setting(0.999, "gate probability: share of true links inside the chi-square gate")
+    gate: Fraction = setting(
+        0.999,
+        "gate probability: share of true links inside the chi-square gate; usual 0.99 to 0.9999; higher: more links",
+    )
 
 
 @dataclass(frozen=True)
 class StationarySettings(Settings):
     """Intervals in which objects are stationary, and how firmly they are held."""
 
-    min_time: NonNegative = setting(1.0, "shortest stationary interval, s")
-    velocity_deviation: Positive = setting(0.02, "standard deviation of the velocity while stationary, m/s")
-    noise_scale: Positive = setting(1e-4, "factor on the process noise while stationary")
+    min_time: NonNegative = setting(
+        1.0, "shortest stationary interval, s; usual 0.5 to 3; higher: short stops stay in motion"
+    )
+    velocity_deviation: Positive = setting(
+        0.02, "standard deviation of the velocity while stationary, m/s; lower: held more firmly"
+    )
+    noise_scale: Positive = setting(1e-4, "factor on the process noise while stationary; lower: held more firmly")
 
 
 @dataclass(frozen=True)
 class QualitySettings(Settings):
     """Quality of a box: the first class whose conditions it meets, else low."""
 
-    high_score: Fraction = setting(0.5, "least score of a box of high quality")
+    high_score: Fraction = setting(0.5, "least score of a box of high quality; higher: fewer boxes of high quality")
     high_deviation: PositiveOrInf = setting(
-        0.3, "largest standard deviation of the position of a box of high quality, m"
+        0.3,
+        "largest standard deviation of the position of a box of high quality, m; higher: more boxes of high quality",
     )
-    medium_score: Fraction = setting(0.2, "least score of a box of medium quality")
+    medium_score: Fraction = setting(0.2, "least score of a box of medium quality; higher: more boxes of low quality")
     medium_deviation: PositiveOrInf = setting(
-        0.8, "largest standard deviation of the position of a box of medium quality, m"
+        0.8,
+        "largest standard deviation of the position of a box of medium quality, m; higher: fewer boxes of low quality",
     )
 
 
@@ -108,14 +123,20 @@ class SmoothingSettings(Settings):
         1, "repetitions of loss weights and edges at the final states; usual 1 to 3; higher: slower"
     )
     extension: NonNegative = setting(
-        1.5, "time before the first and after the last detection in which an object is searched, s"
+        1.5,
+        "time by which the search for detections of an object reaches before its first and after its last "
+        "one, s; 0: no search; higher: longer tracks",
     )
     prior_opportunity_time: NonNegative = setting(
         1.0, "missed opportunities that each object starts with, as a time, s; higher: short tracks score less"
     )
     min_score: Fraction = setting(0.02, "drop objects of a lower score; higher: fewer false objects, more misses")
     quality: QualitySettings = settings_group(QualitySettings, "quality classes of boxes")
-    association_gate: Fraction = setting(0.95, "gate probability for detections that no track was matched to")
+    association_gate: Fraction = setting(
+        0.95,
+        "gate probability for detections that no track was matched to; usual 0.9 to 0.99; higher: more are "
+        "added, right and wrong",
+    )
 
     @property
     def robust(self) -> Robust | None:

@@ -316,12 +316,19 @@ class GreedySettings(Settings):
 
     max_distance: Mapping[str, float] = settings_group(
         lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
-        "largest distance of prediction and detection by class, m; default serves all others",
+        "largest distance of prediction and detection by class, m; default serves all others; usual 1 to "
+        "12; higher: more matches, right and wrong",
     )
-    max_coasting: PositiveOrInf = setting(1.2, "delete a track this long after its last detection, s")
+    max_coasting: PositiveOrInf = setting(
+        1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
+    )
     baseline: NonNegative = setting(
         0.2, "least time between two positions whose difference gives a velocity, s; higher: smoother, later velocities"
     )
-    min_score: Fraction = setting(0.0, "discard detections with a lower probability")
+    min_score: Fraction = setting(
+        0.0, "discard detections with a lower probability; higher: fewer false tracks, more misses"
+    )
     clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
-    max_delay: NonNegative = setting(0.5, "discard frames that are older than the newest by more than this, s")
+    max_delay: NonNegative = setting(
+        0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
+    )

@@ -33,10 +33,20 @@ LEAST_BELIEF = 1e-6  # no colour is ever ruled out
 class SignalSettings(Settings):
     """Colour changes of traffic lights, and the effect of the belief on stop lines."""
 
-    red_duration: Positive = setting(15.0, "mean duration of red, s")
-    amber_duration: Positive = setting(3.0, "mean duration of amber, s")
-    green_duration: Positive = setting(15.0, "mean duration of green, s")
-    max_distance: Positive = setting(4.0, "a reported light belongs to no known light further away than this, m")
+    red_duration: Positive = setting(
+        15.0, "mean duration of red, s; usual 10 to 60; higher: lights are believed to stay red longer"
+    )
+    amber_duration: Positive = setting(
+        3.0, "mean duration of amber, s; usual 3 to 5; higher: lights are believed to stay amber longer"
+    )
+    green_duration: Positive = setting(
+        15.0, "mean duration of green, s; usual 10 to 60; higher: lights are believed to stay green longer"
+    )
+    max_distance: Positive = setting(
+        4.0,
+        "a reported light belongs to no known light further away than this, m; usual 2 to 6; higher: more "
+        "reports are used, more of them wrongly",
+    )
     belief: Literal["mixed", "likeliest"] = setting(
         "mixed", "effect of a stop line: mixed: by the probability that it is closed; likeliest: all or nothing"
     )

@@ -40,7 +40,9 @@ class KeepLane(Settings):
     offset_time: PositiveOrInf = setting(
         3.0, "tau: time constant with which an offset from the centre line fades, s; usual 2 to 5; .inf: never"
     )
-    lag: NonNegative = setting(0.5, "time by which vehicles look ahead along the lane, s")
+    lag: NonNegative = setting(
+        0.5, "time by which vehicles look ahead along the lane, s; usual 0 to 1; 0: where they are"
+    )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         across, constant = np.zeros((len(target), 2, 2)), np.zeros((len(target), 2))

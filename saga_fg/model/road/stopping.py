@@ -162,12 +162,22 @@ class RedLight(Settings):
         Stopping, "interaction function of the edges"
     )
     rate: NonNegative = setting(
-        1.0, "strength of an edge of a vehicle that brakes for a line that is surely closed, 1/s"
+        1.0,
+        "strength of an edge of a vehicle that brakes for a line that is surely closed, 1/s; usual 0.5 to "
+        "2; higher: brakes more surely",
     )
-    max_distance: NonNegative = setting(100.0, "no edge from a line further away, m")
-    reaction_deceleration: NonNegative = setting(0.3, "needed deceleration at which drivers begin to react, m/s^2")
-    full_deceleration: Positive = setting(1.0, "needed deceleration from which they brake fully, m/s^2")
-    max_deceleration: Positive = setting(4.5, "drivers who would have to brake harder do not stop, m/s^2")
+    max_distance: NonNegative = setting(
+        100.0, "no edge from a line further away, m; usual 50 to 150; higher: vehicles brake from afar"
+    )
+    reaction_deceleration: NonNegative = setting(
+        0.3, "needed deceleration at which drivers begin to react, m/s^2; usual 0.2 to 1; higher: they react later"
+    )
+    full_deceleration: Positive = setting(
+        1.0, "needed deceleration from which they brake fully, m/s^2; usual 0.8 to 2; higher: they brake later"
+    )
+    max_deceleration: Positive = setting(
+        4.5, "drivers who would have to brake harder do not stop, m/s^2; usual 3 to 6; higher: more vehicles stop"
+    )
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def pairs(self, nodes: NodeTable) -> Pairs:

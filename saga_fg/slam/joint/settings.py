@@ -45,7 +45,9 @@ class JointSettings(Settings):
     """Noise of the odometry, stationarity of objects, and effort of the joint estimation."""
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "errors of the odometry")
-    start_noise: Positive = setting(1e-3, "standard deviation of the first pose, m and rad")
+    start_noise: Positive = setting(
+        1e-3, "standard deviation of the first pose, m and rad; lower: the path stays closer to where it starts"
+    )
     stationary_window: Positive = setting(
         3.0, "time over which an object is judged stationary or moving, s; higher: surer, later"
     )
@@ -57,9 +59,14 @@ class JointSettings(Settings):
         "standard deviation of the velocity of moving objects by class, m/s; default serves all others",
     )
     stationary_drift: Positive = setting(
-        0.05, "standard deviation of the drift of a stationary object in one second, m"
+        0.05,
+        "standard deviation of the drift of a stationary object in one second, m; usual 0.01 to 0.1; lower: "
+        "stationary objects hold the path more firmly",
     )
-    stationary_speed: Positive = setting(0.1, "standard deviation of the velocity of a stationary object, m/s")
+    stationary_speed: Positive = setting(
+        0.1,
+        "standard deviation of the velocity of a stationary object, m/s; higher: slow objects are taken for stationary",
+    )
     motion_noise: Positive = setting(
         1000.0, "factor on the process noise of objects; high, since traffic brakes and turns as one"
     )
@@ -67,17 +74,27 @@ class JointSettings(Settings):
         1.0, "factor on the process noise of objects online; higher: better paths, worse velocities"
     )
     outlier_scale: PositiveOrInf = setting(
-        3.0, "residual from which the Cauchy loss discounts a detection, standard deviations"
+        3.0,
+        "residual from which the Cauchy loss discounts a detection, standard deviations; usual 2 to 5; "
+        "higher: outliers count more",
     )
-    max_landmark_distance: Positive = setting(2.5, "largest distance between two observations of one landmark, m")
+    max_landmark_distance: Positive = setting(
+        2.5,
+        "largest distance between two observations of one landmark, m; usual 1 to 4; higher: more matches, "
+        "right and wrong",
+    )
     lanes: LaneSettings | None = settings_group(
         lambda: None, "attraction of moving vehicles to the lanes of a map; null: none"
     )
     keyframe_period: NonNegative = setting(
         0.15, "skip frames that follow a keyframe within this time, s; higher: faster, coarser"
     )
-    passes: PositiveInt = setting(2, "passes of associating objects along the latest path")
-    max_iterations: PositiveInt = setting(30, "largest number of linearisations in each pass")
+    passes: PositiveInt = setting(
+        2, "passes of associating objects along the latest path; usual 1 to 3; higher: slower"
+    )
+    max_iterations: PositiveInt = setting(
+        30, "largest number of linearisations in each pass; usual 10 to 50; higher: slower where they do not converge"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
