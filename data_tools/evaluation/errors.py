@@ -11,10 +11,10 @@ from data_tools.metrics import EllipseCoverage, ErrorSummary, LabelErrors, calib
 from data_tools.plots import calibration_plot, error_histograms
 
 _ERRORS = (
-    *("class", "labels", "with track", "position", "detection", "velocity", "... parked", "... moving"),
-    *("heading", "flipped"),
+    *("class", "labels", "with track", "position", "detection", "velocity", "velocity parked"),
+    *("velocity moving", "heading", "flipped"),
 )
-_CALIBRATION = ("class", "objects", "boxes", "ANEES / 2", "median", "in 50 %", "in 90 %", "in 99 %", "")
+_CALIBRATION = ("class", "objects", "boxes", "ANEES / 2", "median", "in 50 %", "in 90 %", "in 99 %", "verdict")
 
 
 def error_tables(errors: LabelErrors) -> list[FigureTable]:
@@ -26,7 +26,7 @@ def error_tables(errors: LabelErrors) -> list[FigureTable]:
     ]
     calibrations = {name: calibration(e) for name, e in classes.items()}
     if any(c.boxes for c in calibrations.values()):
-        title = "Calibration: share of position errors within the tracks' ellipses; ANEES and median: 1 is right"
+        title = "Calibration: share of errors within the tracks' ellipses; ANEES / 2 and median: 1 is right"
         rows = tuple((name, *_calibration_cells(c)) for name, c in calibrations.items())
         tables.append(FigureTable(title, _CALIBRATION, rows))
     return tables

@@ -18,10 +18,10 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
 
-_TITLE = "Tracks at every moment; MOTP and errors in m; carried: error of the track that last followed a hidden object"
+_TITLE = "Tracks at every moment; MOTP and errors in m; carried error: of the track that last followed a hidden object"
 _COLUMNS = (
-    *("class", "MOTA", "MOTP", "recall", "IDS", "FP", "FN", "objects", "hidden", "... tracked", "carried error"),
-    *("... median",),
+    *("class", "MOTA", "MOTP", "recall", "IDS", "FP", "FN", "objects", "hidden", "hidden tracked"),
+    *("carried error", "carried error median"),
 )
 
 

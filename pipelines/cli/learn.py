@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -97,7 +97,20 @@ _interaction_commands = dataset_commands(
         "track {recordings} --output {tracks} --interactions interactions.yaml",
     ),
 )
-learn_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
+
+
+class LearnGroup(ReportingGroup):
+    """The kinds of settings that can be learned; names the command where a dataset is given in their place."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        from data_tools.datasets.registry import dataset_names
+
+        if args and args[0] in dataset_names():
+            ctx.fail(f"No such command '{args[0]}'; try 'learn noise {args[0]}' or 'learn interactions {args[0]}'.")
+        return super().resolve_command(ctx, args)
+
+
+learn_app = typer.Typer(cls=LearnGroup, no_args_is_help=True, rich_markup_mode=None)
 noise_app = typer.Typer(cls=_noise_commands, no_args_is_help=True, rich_markup_mode=None)
 interactions_app = typer.Typer(cls=_interaction_commands, no_args_is_help=True, rich_markup_mode=None)
 learn_app.add_typer(noise_app, name="noise")

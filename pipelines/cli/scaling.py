@@ -24,8 +24,8 @@ Workers = Annotated[
     typer.Option(
         "--workers",
         min=0,
-        help="Do the scenes in parallel, in so many processes (0: one a core); --output is a folder then, and a second "
-        "run does only what is not done.",
+        help="Process scenes in parallel, in this many processes (0: one per core); a second run continues where the "
+        "first stopped.",
         metavar="N",
     ),
 ]
@@ -33,7 +33,7 @@ RayAddress = Annotated[
     str | None,
     typer.Option(
         "--ray",
-        help='Do the scenes on a Ray cluster: "auto", HOST:PORT, ray://HOST:PORT, or "local" for one of --workers '
+        help='Process scenes on a Ray cluster: "auto", HOST:PORT, ray://HOST:PORT, or "local" for one of --workers '
         "CPUs on this machine.",
         metavar="ADDRESS",
     ),

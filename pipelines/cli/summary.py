@@ -23,7 +23,7 @@ class Summary:
     frames: int = 0
     boxes: int = 0
     seconds: float = 0.0
-    tracks: set[tuple[str, int]] = field(default_factory=set)
+    best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
     def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
@@ -34,7 +34,10 @@ class Summary:
             self.seconds += run.seconds
             self.milliseconds[run.scene.name] = run.milliseconds
             self.boxes += sum(len(tracks) for tracks in run.tracks)
-            self.tracks.update((run.scene.name, id_) for tracks in run.tracks for id_ in tracks.id.tolist())
+            for tracks in run.tracks:
+                for id_, score in zip(tracks.id.tolist(), tracks.score.tolist(), strict=True):
+                    track = (run.scene.name, id_)
+                    self.best_score[track] = max(score, self.best_score.get(track, score))
             yield run
 
     def write_record(self, method: str, settings: TrackConfig) -> None:
@@ -48,8 +51,10 @@ class Summary:
     def show(self) -> None:
         """Print the line on stdout."""
         rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
-        counts = ((self.scenes, "scene"), (self.frames, "frame"), (len(self.tracks), "track"), (self.boxes, "box"))
-        typer.echo(f"{self.output}: {', '.join(counted(*count) for count in counts)}{rate}")
+        sure = sum(score > 0.5 for score in self.best_score.values())
+        tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
+        counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
+        typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
 
 
 def counted(number: int, noun: str) -> str:

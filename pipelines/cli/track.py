@@ -10,7 +10,7 @@ import typer
 from pipelines.cli import options
 from pipelines.cli import tracking_options as how
 from pipelines.cli.console import progress_bar
-from pipelines.cli.datasets import dataset_commands
+from pipelines.cli.datasets import Source, dataset_commands
 from pipelines.cli.scaling import RayAddress, Workers, at_scale, run_at_scale
 from pipelines.cli.summary import Summary
 
@@ -60,7 +60,15 @@ _EXAMPLES = (
     "track {recordings} --output {tracks} --estimator fixed-lag --lag 3",
     "track {recordings} --output run --workers 0   # all cores; writes run/tracks/",
 )
-_commands = dataset_commands("track", _track, _EXAMPLES, lambda source: {"output": source.tracks})
+
+
+def _texts(source: Source) -> dict[str, str]:
+    """Help of --output, which names a file unless scenes are processed in parallel."""
+    is_file = bool(Path(source.tracks_example).suffix)
+    return {"output": source.tracks + " With --workers or --ray: a folder." * is_file}
+
+
+_commands = dataset_commands("track", _track, _EXAMPLES, _texts)
 track_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 
 

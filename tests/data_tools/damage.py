@@ -34,6 +34,7 @@ from pipelines.config import load_config
 from pipelines.explaining import read_events
 from pipelines.report.run_record import read_run_record
 from pipelines.serving import StreamTracker
+from saga_fg.types.dataset import Scene
 
 PIECES = [
     *(b"", b"NaN", b"nan", b"-1", b"0", b"1e999", b"-1e308", b"1e-320", b"99999999999999999999", b"0x10", b"1_0"),
@@ -224,25 +225,27 @@ def _argoverse(root: Path) -> dict[str, Target]:
     return {"Argoverse": Target(files, lambda: ArgoverseLogs(root).scene("log"))}
 
 
-def _read_nuscenes(root: Path) -> None:
+def _read_nuscenes(root: Path) -> list[Scene]:
     data = NuScenes(root, "v1.0-mini", {"lidar": root / "found.json"}, ground_truth=True)
-    for name in data.scenes:
-        data.scene(name)
+    scenes = [data.scene(name) for name in data.scenes]
     split_scenes(root, "v1.0-mini", "mini_val")
+    return scenes
 
 
-def _read_kitti(root: Path) -> None:
-    KittiTracking(root, root / "found", ground_truth=True).scene("0007")
+def _read_kitti(root: Path) -> Scene:
+    return KittiTracking(root, root / "found", ground_truth=True).scene("0007")
 
 
-def _read_table(path: Path) -> None:
+def _read_table(path: Path) -> list[Scene]:
     data = read_detections(path)
-    for name in data.scenes:
-        data.scene(name)
+    return [data.scene(name) for name in data.scenes]
 
 
-def _stream(path: Path, new_tracker: Callable[[], object]) -> None:
+def _stream(path: Path, new_tracker: Callable[[], object]) -> list[object]:
     service: StreamTracker[None] = StreamTracker(new_tracker)  # type: ignore[arg-type]
+    answers: list[object] = []
     for line in path.read_bytes().splitlines(keepends=True):
         for _, answer in service.handle(line, None):
             json.dumps(answer, allow_nan=False)
+            answers.append(answer)
+    return answers

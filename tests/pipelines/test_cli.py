@@ -109,6 +109,12 @@ def test_a_file_for_another_command_is_named(tmp_path: Path) -> None:
     assert result.stderr == f"error: {path}: smoothing: unknown section, this is a file for `saga-fg smooth`\n"
 
 
+def test_a_dataset_in_place_of_what_to_learn_is_answered_with_the_command() -> None:
+    result = saga_fg("learn", "kitti")
+    assert result.exit_code == 2
+    assert "try 'learn noise kitti'" in result.stderr
+
+
 def test_config_prints_the_simulators_settings_and_markdown() -> None:
     assert "visible_share" in yaml.safe_load(saga_fg("config", "--full", "--simulator").stdout)
     assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,7 @@ def test_nuscenes_results_list_every_sample_of_the_split(simulated: Path, tmp_pa
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith(f"{output}: 2 scenes, 16 frames, ")
     assert result.stdout.rstrip().endswith("frames/s")
+    assert re.search(r", \d+ tracks \(\d+ with a score above 0\.5\), ", result.stdout)
     results = read_tracking_results(output)
     dataset = NuScenes(simulated, "v1.0-mini", {})
     assert set(results.samples) == {token for name in dataset.scenes for token in dataset.scene(name).tokens}
@@ -122,7 +124,7 @@ def test_tables_of_ones_own(tmp_path: Path, method: str) -> None:
     output = tmp_path / "tracks.csv"
     result = saga_fg("track", "file", table, "--output", output, "--method", method)
     assert result.exit_code == 0, result.output
-    assert result.stdout.startswith(f"{output}: 1 scene, 10 frames, 1 track, 10 boxes, ")
+    assert result.stdout.startswith(f"{output}: 1 scene, 10 frames, 1 track (1 with a score above 0.5), 10 boxes, ")
     with output.open() as file:
         read = list(csv.DictReader(file))
     assert [float(row["timestamp"]) for row in read] == [k / 10 for k in range(10)]

@@ -34,22 +34,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class KittiSource(DatasetSource):
-    """KITTI tracking sequences.
-
-    Results are the benchmark's text, one file a sequence, and beside them tracks.csv with velocities and covariances.
-    """
+    """KITTI tracking sequences."""
 
     name = "kitti"
     family = "kitti"
     example = "--dataroot data/kitti --detections data/kitti/detections/pointrcnn --sequences 0000,0011"
-    tracks = "Folder to write NNNN.txt to."
+    tracks = "Folder to write: NNNN.txt in the benchmark's format, tracks.csv with velocities and covariances."
     tracks_example = "results"
     merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
     dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
     detections: str | None = option(
         "Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.", None, required=TRACKING
     )
-    sequences: str | None = option("Sequences with commas between them; all, or all results, if left out.", None)
+    sequences: str | None = option("Sequences with commas between them; all if left out.", None)
     iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate",))
     classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate",))
 

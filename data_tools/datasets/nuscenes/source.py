@@ -37,16 +37,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class NuScenesSource(DatasetSource):
-    """nuScenes recordings.
-
-    Detections are official detection-result JSON, one file a sensor; results are official tracking-result JSON. The
-    official figures equal those of the development kit, which need not be installed.
-    """
+    """nuScenes recordings, with detections as official detection-result JSON, one file a sensor."""
 
     name = "nuscenes"
     family = "nuscenes"
     example = "--dataroot data/nuscenes --split mini_train --detections lidar=megvii.json"
-    tracks = "Tracking-result JSON to write."
+    tracks = "Official tracking-result JSON to write."
     tracks_example = "tracks.json"
     merged = ("tracks.json", "tracking.json")
     dataroot: str = option("Folder that holds the folder of tables, or its URL.")

@@ -132,7 +132,8 @@ def test_a_file_of_empty_frames_alone(tmp_path: Path) -> None:
 
 
 def test_columns_one_does_not_know_are_left_alone(tmp_path: Path) -> None:
-    read_detections(write(tmp_path, ".csv", "timestamp,x,y,remark,frame\n0,1,1,,7\n"))
+    scene = read_detections(write(tmp_path, ".csv", "timestamp,x,y,remark,frame\n0,1,2,,7\n")).scene("drive")
+    assert [found.position for found in scene.frames[0].detections] == [(1.0, 2.0, 0.0)]
 
 
 numbers = st.floats(-1e6, 1e6)

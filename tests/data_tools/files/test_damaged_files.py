@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sized
 from contextlib import suppress
+from typing import Any
 
 import pytest
 from damage import Target, damaged, targets
@@ -14,6 +16,29 @@ from damage import Target, damaged, targets
 from saga_fg import InputError
 
 INPUTS = 60
+SIZES = {
+    "nuScenes": 2,
+    "nuScenes detections": 2,
+    "nuScenes results": 2,
+    "KITTI": 3,
+    "KITTI results": 1,
+    "detections, CSV": 1,
+    "detections, NDJSON": 1,
+    "detections, NumPy": 1,
+    "ETH and UCY": 2,
+    "pose graph, plane": 2,
+    "pose graph, space": 2,
+    "poses, KITTI": 2,
+    "poses, TUM": 2,
+    "scan, KITTI": 3,
+    "scan, nuScenes": 3,
+    "scan, PCD": 2,
+    "scan, PLY": 2,
+    "scan, NumPy": 3,
+    "journal": 2,
+    "stream": 4,
+}
+"""Scenes, moments, poses, points or messages of the valid files that have a length."""
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +47,13 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 
 
 def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
-    for target in valid.values():
-        target.read()
+    read: dict[str, Any] = {name: target.read() for name, target in valid.items()}
+    assert len(read.pop("Argoverse", "ab")) == 2  # needs pyarrow
+    assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES
+    assert [len(scene) for scene in read["nuScenes"]] == [3, 2]
+    assert len(read["tracks"].id) == len(read["labels"].tracks.id) == 2
+    assert read["configuration"].tracker.max_delay == 0.5
+    assert read["run record"].method == "kf"
 
 
 @pytest.mark.parametrize("seed", range(8))
