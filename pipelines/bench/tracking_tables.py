@@ -39,7 +39,7 @@ def figures(result: SetResult) -> dict[str, Any]:
 
 def _variants(result: SetResult) -> FigureTable:
     names = list(next(iter(result.variants.values())).figures)
-    columns = ("variant", *names, "position", "velocity", "... moving", "ms / frame", "/ centerpoint")
+    columns = ("variant", *names, "position", "velocity", "velocity moving", "ms / frame", "/ centerpoint")
     rows = []
     for name, each in result.variants.items():
         errors = error_summary(result.errors(name))

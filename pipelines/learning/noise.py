@@ -36,7 +36,7 @@ from saga_fg.types.dataset import Dataset, Scene
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 2  # of tracking, each with the noise learned in the one before
+PASSES = 2  # of tracking, each with the noise learned in the one before
 FEW_DETECTIONS = 200  # of a sensor, that a standard deviation is known to 5 %
 FEWEST_TRAJECTORIES = 5  # a class with fewer has the noise of all together
 
@@ -58,9 +58,9 @@ def learn_noise(
     Raises `InputError` for scenes that lack ground truth where it is asked for, or in which no sensor sees anything.
     """
     learned = LearnedNoise(config, {}, ())
-    rounds = 1 if with_truth else ROUNDS
-    for k in range(rounds):
-        reported = _reported(dataset, scenes, f" {k + 1}/{rounds}" if rounds > 1 else "", progress)
+    passes = 1 if with_truth else PASSES
+    for k in range(passes):
+        reported = _reported(dataset, scenes, f" {k + 1}/{passes}" if passes > 1 else "", progress)
         learned = _from_truth(reported, learned.config) if with_truth else _from_tracker(reported, learned.config)
     if not any(learned.detections.values()):
         raise InputError(f"{', '.join(scenes)}: expected detections to learn from, there is none")

@@ -1,4 +1,4 @@
-"""Stationary objects: v ~ N(0, deviation^2 / dt), robust, so that an object which drives off is given up.
+"""Stationary objects: v ~ N(0, deviation^2 / dt), robust, so that it lets an object go that drives off.
 
 The variance shrinks with the length of the interval, so that a second has the same weight at any rate of frames.
 """

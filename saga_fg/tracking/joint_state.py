@@ -100,7 +100,7 @@ class JointTrackState:
             if isinstance(node_type.motion, Mixture):
                 new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
                 self._modes[node_type.motion] = new if old is None else old.extended(new)
-            estimator = self._changed()
+            estimator = self._estimator_to_change()
             if isinstance(estimator, GraphFilter | JointKalmanFilter):
                 estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
             else:
@@ -111,14 +111,14 @@ class JointTrackState:
 
     def remove(self, ids: IntArray) -> None:
         """Marginalise tracks; their information on their neighbours stays."""
-        self._changed().marginalise(ids)
+        self._estimator_to_change().marginalise(ids)
         self._modes = {k: t.select(np.flatnonzero(~np.isin(t.ids, ids))) for k, t in self._modes.items()}
         for track in ids.tolist():
             del self._initiated[track]
 
     def predict(self, graph: SceneGraph, dt: float) -> None:
         """Move all tracks by `dt` s under the graph's dynamics."""
-        estimator = self._changed()
+        estimator = self._estimator_to_change()
         if self._modes:
             self._anchor_modes()
             graph = replace(graph, modes=tuple(self._modes.values()))
@@ -159,7 +159,7 @@ class JointTrackState:
 
     def _add_relative(self, ids: IntArray, label: StrArray, relative: RelativePositions) -> None:
         """Take in positions seen from the vehicle."""
-        estimator = self._changed()
+        estimator = self._estimator_to_change()
         assert isinstance(estimator, GraphFilter)
         for node_type, rows in self.rows_by_type(label):
             x, y = node_type.index(POSITION).tolist()
@@ -169,13 +169,13 @@ class JointTrackState:
         """Set the frame that providers see from now on; positions are from `origin` (2,)."""
         if isinstance(self.estimator, GraphFilter | JointKalmanFilter) and self.estimator.providers:
             self.estimator.set_frame(frame, origin)
-            self._changed()
+            self._estimator_to_change()
 
     def ask_providers(self) -> None:
         """Let factor providers add their factors."""
         if isinstance(self.estimator, GraphFilter | JointKalmanFilter) and self.estimator.providers:
             self.estimator.ask_providers()
-            self._changed()
+            self._estimator_to_change()
 
     @property
     def empty(self) -> bool:
@@ -216,7 +216,7 @@ class JointTrackState:
     def restore(self, snapshot: Any) -> None:
         """Continue from a snapshot."""
         state, self._initiated, self._modes = snapshot
-        self._changed().restore(state)
+        self._estimator_to_change().restore(state)
 
     @property
     def window(self) -> float:
@@ -234,7 +234,7 @@ class JointTrackState:
         self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
     ) -> None:
         """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old."""
-        estimator = self._changed()
+        estimator = self._estimator_to_change()
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
             R = np.broadcast_to(np.eye(node_type.dim), H.shape)
@@ -254,7 +254,7 @@ class JointTrackState:
             marginals = estimator.mean(table.ids), estimator.covariance(table.ids)
             self._modes[mixture] = table.anchored(*marginals) if len(table) else table
 
-    def _changed(self) -> TrackEstimator:
+    def _estimator_to_change(self) -> TrackEstimator:
         self._kinematics = None
         return self.estimator
 

@@ -39,7 +39,7 @@ GATE = 0.999  # gate probability of the detections of a light
 
 @dataclass(frozen=True)
 class Place:
-    """Where the map has a node, world: middle (2,), polyline (k, 2) about it, direction of travel, m and rad."""
+    """Place of a node on the map, world: middle (2,), polyline (k, 2) about it, direction of travel, m and rad."""
 
     middle: FloatArray
     outline: FloatArray

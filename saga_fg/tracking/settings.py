@@ -282,7 +282,7 @@ class TrackerSettings(Settings):
     )
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
-        """Whether any class moves nonlinearly, or any of the edge rules acts so."""
+        """Return True if a class moves nonlinearly or an edge rule is nonlinear."""
         moving = any(isinstance(one.motion, NonlinearMotion) for one in self.classes.values())
         return moving or any(isinstance(rule.interaction, AccelerationLaw) for rule in rules)
 
