@@ -1,7 +1,7 @@
 """Attraction to lanes: vehicles that go along a lane keep to its centre line, r = e - c, r ~ N(0, deviation^2 / dt).
 
 e is the offset from the line at the foot of where an object is, c how far the line lies aside of where the map has it,
-a variable for all time with a prior (`factors.lane`). The loss is robust, so that it lets an object go that changes lanes.
+a variable for all time with a prior (`factors.lane`). The loss is robust: it lets go of objects that change lanes.
 """
 
 from __future__ import annotations
