@@ -23,12 +23,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "data_tools"))
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the folders beside this script are named as the packages are
-from damage import Target, damaged, targets
-
 from data_tools.files.atomic_files import write_text
 from saga_fg import InputError
+from tests.data_tools.damage import Target, damaged, targets
 
 PART = 1000  # inputs
 HANGS = 600.0  # s for one input

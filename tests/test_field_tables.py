@@ -38,7 +38,7 @@ def add(a: int, b: int = 2) -> int:
 @pytest.fixture
 def module(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "path", [str(ROOT / "docs"), *sys.path])
-    from field_tables import FieldTables
+    from field_tables import FieldTables  # type: ignore[import-not-found]
 
     return griffe.visit("page", Path("page.py"), CODE, extensions=griffe.load_extensions(FieldTables))
 

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from following_pairs import RATE, following_pairs
 from typer.testing import CliRunner
 
 from benchmarks import gaps as bench
@@ -15,6 +14,7 @@ from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, Trajectories, filter_independently, sample_gaps
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import CarFollowing
+from tests.saga_fg.following_pairs import RATE, following_pairs
 
 
 def test_figures_are_those_of_the_errors_at_the_end_of_each_gap():

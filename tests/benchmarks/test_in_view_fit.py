@@ -5,13 +5,13 @@ import math
 
 import numpy as np
 import pytest
-from following_pairs import RATE, following_pairs
 
 from benchmarks.in_view_fit import fit_interactions_in_view
 from saga_fg import InputError
 from saga_fg.learning import Trajectories
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
+from tests.saga_fg.following_pairs import RATE, following_pairs
 
 FOLLOW = Following(CarFollowing(time_constant=math.inf), rate=0.3)
 

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from kitti_example import write_sequence
-from nuscenes_example import box, results, write_results, write_tables
 
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.detection_files import read_detections, read_tracks
@@ -35,6 +33,8 @@ from pipelines.explaining import read_events
 from pipelines.report.run_record import read_run_record
 from pipelines.serving import StreamTracker
 from saga_fg.types.dataset import Scene
+from tests.data_tools.kitti_example import write_sequence
+from tests.data_tools.nuscenes_example import box, results, write_results, write_tables
 
 PIECES = [
     *(b"", b"NaN", b"nan", b"-1", b"0", b"1e999", b"-1e308", b"1e-320", b"99999999999999999999", b"0x10", b"1_0"),

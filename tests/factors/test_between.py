@@ -48,7 +48,7 @@ def test_jacobians_are_those_of_central_differences(dim, seed, covariance):
                 step = gtsam.VectorValues()
                 for other in (9, 2):
                     step.insert(other, sign * 1e-6 * np.eye(k)[i] * (other == key))
-                ends.append(factor.whitenedError(values.retract(step)))
+                ends.append(factor.whitenedError(values.retract(step)))  # type: ignore[attr-defined]
             np.testing.assert_allclose(columns[key][:, i], (ends[0] - ends[1]) / 2e-6, atol=1e-6)
 
 

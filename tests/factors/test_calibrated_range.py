@@ -28,10 +28,10 @@ def test_jacobians_are_those_of_central_differences(seed):
     kinds = (PlanarPose(), Vector(2), Vector(2))
 
     def residual(*moved):
-        return factors.residual(*(kind.array(state)[None] for kind, state in zip(kinds, moved, strict=True)))[0]
+        return factors.residual(*(kind.array(state)[None] for kind, state in zip(kinds, moved, strict=True)))[0]  # type: ignore[attr-defined]
 
     expected = central_differences(residual, states, kinds)
-    stacked = [kind.array(state)[None] for kind, state in zip(kinds, states, strict=True)]
+    stacked = [kind.array(state)[None] for kind, state in zip(kinds, states, strict=True)]  # type: ignore[attr-defined]
     for got, wanted in zip(factors.jacobians(*stacked), expected, strict=True):
         np.testing.assert_allclose(got[0], wanted, atol=1e-7)
 

@@ -55,12 +55,12 @@ def plane(rng, keys, covariance):
     seen = some_plane(rng)
     pose = some_pose(rng)
     held = seen.transform(pose.inverse()).retract(rng.normal(0, 0.2, 3))
-    return plane_factor(*keys, seen.planeCoefficients(), covariance(rng, 3)), [pose, held]
+    return plane_factor(*keys, seen.planeCoefficients(), covariance(rng, 3)), [pose, held]  # type: ignore[call-arg]
 
 
 def distance(planar):
     def make(rng, keys, covariance):
-        factor = range_factor(*keys, rng.uniform(1, 9), 0.3, planar, Robust("huber", 100.0))
+        factor = range_factor(*keys, rng.uniform(1, 9), 0.3, planar, Robust("huber", 100.0))  # type: ignore[call-arg]
         dim = 2 if planar else 3
         return factor, [some_pose(rng, dim), rng.normal(0, 5, dim)]
 
@@ -74,7 +74,7 @@ def bearing(planar):
         off = 0.3 if planar else 0.0  # GTSAM neglects the curvature of the sphere of directions
         towards = pose.transformTo(place) + rng.normal(0, off, dim)
         angle = np.arctan2(towards[1], towards[0]) if planar else towards / np.linalg.norm(towards)
-        return bearing_range_factor(*keys, angle, 4.0, covariance(rng, dim)), [pose, place]
+        return bearing_range_factor(*keys, angle, 4.0, covariance(rng, dim)), [pose, place]  # type: ignore[call-arg]
 
     return make
 
@@ -113,7 +113,7 @@ def keeping_bend(rng, keys, covariance):
 
 
 def standing(rng, keys, covariance):
-    return on_plane_factor(*keys, 0.8, 0.01, state_dim=6, position=(4, 0, 2)), [rng.normal(0, 5, 6), some_plane(rng)]
+    return on_plane_factor(*keys, 0.8, 0.01, state_dim=6, position=(4, 0, 2)), [rng.normal(0, 5, 6), some_plane(rng)]  # type: ignore[call-arg]
 
 
 def detection(rng, keys, covariance):

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from kitti_example import write_sequence
-from nuscenes_random_drive import VERSION, write_random_drive
 from typer.testing import CliRunner, Result
 
 from data_tools.datasets.nuscenes import read_scored_scenes
 from data_tools.metrics import nuscenes_tracking_metrics
 from pipelines.cli import app
+from tests.data_tools.kitti_example import write_sequence
+from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
 
 
 def evaluate(*arguments: str | Path) -> Result:

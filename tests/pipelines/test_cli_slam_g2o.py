@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loops import loop
 from typer.testing import CliRunner
 
 from data_tools.pose_graphs import read_g2o, write_g2o
 from pipelines.cli import app
 from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
 from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
+from tests.saga_fg.loops import loop
 
 RECORDINGS = Path(os.environ.get("SAGA_FG_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "slam"
 

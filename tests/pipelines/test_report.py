@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from page_in_browser import tried_in_browser
 from typer.testing import CliRunner
 
 from data_tools.figures import FigureTable
@@ -34,6 +33,7 @@ from pipelines.report.run_record import record_path, write_run_record
 from pipelines.report.scenes import edges_of_moments, scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
+from tests.pipelines.page_in_browser import tried_in_browser
 
 SHORT = SimulatorSettings(duration=4.0, warm_up=5.0)
 CONFIG = load_config("simulated")

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-from page_in_browser import tried_in_browser
 
 from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
@@ -15,6 +14,7 @@ from saga_fg import Boxes, Frame, Scene
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.frame import Detections
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
+from tests.pipelines.page_in_browser import tried_in_browser
 
 ORIGIN = (100.0, 50.0)
 LIGHT = TrafficLight("north", (130.0, 50.0))

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
 from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.parts import HeldScene, Part
@@ -24,6 +23,7 @@ from pipelines.scale_out import (
 )
 from pipelines.scale_out.folder import OutputFolder
 from saga_fg.errors import InputError
+from tests.pipelines.scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
 
 def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> RunSummary:

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
-from scale_out_example import InThisProcess, content, write_recordings
 from typer.testing import CliRunner, Result
 
 from data_tools.datasets.nuscenes import read_tracking_results
@@ -23,6 +22,7 @@ from pipelines.cli import app
 from pipelines.scale_out import TrackTask
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
+from tests.pipelines.scale_out_example import InThisProcess, content, write_recordings
 
 COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
 
@@ -137,7 +137,7 @@ def test_a_killed_run_is_completed_by_the_next(tmp_path: Path) -> None:
 CLUSTER = """
 from pathlib import Path
 import sys
-from scale_out_example import Deadly, write_recordings
+from tests.pipelines.scale_out_example import Deadly, write_recordings
 from pipelines.scale_out import RayPool, run_scenes
 
 folder = Path(sys.argv[1])
@@ -151,7 +151,7 @@ assert sorted(report.done) == [f"a{k:02d}" for k in range(6)], report
 
 def test_a_ray_cluster_of_two_workers_of_which_one_is_killed(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray comes with the extra ray")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", CLUSTER, str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert result.returncode == 0, result.stderr

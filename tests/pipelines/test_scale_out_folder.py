@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from scale_out_example import TRACK, InThisProcess, content, write_recordings
 from typer.testing import CliRunner
 
 from pipelines.cli import app
@@ -18,6 +17,7 @@ from pipelines.scale_out.folder import OutputFolder, is_inside
 from pipelines.scale_out.manifest import file_name
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
+from tests.pipelines.scale_out_example import TRACK, InThisProcess, content, write_recordings
 
 
 def run(folder: Path, scenes: int = 1) -> RunSummary:

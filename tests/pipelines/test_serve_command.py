@@ -11,11 +11,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from running_service import COMMAND, frame, serving
 
 from pipelines.bench.service import ServiceBenchSettings, bench_service
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
+from tests.pipelines.running_service import COMMAND, frame, serving
 
 
 def test_clients_share_one_tracker_and_one_may_listen():

@@ -11,9 +11,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from running_service import frame, limits, serving, status, wait_for
-
 from pipelines.serving import Address, SocketServer, StreamClient, StreamSettings
+from tests.pipelines.running_service import frame, limits, serving, status, wait_for
 
 
 def connected(address: Address) -> socket.socket:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running_service import COMMAND, frame, serving, status, wait_for
 
 from pipelines.serving import Address, StreamClient
+from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
 FRAMES = 40
 

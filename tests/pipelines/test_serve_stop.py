@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 
 import pytest
-from running_service import COMMAND, frame, serving, status, wait_for
 
 from pipelines.serving import StreamClient
+from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
 STUCK = """
 import sys, time

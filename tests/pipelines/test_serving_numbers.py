@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running_service import COMMAND
 
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker
 from pipelines.serving.messages import encode
+from tests.pipelines.running_service import COMMAND
 
 
 def stream(**settings: Any) -> StreamTracker[None]:

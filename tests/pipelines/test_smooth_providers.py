@@ -84,7 +84,7 @@ def test_a_wall_of_the_configuration_moves_the_labels(walkers: Path) -> None:
 
 
 def test_in_chunks_and_from_python_it_is_the_same(walkers: Path) -> None:
-    from walls_of_this_test import Wall
+    from walls_of_this_test import Wall  # type: ignore[import-not-found]
 
     config = load_smooth_config("file", configuration(walkers.parent, "Wall"))
     parts = read_scenes_in_parts(walkers, 20)

@@ -10,7 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from scale_out_example import write_recordings
+
+from tests.pipelines.scale_out_example import write_recordings
 
 COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
 LINE = "terminated: what was complete is kept\n"

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kitti_example import write_sequence
-from nuscenes_example import VERSION, write_results, write_tables
 from typer.testing import CliRunner
 
 from data_tools.datasets.kitti import local_kitti
@@ -16,6 +14,8 @@ from data_tools.datasets.kitti.source import KittiPart, KittiSource
 from data_tools.files.remote_files import local_tree
 from pipelines.cli import app
 from saga_fg.errors import InputError
+from tests.data_tools.kitti_example import write_sequence
+from tests.data_tools.nuscenes_example import VERSION, write_results, write_tables
 
 Put = Callable[[Path, str], str]
 

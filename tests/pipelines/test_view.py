@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kitti_example import write_sequence
-from nuscenes_example import VERSION, tables, write_tables
 from typer.testing import CliRunner
 
 from data_tools.datasets.nuscenes import NuScenes, nuscenes_scans
@@ -25,6 +23,8 @@ from pipelines.view import SceneView, draw_scene, read_slam_view, write_view
 from pipelines.view.scenes import HELD, ellipses
 from saga_fg import InputError
 from saga_fg.tracking import Journal
+from tests.data_tools.kitti_example import write_sequence
+from tests.data_tools.nuscenes_example import VERSION, tables, write_tables
 
 Rows = dict[str, dict[Any, Any]]
 """Column -> time (None: always) -> value."""

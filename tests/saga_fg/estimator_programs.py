@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 
 class Add(NamedTuple):

@@ -5,14 +5,15 @@ kinds speak or are silent, some of them late.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
-from random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 EXACT = 1e-9  # standard deviations of means, relative difference of covariances
 
@@ -84,7 +85,7 @@ class Step:
     new_nodes: list = field(default_factory=list)
     seen: list = field(default_factory=list)
     gone: list = field(default_factory=list)
-    transition: object = None
+    transition: Any = None
 
 
 class Textbook:

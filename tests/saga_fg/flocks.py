@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from random_graphs import CAR
 from scipy.spatial import cKDTree
 
 from saga_fg import Edges, SceneGraph
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.random_graphs import CAR
 
 
 @dataclass

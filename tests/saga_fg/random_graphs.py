@@ -44,7 +44,7 @@ def interaction_edges(rng, nodes, interaction, density, max_rate):
             if not applies(interaction.needs, target_type, source_type):
                 continue
             rows = [[k for k, t in enumerate(nodes.types) if t is kind] for kind in (target_type, source_type)]
-            target, source = random_pairs(rng, *rows, density)
+            target, source = random_pairs(rng, *rows, density)  # type: ignore[call-arg]
             if len(target):
                 rate = rng.uniform(0, max_rate, len(target))
                 name = type(interaction).__name__
@@ -58,7 +58,7 @@ def arbitrary_edges(rng, types, density, max_rate):
     for d_i in sorted({t.dim for t in types}):
         for d_j in sorted({t.dim for t in types}):
             rows = [[k for k, t in enumerate(types) if t.dim == d] for d in (d_i, d_j)]
-            target, source = random_pairs(rng, *rows, density)
+            target, source = random_pairs(rng, *rows, density)  # type: ignore[call-arg]
             m = len(target)
             if m:
                 A_self = 0.3 * rng.normal(size=(m, d_i, d_i)) - np.eye(d_i)

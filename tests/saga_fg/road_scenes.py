@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from estimator_programs import Add, Marginalise, Predict, Update
 
 from saga_fg import ConstantVelocity, NodeType, RandomWalk
 from saga_fg.estimators import Measurements
@@ -15,6 +14,7 @@ from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
 from saga_fg.model.road.stopping import RedLight
+from tests.saga_fg.estimator_programs import Add, Marginalise, Predict, Update
 
 CAR = NodeType("vehicle", ConstantVelocity(acceleration_noise=0.5))
 STANDING = NodeType("standing", RandomWalk())

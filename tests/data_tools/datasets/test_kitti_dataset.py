@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_example import write_sequence
 
 from data_tools.datasets.kitti import KittiTracking
 from saga_fg import Dataset, InputError
+from tests.data_tools.kitti_example import write_sequence
 
 
 @pytest.fixture

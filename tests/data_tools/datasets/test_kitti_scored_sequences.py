@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_example import write_sequence
 
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
 from saga_fg import InputError, Tracks
+from tests.data_tools.kitti_example import write_sequence
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def write_truth_as_result(root: Path, folder: Path) -> None:
     for truth in scene.ground_truth or ():
         n = len(truth)
         velocity = np.tile([10.0, 0.0], (n, 1))
-        boxes = type(truth.boxes)(*(getattr(truth.boxes, f) for f in ("label", "position", "size", "yaw")), velocity)
+        boxes = type(truth.boxes)(*(getattr(truth.boxes, f) for f in ("label", "position", "size", "yaw")), velocity)  # type: ignore[call-arg]
         P = np.tile(np.diag([0.25, 0.5]), (n, 1, 1))
         moments.append(Tracks(0.0, np.arange(n) + 3, boxes, np.full(n, 0.5), P, P, np.zeros(n)))
     write_kitti_results(folder, data, [(scene, moments)])

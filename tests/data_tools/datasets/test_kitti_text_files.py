@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_example import CALIBRATION, LABELS, calibration_text, oxts_line
 
 from data_tools.datasets.kitti import has_box, read_calibration, read_kitti_labels, read_poses
 from saga_fg import InputError
 from saga_fg.numerics.geometry import transform_points
+from tests.data_tools.kitti_example import CALIBRATION, LABELS, calibration_text, oxts_line
 
 
 def write(path: Path, text: str) -> Path:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_example import write_sequence
 
 from data_tools.datasets.kitti import KittiScans
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform
+from tests.data_tools.kitti_example import write_sequence
 
 
 def with_scans(root: Path, *frames: int) -> Path:

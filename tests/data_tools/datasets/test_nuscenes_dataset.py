@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nuscenes_example import SAMPLES, START, Tables, box, results, tables, write_results, write_tables
 
 from data_tools.datasets.nuscenes import NuScenes
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.geometry import yaw_of
+from tests.data_tools.nuscenes_example import SAMPLES, START, Tables, box, results, tables, write_results, write_tables
 
 
 def dataset(tmp_path: Path, content: Tables | None = None, found: Any = None, **options: Any) -> NuScenes:

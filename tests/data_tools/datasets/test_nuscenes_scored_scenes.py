@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nuscenes_example import VERSION, annotation, box, tables, write_tables
 
 from data_tools.datasets.nuscenes.scored_scenes import read_scored_scenes
 from data_tools.metrics import nuscenes_tracking_metrics
 from saga_fg import InputError
+from tests.data_tools.nuscenes_example import VERSION, annotation, box, tables, write_tables
 
 
 def tracked(sample: str, track: str = "t", **changes: Any) -> dict[str, Any]:

@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from nuscenes_example import write_tables
 
 from data_tools.datasets.nuscenes import split_scenes
 from saga_fg import InputError
+from tests.data_tools.nuscenes_example import write_tables
 
 
 def scenes(root: Path, version: str, names: list[str], splits: object = None) -> Path:

@@ -11,9 +11,9 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from damage import Target, damaged, targets
 
 from saga_fg import InputError
+from tests.data_tools.damage import Target, damaged, targets
 
 INPUTS = 60
 SIZES = {

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damage import PCD, PLY
 
 from data_tools.lidar import read_scan
 from saga_fg import InputError
+from tests.data_tools.damage import PCD, PLY
 
 BINARY = PCD.replace("DATA ascii\n1 2 3\n4 5 6\n", "DATA binary\n").encode() + np.arange(6, dtype="<f4").tobytes()
 

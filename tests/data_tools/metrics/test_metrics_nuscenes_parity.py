@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nuscenes_random_drive import VERSION, write_random_drive
 
 from benchmarks.metrics import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
 from data_tools.datasets.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.scored_scenes import read_scored_scenes
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from saga_fg import Annotations, Boxes, InputError, Tracks
+from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
 
 
 @pytest.fixture(scope="session")

@@ -5,9 +5,6 @@ import pickle
 import gtsam
 import numpy as np
 import pytest
-from estimator_scenario import EXACT, Textbook, covariance_error, mean_error, part, random_scenario, tell
-from graph_keys import keys_of
-from random_graphs import BUS, CAR, CONE, POLE
 
 from factors import RangeBearing, Robust
 from saga_fg import Edges, InputError, SceneGraph
@@ -21,6 +18,9 @@ from saga_fg.estimators import (
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.nonlinear_interactions import SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
+from tests.saga_fg.estimator_scenario import EXACT, Textbook, covariance_error, mean_error, part, random_scenario, tell
+from tests.saga_fg.graph_keys import keys_of
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE
 
 
 def punctual(scenario):

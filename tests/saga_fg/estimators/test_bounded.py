@@ -5,17 +5,17 @@ import pickle
 import gtsam
 import numpy as np
 import pytest
-from estimator_programs import TextbookEstimator, new_nodes, random_program, run
-from flocks import flock, prior_deviation
-from graph_keys import keys_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_graphs import BUS, CAR, CONE, random_graph
 
 from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.estimators import BoundedKalmanFilter, JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.estimator_programs import TextbookEstimator, new_nodes, random_program, run
 from tests.saga_fg.estimators.test_conformance import BAD, assert_equal, in_step, measured
+from tests.saga_fg.flocks import flock, prior_deviation
+from tests.saga_fg.graph_keys import keys_of
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, random_graph
 
 COVERING = [{"core": 1000}, {"core": 1, "hops": 1000}]
 
@@ -74,7 +74,7 @@ def side_by_side():
     prior, record = flock(seed=4, n=150, frames=25)
     exact, bounded = JointKalmanFilter(), {hops: BoundedKalmanFilter(hops=hops, core=12) for hops in (1, 2, 3)}
     for estimator in (exact, *bounded.values()):
-        estimator.add(nodes, prior, np.tile(np.diag(prior_deviation() ** 2), (150, 1, 1)))
+        estimator.add(nodes, prior, np.tile(np.diag(prior_deviation() ** 2), (150, 1, 1)))  # type: ignore[attr-defined]
     errors, nees, likelihoods = {h: [] for h in bounded}, {h: [] for h in (0, *bounded)}, {h: [] for h in bounded}
     for k, frame in enumerate(record):
         exact.predict(frame.transition)
@@ -166,7 +166,7 @@ def test_covariances_are_positive_definite(seed, hops, core, patience, density):
             assert np.allclose(P, P.T, rtol=0, atol=1e-12 * np.abs(P).max(initial=0))
             assert (np.linalg.eigvalsh(correlation(P)) > 0).all()
             start = 0
-            for node in some:
+            for node in some:  # type: ignore[attr-defined]
                 own = alone[int(node)]
                 at = slice(start, start + len(own))
                 assert np.allclose(P[at, at], own, rtol=1e-9, atol=1e-12 * np.abs(own).max())

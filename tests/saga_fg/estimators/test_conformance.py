@@ -13,7 +13,15 @@ import textwrap
 import gtsam
 import numpy as np
 import pytest
-from estimator_programs import (
+
+from factors import SolverSettings
+from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
+from saga_fg.estimators import BatchSolver, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.graph import SceneFactorGraph
+from saga_fg.graph.keys import node_key
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.transition import Blocks
+from tests.saga_fg.estimator_programs import (
     Add,
     Marginalise,
     Predict,
@@ -23,18 +31,10 @@ from estimator_programs import (
     random_program,
     run,
 )
-from estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
-from graph_keys import newest_key
-from random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
-from road_scenes import road_program
-
-from factors import SolverSettings
-from saga_fg import Edges, InputError, SagaError, SceneGraph, UnknownNodeError
-from saga_fg.estimators import BatchSolver, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
-from saga_fg.graph import SceneFactorGraph
-from saga_fg.graph.keys import node_key
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.transition import Blocks
+from tests.saga_fg.estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
+from tests.saga_fg.graph_keys import newest_key
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
+from tests.saga_fg.road_scenes import road_program
 
 ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
@@ -433,11 +433,11 @@ def test_rate_zero_is_independent_filters_exactly(make, seed):
 def only(operation, node):
     """Return the part of an operation on one node; None if it has none."""
     if isinstance(operation, Predict):
-        graph = operation.transition.graph
+        graph = operation.transition.graph  # type: ignore[attr-defined]
         rows = np.flatnonzero(graph.nodes == node)
         if len(rows) == 0:
             return None
-        return Predict(discretise(SceneGraph([node], (graph.types[rows[0]],)), operation.transition.dt))
+        return Predict(discretise(SceneGraph([node], (graph.types[rows[0]],)), operation.transition.dt))  # type: ignore[attr-defined]
     if isinstance(operation, Update):
         m = operation.measurements
         rows = np.flatnonzero(m.nodes == node)

@@ -8,13 +8,13 @@ Kirubarajan 2001, section 5.4.2).
 
 import numpy as np
 import pytest
-from random_graphs import BUS, CAR, interaction_edges, node_table
 from scipy.stats import chi2
 
 from saga_fg import Edges, SceneGraph
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
+from tests.saga_fg.random_graphs import BUS, CAR, interaction_edges, node_table
 
 RUNS = 200
 TYPES = (CAR, CAR, BUS, CAR, BUS, CAR)

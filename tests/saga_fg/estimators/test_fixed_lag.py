@@ -5,7 +5,15 @@ import pickle
 import gtsam
 import numpy as np
 import pytest
-from estimator_scenario import (
+
+from factors import RangeBearing, Robust
+from saga_fg import InputError, SceneGraph, UnknownNodeError
+from saga_fg.estimators import FixedLagSmoother, GraduatedNonConvexity, Measurements, Observations
+from saga_fg.graph import OBJECT, key_of
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.nonlinear_interactions import SocialForce
+from saga_fg.model.scene_graph import NonlinearEdges
+from tests.saga_fg.estimator_scenario import (
     EXACT,
     Textbook,
     admissible,
@@ -17,16 +25,8 @@ from estimator_scenario import (
     random_scenario,
     tell,
 )
-from graph_keys import keys_of
-from random_graphs import BUS, CAR, CONE, POLE
-
-from factors import RangeBearing, Robust
-from saga_fg import InputError, SceneGraph, UnknownNodeError
-from saga_fg.estimators import FixedLagSmoother, GraduatedNonConvexity, Measurements, Observations
-from saga_fg.graph import OBJECT, key_of
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.nonlinear_interactions import SocialForce
-from saga_fg.model.scene_graph import NonlinearEdges
+from tests.saga_fg.graph_keys import keys_of
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.6, 100.0])

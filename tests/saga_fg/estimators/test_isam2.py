@@ -5,13 +5,20 @@ import pickle
 import gtsam
 import numpy as np
 import pytest
-from estimator_scenario import Textbook, covariance_error, mean_error, part, random_covariance, random_scenario
-from random_graphs import BUS, CAR, CONE, POLE, random_graph
 
 from saga_fg import Edges, SceneGraph
 from saga_fg.estimators import IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import OBJECT, key_of
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.estimator_scenario import (
+    Textbook,
+    covariance_error,
+    mean_error,
+    part,
+    random_covariance,
+    random_scenario,
+)
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, random_graph
 
 EXACT = 1e-9
 
@@ -173,7 +180,7 @@ def test_what_gtsam_refuses_is_done_without_it(monkeypatch):
 def test_little_noise_beside_large_variances_costs_no_digits():
     """Acceleration noise of 1e-10 m^2/s^3 over 10 ms: information matrices have nothing left, moments all."""
     quiet = SceneGraph.of([1, 2], CAR)
-    quiet = SceneGraph([1, 2], tuple(type(CAR)("quiet", type(CAR.motion)(acceleration_noise=1e-10)) for _ in range(2)))
+    quiet = SceneGraph([1, 2], tuple(type(CAR)("quiet", type(CAR.motion)(acceleration_noise=1e-10)) for _ in range(2)))  # type: ignore[call-arg]
     textbook, estimator = Textbook(), IncrementalFilter()
     rng = np.random.default_rng(5)
     calls = [("add", [1, 2], 1e3 * rng.normal(size=(2, 4)), np.tile(100 * np.eye(4), (2, 1, 1)))]

@@ -6,14 +6,14 @@ import textwrap
 
 import numpy as np
 import pytest
-from estimator_scenario import covariance_error, random_covariance, random_scenario
-from random_graphs import BUS, CAR, CONE, POLE, TRAM
 
 from factors import RangeBearing, Robust
 from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.estimators import BatchSmoother, GraduatedNonConvexity, Measurements, Observations
 from saga_fg.estimators.sparse_elimination import cheapest_order
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.estimator_scenario import covariance_error, random_covariance, random_scenario
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM
 
 EXACT = 1e-9
 

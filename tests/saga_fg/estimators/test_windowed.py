@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from estimator_programs import random_program
-from random_graphs import CAR, CONE
 
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
 from saga_fg.errors import InputError
@@ -11,6 +9,8 @@ from saga_fg.estimators import BatchSmoother, Measurements, WindowedSmoother, Wi
 from saga_fg.estimators.backward import future_influence
 from saga_fg.estimators.recording import Recording
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.estimator_programs import random_program
+from tests.saga_fg.random_graphs import CAR, CONE
 
 SHORT = (0.02, 0.1, 0.2)
 

@@ -9,9 +9,6 @@ from functools import partial
 import gtsam
 import numpy as np
 import pytest
-from estimator_programs import Add, Marginalise, TextbookEstimator, random_program
-from random_graphs import CAR, POLE, TRAM
-from traffic_frames import run, seen, straight
 
 from factors import (
     ResidualFactor,
@@ -28,8 +25,11 @@ from factors import (
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.graph import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, Additions, GraphError, NewVariable
+from tests.saga_fg.estimator_programs import Add, Marginalise, TextbookEstimator, random_program
+from tests.saga_fg.random_graphs import CAR, POLE, TRAM
 from tests.saga_fg.tracking.test_tracker_road import SENSORS, queue_frames
 from tests.saga_fg.tracking.test_tracker_road import SETTINGS as ROAD
+from tests.saga_fg.traffic_frames import run, seen, straight
 
 BACK_ENDS = {
     "kalman": JointKalmanFilter,
@@ -321,9 +321,10 @@ def test_what_the_kalman_filter_does_not_take_is_refused_by_name(provider, messa
 def test_what_fails_is_named_and_the_tracker_goes_on(name):
     """An undetermined landmark, one that is half determined, a residual that is not finite, a provider that raises."""
     faults = {
-        "landmark 2: not determined by the factors": lambda view, key: Additions([landmark]),
+        "landmark 2: not determined by the factors": lambda view, key: Additions([landmark]),  # type: ignore[has-type]
         r"landmark 2: not determined by the factors \(factors on landmark 2: 1 ": lambda view, key: Additions(
-            [landmark], [gaussian_factor([view.key(LANDMARK, 2, static=True)], [np.eye(1, 2)], [0.0])]
+            [landmark],  # type: ignore[has-type]
+            [gaussian_factor([view.key(LANDMARK, 2, static=True)], [np.eye(1, 2)], [0.0])],
         ),
         "provider faulty: wall on car 1 at 0.50 s: .*finite": lambda view, key: Additions(
             factors=[ResidualFactor((key,), (Vector(4),), lambda x: [np.nan], np.eye(1), name="wall")]

@@ -9,13 +9,13 @@ import traceback
 import gtsam
 import numpy as np
 import pytest
-from random_graphs import CAR
 
 from factors import ResidualFactor, ResidualFactors, Vector, gaussian_factor, interaction_factor, prior_factor
 from saga_fg import InputError, SceneGraph
 from saga_fg.estimators import GraphFilter, IncrementalSmoother, JointKalmanFilter, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, LANDMARK, OBJECT, Additions, GraphError, NewVariable, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.random_graphs import CAR
 
 UNIT = gtsam.noiseModel.Isotropic.Sigma
 

@@ -4,9 +4,6 @@ import copy
 
 import numpy as np
 import pytest
-from estimator_programs import random_program
-from graph_estimator import GraphEstimator
-from random_graphs import CAR, CONE
 
 from factors import ResidualFactors, prior_factor
 from pipelines.bench.sampled_traffic import (
@@ -19,7 +16,10 @@ from pipelines.bench.sampled_traffic import (
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraduatedNonConvexity, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphError, NewVariable, UndeterminedError, key_of
+from tests.saga_fg.estimator_programs import random_program
 from tests.saga_fg.graph.test_running_graph_linear import MILLISECONDS, USUAL, largest_errors
+from tests.saga_fg.graph_estimator import GraphEstimator
+from tests.saga_fg.random_graphs import CAR, CONE
 
 
 class Batch(GraphEstimator):

@@ -135,7 +135,7 @@ def test_a_pose_far_from_its_base_is_where_its_factors_say():
     new = NewVariable(EGO_POSE, 0, gtsam.Pose3())
     smoother = IncrementalSmoother([Once(Additions([new], [pose_prior_factor(key, far.matrix(), P)]))])
     smoother.step(0.0)
-    assert smoother.state(key).equals(far, 1e-9)
+    assert smoother.state(key).equals(far, 1e-9)  # type: ignore[attr-defined]
     np.testing.assert_allclose(smoother.covariance(key), P, atol=1e-8)
 
 
@@ -223,10 +223,9 @@ def test_noise_of_a_millisecond_is_noise(one_bus_for_a_millisecond):
 
 @pytest.fixture
 def one_bus_for_a_millisecond():
-    from random_graphs import BUS
-
     from saga_fg import SceneGraph
     from saga_fg.model.discretisation import discretise
+    from tests.saga_fg.random_graphs import BUS
 
     smoother = BatchSmoother()
     smoother.add([1], np.zeros((1, 6)), np.eye(6)[None])

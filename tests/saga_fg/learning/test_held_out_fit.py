@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from following_pairs import RATE, following_pairs
 
 from saga_fg.learning import (
     FORMS_OF_TRACKERS,
@@ -18,6 +17,7 @@ from saga_fg.learning import (
 from saga_fg.learning.held_out_fit import HIDDEN, coupled_classes, held_out_parts
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing
+from tests.saga_fg.following_pairs import RATE, following_pairs
 
 SHORT = GapSettings(longest=1.5)
 OWN = FilterNoise({"car": 0.3, "default": 0.3}, 0.005)

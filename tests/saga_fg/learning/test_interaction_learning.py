@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from following_pairs import GAP, RATE, following_pairs
 
 from saga_fg import InputError
 from saga_fg.learning import (
@@ -28,6 +27,7 @@ from saga_fg.model.edge_features import EdgeFeatures
 from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedCourse, SharedVelocity
+from tests.saga_fg.following_pairs import GAP, RATE, following_pairs
 
 SHORT = GapSettings(longest=1.5)
 FOLLOW = Following(CarFollowing(time_constant=math.inf), rate=0.3, gap_scale=20.0)

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from following_pairs import following_pairs
 
 from saga_fg.learning import GapSettings, filter_independently, gap_errors, predict_gaps, sample_gaps
 from saga_fg.learning.interaction_fit import predict_with
 from saga_fg.learning.network_fit import fit_networks, network_loss, network_template
 from saga_fg.model.edge_features import EdgeEnds, edge_features
 from saga_fg.model.edge_network import edge_rates, messages
+from tests.saga_fg.following_pairs import following_pairs
 
 jax = pytest.importorskip("jax", reason="the extra [learn] is not installed")
 ravel_pytree = pytest.importorskip("jax.flatten_util").ravel_pytree

@@ -5,12 +5,22 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, interaction_edges, node_table, random_graph, random_types
 
 from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.model.discretisation import discretise, joint_generator
-from saga_fg.model.edge_rules import NodeTable
-from saga_fg.model.interactions import CarFollowing, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from tests.saga_fg.random_graphs import (
+    BUS,
+    CAR,
+    CONE,
+    MOVING,
+    POLE,
+    TRAM,
+    interaction_edges,
+    node_table,
+    random_graph,
+    random_types,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))

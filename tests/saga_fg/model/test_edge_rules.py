@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_graphs import BUS, CAR, CONE
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.numerics.geometry import yaw_transform
+from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from road_scenes import queue, table
 
 from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
@@ -14,6 +13,7 @@ from saga_fg.model.edge_rules import Following, build_graph
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.road.stopping import DriverStopping, RedLight
 from saga_fg.model.stability import require_stable
+from tests.saga_fg.road_scenes import queue, table
 
 DRIVER = IntelligentDriver(
     free_speed=14.0, headway=1.2, acceleration=1.5, deceleration=2.0, hidden_vehicle_gap=math.inf

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
 
 from saga_fg import NodeType, RandomWalk
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 from saga_fg.numerics.geometry import yaw_transform
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
 
 seeds = st.integers(0, 2**32 - 1)
 pairs_of_types = st.tuples(st.sampled_from(MOVING), st.sampled_from(MOVING))
@@ -142,9 +142,9 @@ def test_many_edges_are_the_edges_one_by_one():
     nodes = node_table(np.random.default_rng(8), (BUS,) * 5)
     target, source = np.array([0, 1, 4, 2]), np.array([1, 0, 2, 3])
     for interaction in INTERACTIONS:
-        together = interaction.triples(nodes, target, source)
+        together = interaction.triples(nodes, target, source)  # type: ignore[attr-defined]
         for k in range(4):
-            alone = interaction.triples(nodes, target[k : k + 1], source[k : k + 1])
+            alone = interaction.triples(nodes, target[k : k + 1], source[k : k + 1])  # type: ignore[attr-defined]
             for a, b in zip(together, alone, strict=True):
                 assert np.array_equal(a[k], b[0])
 
@@ -152,9 +152,11 @@ def test_many_edges_are_the_edges_one_by_one():
 def test_interactions_say_which_types_they_act_on():
     rider = NodeType("drifting", RandomWalk(("vx", "vy"), drift=0.1))
     for interaction in INTERACTIONS:
-        assert all(applies(interaction.needs, a, b) for a in MOVING for b in MOVING)
+        assert all(applies(interaction.needs, a, b) for a in MOVING for b in MOVING)  # type: ignore[attr-defined]
         assert not any(
-            applies(interaction.needs, a, b) or applies(interaction.needs, b, a) for a in MOVING for b in (CONE, POLE)
+            applies(interaction.needs, a, b) or applies(interaction.needs, b, a)  # type: ignore[attr-defined]
+            for a in MOVING
+            for b in (CONE, POLE)  # type: ignore[attr-defined]
         )
     assert applies(SharedVelocity.needs, CAR, rider)
     assert not applies(CarFollowing.needs, CAR, rider)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_graphs import CAR
 
 from pipelines.configuration import read_settings, write_settings
 from saga_fg import InputError
@@ -16,6 +15,7 @@ from saga_fg.model.edge_network import FEATURES, EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity, velocity_triples
 from saga_fg.model.learned_interactions import LearnedInteractions
+from tests.saga_fg.random_graphs import CAR
 
 
 def network(seed=0, hidden=4, **changes):

@@ -81,8 +81,8 @@ def test_accelerations_and_their_derivatives(name):
     (law, given), rng = GIVEN[name], np.random.default_rng(2)
     own, other = 4 * rng.normal(size=(40, 4)), rng.normal(size=(40, 4))
     stacked = np.broadcast_to(given, (40, *given.shape))
-    _, by_own, by_other = law.accelerations(own, other, stacked)
-    expected = stacked_differences(lambda a, b: law.accelerations(a, b, stacked).value, [own, other])
+    _, by_own, by_other = law.accelerations(own, other, stacked)  # type: ignore[attr-defined]
+    expected = stacked_differences(lambda a, b: law.accelerations(a, b, stacked).value, [own, other])  # type: ignore[attr-defined]
     np.testing.assert_allclose(by_own, expected[0], atol=1e-6 * max(1.0, np.abs(by_own).max()))
     np.testing.assert_allclose(by_other, expected[1], atol=1e-6 * max(1.0, np.abs(by_own).max()))
 

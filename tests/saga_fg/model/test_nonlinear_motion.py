@@ -7,7 +7,6 @@ Levenberg-Marquardt finds on the graph they export.
 import gtsam
 import numpy as np
 import pytest
-from graph_keys import keys_of
 
 from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SagaError, SceneGraph
 from saga_fg.estimators import (
@@ -26,6 +25,7 @@ from saga_fg.model.motion import RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
+from tests.saga_fg.graph_keys import keys_of
 
 CAR, BIKE = NodeType("car", CoordinatedTurn(0.5, 0.02)), NodeType("bike", Bicycle(0.5))
 WALKER, WALL = NodeType("walker", ConstantVelocity(0.3)), NodeType("wall", RandomWalk(drift=0.01))
@@ -150,11 +150,11 @@ def test_a_flow_is_the_motion_the_law_and_the_linear_edges():
         columns = [np.stack([START[r] for r in rows]) for rows in flow.rows.T]
         moved.update(zip(flow.rows[:, 0].tolist(), flow.predict(columns), strict=True))
     assert sorted(moved) == [0, 1, 2, 3, 4, 6]
-    np.testing.assert_allclose(moved[0], CAR.motion.flow(np.array(START[0]), dt), atol=1e-12)
+    np.testing.assert_allclose(moved[0], CAR.motion.flow(np.array(START[0]), dt), atol=1e-12)  # type: ignore[attr-defined]
     bike, leader = np.array(START[2]), np.array(START[1])
     a = SmoothDriver().accelerations(bike[:4], leader[:4], np.array(3.5)).value
     pushed = np.concatenate([dt * dt / 2 * a, dt * a, [0.0]])
-    np.testing.assert_allclose(moved[2], BIKE.motion.flow(bike, dt) + pushed, atol=1e-12)
+    np.testing.assert_allclose(moved[2], BIKE.motion.flow(bike, dt) + pushed, atol=1e-12)  # type: ignore[attr-defined]
     straight = [*START[1][:4], 0.0]
     linear = discretise(SceneGraph(graph.nodes, graph.types, graph.edges), dt)
     (flow,) = (f for f in nonlinear_dynamics(linear) if f.rows.shape[1] == 2)

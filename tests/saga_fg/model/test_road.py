@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from road_scenes import bent_lane, queue, table, taper
 
 from saga_fg import InputError
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
@@ -20,6 +19,7 @@ from saga_fg.model.road.stopping import RedLight, Stopping
 from saga_fg.numerics.polyline import direction_at, feet
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
 from saga_fg.types.signal import COLOURS, SignalSettings, colour_updated
+from tests.saga_fg.road_scenes import bent_lane, queue, table, taper
 
 
 def pull(nodes, rule):

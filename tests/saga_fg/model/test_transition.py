@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from random_graphs import BUS, CAR, CONE
 
 from saga_fg import Edges, InputError, SceneGraph
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.transition import Blocks, Transition
+from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
 GRAPH = SceneGraph([4, 9, 2], (CAR, BUS, CONE))
 TRANSITION = discretise(GRAPH, 0.5)

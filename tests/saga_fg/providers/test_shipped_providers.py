@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -39,11 +40,11 @@ def frame(k: int, ego: EgoMeasurements | None) -> Frame:
     return Frame(DT * k, "ego", Detections.empty(), ego=ego)
 
 
-def now(smoother: IncrementalSmoother, kind: object) -> int:
+def now(smoother: IncrementalSmoother, kind: Any) -> int:
     return smoother.graph().of(kind, smoother.graph().epoch)[0].key
 
 
-def nees(smoother: IncrementalSmoother, key: int, truth: object) -> float:
+def nees(smoother: IncrementalSmoother, key: int, truth: Any) -> float:
     """Normalised squared error per dimension."""
     kind = smoother.graph().variable(key).type
     e = kind.local(smoother.state(key), truth)
@@ -147,8 +148,8 @@ def test_a_vehicle_without_samples_goes_straight_on() -> None:
     for k in range(11):
         smoother.step(DT * k, frame=frame(k, None))
     pose = smoother.state(now(smoother, EGO_POSE))
-    assert pose.translation() == pytest.approx([4.0, 1.0, 0.0], abs=1e-6)
-    assert pose.rotation().yaw() == pytest.approx(0.3, abs=1e-9)
+    assert pose.translation() == pytest.approx([4.0, 1.0, 0.0], abs=1e-6)  # type: ignore[attr-defined]
+    assert pose.rotation().yaw() == pytest.approx(0.3, abs=1e-9)  # type: ignore[attr-defined]
     assert np.sqrt(smoother.covariance(now(smoother, EGO_VELOCITY))[0, 0]) > 3.0
 
 
@@ -163,8 +164,8 @@ def test_an_increment_is_shared_out_over_the_epochs_it_covers() -> None:
             smoother.step(0.4 * (k + 1) / epochs, frame=frame(k, measured))
         key = now(smoother, EGO_POSE)
         ends.append((smoother.state(key), smoother.covariance(key)))
-    assert ends[0][0].localCoordinates(step) == pytest.approx(np.zeros(3), abs=1e-9)
-    assert ends[1][0].localCoordinates(step) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert ends[0][0].localCoordinates(step) == pytest.approx(np.zeros(3), abs=1e-9)  # type: ignore[attr-defined]
+    assert ends[1][0].localCoordinates(step) == pytest.approx(np.zeros(3), abs=1e-9)  # type: ignore[attr-defined]
     assert np.sqrt(np.diag(ends[1][1])) == pytest.approx(np.sqrt(np.diag(ends[0][1])), rel=0.25)
 
 
@@ -175,7 +176,7 @@ def test_a_fix_far_off_is_gated_or_given_up(gps: Gps, heeds: bool) -> None:
         off = 60.0 if k == 7 else 0.0
         still = OdometryIncrement(np.eye(3), DT, 0.01 * np.eye(3))
         smoother.step(DT * k, frame=frame(k, EgoMeasurements(still if k else None, GpsFix([off, 0.0]))))
-    assert (abs(smoother.state(now(smoother, EGO_POSE)).x()) > 1.0) == heeds
+    assert (abs(smoother.state(now(smoother, EGO_POSE)).x()) > 1.0) == heeds  # type: ignore[attr-defined]
 
 
 def test_the_antenna_says_where_the_vehicle_points() -> None:
@@ -196,7 +197,7 @@ class Parked:
     def __init__(self, label: str) -> None:
         self.label = label
 
-    def factors(self, view: object) -> Additions:
+    def factors(self, view: Any) -> Additions:
         from factors import gaussian_factor, interaction_factor, prior_factor
 
         key, before = view.key(OBJECT, 1), view.before(OBJECT)
@@ -323,7 +324,7 @@ SPACE = StartSettings((0.0, 0.0, 0.0), planar=False)
     ],
 )
 def test_what_does_not_fit_is_one_error_and_the_smoother_goes_on(
-    providers: Sequence[object], ego: EgoMeasurements, message: str
+    providers: Sequence[Any], ego: EgoMeasurements, message: str
 ) -> None:
     smoother = IncrementalSmoother(providers)
     smoother.step(0.0)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from ego_drive import drive, new_tracker
 from scipy.stats import chi2
 
 from saga_fg import Boxes, Detections, Frame, InputError
@@ -12,6 +11,7 @@ from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise,
 from saga_fg.slam.joint.record import record_epochs
 from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.types.landmark import Observation
+from tests.saga_fg.ego_drive import drive, new_tracker
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ego_drive import NOISE, new_tracker
 
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -22,6 +21,7 @@ from saga_fg.slam.joint import (
 )
 from saga_fg.slam.joint.lanes import KnownLane, LaneAssociation, assign_lanes, known_lanes
 from saga_fg.types.road_map import Lane, RoadMap
+from tests.saga_fg.ego_drive import NOISE, new_tracker
 
 RADIUS = 200.0  # m of the bend
 ASIDE = 0.15  # m that the left lane lies to the left of where the map has it

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ego_drive import drive, new_tracker
 from scipy.stats import chi2
 
 from saga_fg import InputError
@@ -15,6 +14,7 @@ from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointSettings, OnlineEstimator, estimate_jointly, estimate_online
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.landmark import Observation
+from tests.saga_fg.ego_drive import drive, new_tracker
 from tests.saga_fg.slam.test_joint import POOR, worse
 
 SETTINGS = JointSettings(POOR)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from loops import loop, moved
 
 from factors import Robust, pose
 from saga_fg import InputError
 from saga_fg.slam.pose_graph import chordal_poses, factor_graph, nearest_rotations, optimise_poses, pose_values
+from tests.saga_fg.loops import loop, moved
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from traffic_frames import frame, run
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.deletion import duplicate_tracks
+from tests.saga_fg.traffic_frames import frame, run
 
 
 @pytest.mark.parametrize(

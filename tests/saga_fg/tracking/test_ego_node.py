@@ -6,11 +6,11 @@ import copy
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
-from traffic_frames import at_pose, frame, seen, straight, turning_vehicle
 
 from saga_fg import ConstantVelocity, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import IncrementalSmoother
@@ -21,6 +21,7 @@ from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Odometry, StartSettings
 from saga_fg.tracking import AssociationSettings, ClassSettings, EgoNodeSettings
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, OdometryIncrement
+from tests.saga_fg.traffic_frames import at_pose, frame, seen, straight, turning_vehicle
 
 PLACE = np.array([4000.0, -7000.0])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
@@ -101,11 +102,11 @@ def errors(step: Callable[[Frame], object], frames: list[tuple[Frame, np.ndarray
     result = []
     for k, (told, truth) in enumerate(frames):
         tracks = step(told)
-        apart = np.linalg.norm(tracks.boxes.position[:, None, :2] - truth, axis=2)
+        apart = np.linalg.norm(tracks.boxes.position[:, None, :2] - truth, axis=2)  # type: ignore[attr-defined]
         nearest = np.argmin(apart, axis=0)
-        e = tracks.boxes.position[nearest, :2] - truth
+        e = tracks.boxes.position[nearest, :2] - truth  # type: ignore[attr-defined]
         if k >= 10:
-            result.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(tracks.position_covariance[nearest]), e) / 2)
+            result.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(tracks.position_covariance[nearest]), e) / 2)  # type: ignore[attr-defined]
     return np.array(result)
 
 
@@ -119,10 +120,10 @@ def test_objects_err_as_they_say_where_the_pose_is_uncertain() -> None:
         path = IncrementalSmoother([Odometry(START), Gps(gate=1)])
         plain = Tracker(TrackerSettings(classes=MODEL, edges=()), SENSORS)
 
-        def step(told: Frame, path: IncrementalSmoother = path, plain: Tracker = plain) -> object:
+        def step(told: Frame, path: IncrementalSmoother = path, plain: Tracker = plain) -> Any:
             path.step(told.timestamp, frame=told)
             pose = path.state(path.graph().of(EGO_POSE, path.graph().epoch)[0].key)
-            return plain.step(replace(told, world_T_ego=yaw_transform(pose.x(), pose.y(), 0.0, pose.theta())))
+            return plain.step(replace(told, world_T_ego=yaw_transform(pose.x(), pose.y(), 0.0, pose.theta())))  # type: ignore[attr-defined]
 
         if seed < 2:
             decoupled.append(errors(step, frames).mean())
@@ -160,7 +161,7 @@ def hidden_follower(seed: int) -> list[tuple[Frame, float, bool]]:
     return frames
 
 
-def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[object, ...] = ()) -> float:
+def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[Any, ...] = ()) -> float:
     """RMS error of the follower's place while it is hidden, m."""
     classes = {"default": ClassSettings(motion=ConstantVelocity(acceleration_noise=1.0), max_coasting=3.0)}
     settings = TrackerSettings(

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from traffic_frames import NAN, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 from saga_fg import Detection, Detections, Frame, GreedyTracker, Sensor
 from saga_fg.model.sensor import Extrinsics
 from saga_fg.tracking import GreedySettings
+from tests.saga_fg.traffic_frames import NAN, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 TRUTH = straight([(0, 0), (20, 5)], [(8, 0), (4, 2)])
 TENTHS = np.arange(0, 2, 0.1)

@@ -52,9 +52,9 @@ def test_a_filter_takes_the_linearisation_at_the_prediction(kind):
     plain.predict(discretise(SceneGraph.of([1, 2], CAR), 0.1))
     before = apart(plain, filtered)
     x = plain.mean([1, 2])
-    J = model.jacobian(x)
-    innovation = model.predict(TRUTH + 0.1 * np.roll(TRUTH, 2, axis=1) * [1, 1, 0, 0]) - model.predict(x)
-    angles = list(model.angles)
+    J = model.jacobian(x)  # type: ignore[attr-defined]
+    innovation = model.predict(TRUTH + 0.1 * np.roll(TRUTH, 2, axis=1) * [1, 1, 0, 0]) - model.predict(x)  # type: ignore[attr-defined]
+    angles = list(model.angles)  # type: ignore[attr-defined]
     innovation[:, angles] = (innovation[:, angles] + np.pi) % (2 * np.pi) - np.pi
     plain.update(Measurements([1, 2], innovation + (J @ x[:, :, None])[:, :, 0], J, noise(model)))
     assert apart(filtered, plain) < 1e-9

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from traffic_frames import NAN, SIZE, frame
 
 from saga_fg import Boxes, Tracker, TrackerSettings
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.existence import covered
+from tests.saga_fg.traffic_frames import NAN, SIZE, frame
 
 ALL = np.array([True, True])
 EGO = yaw_transform(0.0, 0.0, 0.0, 0.0)

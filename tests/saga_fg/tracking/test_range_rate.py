@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from traffic_frames import at_pose, frame, straight, turning_vehicle
 
 from saga_fg import Boxes, Detection, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import Extrinsics, NoiseModel
 from saga_fg.numerics.geometry import yaw_transform
+from tests.saga_fg.traffic_frames import at_pose, frame, straight, turning_vehicle
 
 NAN = float("nan")
 RADAR = Sensor(noise={"default": NoiseModel(position=0.5, range_rate=0.1)})

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from traffic_frames import NAN, frame, run
 
 from saga_fg import Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
+from tests.saga_fg.traffic_frames import NAN, frame, run
 
 
 def told(noise, yaw=np.pi / 2, score=0.9):

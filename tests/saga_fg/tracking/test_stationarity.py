@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import Sensor, Tracker, TrackerSettings
 from saga_fg.tracking import StationaritySettings
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.stationarity import Stationarity
+from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 ON = StationaritySettings(prior=0.5)
 SETTINGS = TrackerSettings(edges=(), stationarity=ON)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
-from traffic_frames import frame
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.track_table import TrackTable
+from tests.saga_fg.traffic_frames import frame
 
 SETTINGS = TrackerSettings(class_groups=(("car", "truck"),))
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 from saga_fg import (
     ConstantAcceleration,
@@ -17,6 +16,7 @@ from saga_fg import (
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import ClassSettings, ExistenceSettings
+from tests.saga_fg.traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 TENTHS = np.arange(0, 5, 0.1)
 

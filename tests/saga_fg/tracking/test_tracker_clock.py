@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.tracking import ClassSettings, ClockSettings, GreedySettings
 from saga_fg.tracking.clock import REMEMBERED, Clock
+from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 CARS = straight([(0.0, 0.0), (0.0, 8.0)], [(5.0, 0.0), (6.0, 0.0)])
 MAKERS = {

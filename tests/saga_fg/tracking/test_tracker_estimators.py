@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from traffic_frames import frame, run, seen, straight
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
+from tests.saga_fg.traffic_frames import frame, run, seen, straight
 
 CLASSES = {
     "car": ClassSettings(motion=ConstantVelocity(1.0), gate=1 - 1e-7),

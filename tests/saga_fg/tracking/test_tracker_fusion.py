@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from traffic_frames import frame, run, seen, straight
 
 from saga_fg import Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
+from tests.saga_fg.traffic_frames import frame, run, seen, straight
 
 WEAK = {"camera": Sensor(initiation="confirmed", noise={"default": NoiseModel(position=0.5)})}
 TENTHS = np.arange(0, 2, 0.1)

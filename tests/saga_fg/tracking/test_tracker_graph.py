@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import ConstantVelocity, Detections, Frame, InputError, Tracker, TrackerSettings
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.tracking import AssociationSettings, ClassSettings
+from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 PATIENT = {
     "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_coasting=10.0)},

@@ -6,15 +6,16 @@ import copy
 import pickle
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
-from traffic_frames import frame, run, seen, straight
 
 from factors import ResidualFactors
 from saga_fg import Frame, InputError, Tracker, TrackerSettings
 from saga_fg.graph import OBJECT, Additions, GraphError, GraphView
 from saga_fg.tracking import AssociationSettings
+from tests.saga_fg.traffic_frames import frame, run, seen, straight
 
 PLACE = np.array([5e5, -3e5])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
@@ -50,7 +51,7 @@ def frames(count: int = 12) -> list[Frame]:
     return seen(np.random.default_rng(0), CARS, np.arange(count) / 10)
 
 
-def same(a: object, b: object, tolerance: float) -> None:
+def same(a: Any, b: Any, tolerance: float) -> None:
     assert a.id.tolist() == b.id.tolist()
     for name in ("position", "velocity"):
         assert getattr(a.boxes, name) == pytest.approx(getattr(b.boxes, name), abs=tolerance)
@@ -105,7 +106,7 @@ def test_variables_have_the_names_of_their_classes_and_times() -> None:
         (lambda x: 1 / 0, "provider faulty: .*division by zero"),
     ],
 )
-def test_a_faulty_factor_is_named_and_the_tracker_goes_on(residual: Callable[..., object], message: str) -> None:
+def test_a_faulty_factor_is_named_and_the_tracker_goes_on(residual: Callable[..., Any], message: str) -> None:
     class Faulty:
         name = "faulty"
         broken = False

@@ -141,8 +141,8 @@ def test_cones_stand_still_and_push():
     standing = tracks.select(tracks.boxes.label == "traffic_cone")
     assert np.array_equal(standing.boxes.velocity, np.zeros((6, 2)))
     car = tracks.select(tracks.boxes.label == "car")
-    assert car.boxes.position[0, 1] > 0.3
-    assert car.boxes.velocity[0, 1] > 0.3
+    assert car.boxes.position[0, 1] > 0.3  # type: ignore[attr-defined]
+    assert car.boxes.velocity[0, 1] > 0.3  # type: ignore[attr-defined]
 
 
 def test_a_hidden_trailer_brakes_with_its_truck():

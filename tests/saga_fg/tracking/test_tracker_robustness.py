@@ -11,7 +11,6 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import Boxes, Detection, Detections, Frame, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import JointKalmanFilter
@@ -19,6 +18,7 @@ from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking import tracker as tracker_module
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
+from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 ESTIMATORS = ("kalman", "isam2", "fixed-lag")
 CARS = straight([(0.0, 0.0), (12.0, 0.0), (24.0, 0.0)], [(8.0, 0.0), (8.5, 0.0), (9.0, 0.0)])

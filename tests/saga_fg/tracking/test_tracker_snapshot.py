@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from traffic_frames import run, seen, straight
 
 from saga_fg import Tracker, TrackerSettings
+from tests.saga_fg.traffic_frames import run, seen, straight
 
 
 def assert_same(a, b, tolerance):

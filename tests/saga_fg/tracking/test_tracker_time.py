@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from traffic_frames import columns, frame, run, seen, straight
 
 from saga_fg import ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
+from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 FAST = straight([(0.0, 0.0), (-25.0, 4.0)], [(20.0, 0.0), (22.0, 0.0)])
 SENSORS = {

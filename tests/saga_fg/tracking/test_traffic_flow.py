@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from traffic_frames import frame
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.tracking import TrafficFlowSettings
 from saga_fg.tracking.traffic_flow import Passages, TrafficFlowPrior
+from tests.saga_fg.traffic_frames import frame
 
 ON = TrafficFlowSettings(weight=5.0)
 
