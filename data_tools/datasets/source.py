@@ -94,6 +94,11 @@ def names(option: str, value: str) -> tuple[str, ...]:
     return entries
 
 
+def tracks_of(scenes: LabelledScenes) -> TrackedScenes:
+    """The labels' tracks, for writers of results."""
+    return [(scene, [frame.tracks for frame in labels]) for scene, labels in scenes]
+
+
 class ChosenScenes:
     """Scenes of a dataset by their names with commas between them; raises `InputError` for one it does not have."""
 

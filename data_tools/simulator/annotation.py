@@ -7,7 +7,6 @@ counts as visible only in views of some duration; a shorter view does not reveal
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from data_tools.simulator.sensors import in_view, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
@@ -41,6 +40,8 @@ def annotate(
 
 def without_short_runs(visible: BoolArray, shortest: int) -> BoolArray:
     """`visible` (K, N) without runs along the first axis shorter than `shortest` keyframes."""
+    from scipy import ndimage  # a tenth of a second, which every help of the command would pay
+
     return np.asarray(ndimage.binary_opening(visible, np.ones((max(shortest, 1), 1))))
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import FactorError, pose
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked, checked_covariances
 from saga_fg.types.landmark import Observation
@@ -31,6 +30,8 @@ class OdometryIncrement:
     covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        from factors import FactorError, pose  # GTSAM, which frames without odometry do not need
+
         motion = checked("odometry", self.before_T_now, (None, None))
         if motion.shape not in ((3, 3), (4, 4)):
             raise InputError(f"odometry: expected a 3 x 3 or 4 x 4 transform, got shape {motion.shape}")

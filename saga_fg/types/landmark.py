@@ -14,14 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-import gtsam
-
-from factors import Linearisable, PlanarPose, SpatialPose, Variable
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances
 
-LandmarkFactors = Sequence[Linearisable] | gtsam.NonlinearFactorGraph
+if TYPE_CHECKING:  # frames bring observations of landmarks, and are read before anything is estimated
+    import gtsam
+
+    from factors import Linearisable, PlanarPose, SpatialPose, Variable
+
+LandmarkFactors: TypeAlias = "Sequence[Linearisable] | gtsam.NonlinearFactorGraph"
 
 
 class LandmarkType(Protocol):

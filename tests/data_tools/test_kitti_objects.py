@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.datasets.kitti import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
+from data_tools.kitti_objects import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
 

@@ -12,7 +12,6 @@ from data_tools.datasets.detection_files.tracks import merge_tables
 from data_tools.datasets.kitti.dataset import KittiTracking, local_kitti
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence, result_sequences, scored_sequences
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE, write_kitti_labels, write_kitti_results
-from data_tools.datasets.kitti.velodyne import KittiScans
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
@@ -23,12 +22,14 @@ from data_tools.datasets.source import (
     TrackedScenes,
     names,
     option,
+    tracks_of,
 )
 from data_tools.files.remote_files import is_url
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 
 if TYPE_CHECKING:
+    from data_tools.datasets.kitti.velodyne import KittiScans
     from data_tools.evaluation import Evaluation
 
 
@@ -68,6 +69,8 @@ class KittiSource(DatasetSource):
         yield Parts(scenes, (KittiPart(self.restricted([name]), name) for name in scenes))
 
     def scans(self, scenes: Collection[str]) -> Mapping[str, KittiScans]:
+        from data_tools.datasets.kitti.velodyne import KittiScans
+
         if is_url(self.dataroot):
             return {}
         root = Path(self.dataroot)
@@ -82,9 +85,7 @@ class KittiSource(DatasetSource):
     def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
         assert isinstance(dataset, KittiTracking)
         write_kitti_labels(folder / "label_02", dataset, scenes)
-        self.write_tracks(
-            folder / "results", dataset, [(scene, [moment.tracks for moment in labels]) for scene, labels in scenes]
-        )
+        self.write_tracks(folder / "results", dataset, tracks_of(scenes))
 
     def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
         self.write_tracks(folder / "tracks", dataset, scenes)

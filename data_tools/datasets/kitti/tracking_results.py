@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,9 +29,11 @@ from data_tools.kitti_objects import world_boxes_to_camera
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
+
+if TYPE_CHECKING:
+    from saga_fg.smoothing import Labels
 
 TRACK_TABLE = "tracks.csv"
 IMAGE_SIZE = (1242, 375)  # pixels, the largest common to most sequences

@@ -21,6 +21,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,8 +40,10 @@ from data_tools.files.input_files import open_bytes
 from data_tools.files.json_stream import open_json, parsed_json
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle
-from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Scene
+
+if TYPE_CHECKING:
+    from saga_fg.smoothing import Labels
 
 LabelledObject = tuple[str, list[Record]]
 """The class of an object, and its annotations in order of time."""

@@ -13,7 +13,6 @@ from data_tools.datasets.nuscenes.dataset import NuScenes
 from data_tools.datasets.nuscenes.labels import merge_label_parts, write_label_part, write_nuscenes_labels
 from data_tools.datasets.nuscenes.result_files import ResultMeta
 from data_tools.datasets.nuscenes.scans import NuScenesScans, nuscenes_scans
-from data_tools.datasets.nuscenes.scored_scenes import ScoredScene, read_scored_scenes
 from data_tools.datasets.nuscenes.splits import split_scenes
 from data_tools.datasets.nuscenes.tracking_results import merge_tracking_results, write_tracking_results
 from data_tools.datasets.parts import HeldScene, OpenedPart, Parts, scene_digests
@@ -26,6 +25,7 @@ from data_tools.datasets.source import (
     TrackedScenes,
     names,
     option,
+    tracks_of,
 )
 from data_tools.files.remote_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
@@ -85,13 +85,13 @@ class NuScenesSource(DatasetSource):
 
     def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
         assert isinstance(dataset, NuScenes)
-        self.write_tracks(folder / self.merged[1], dataset, _tracks(scenes))
+        self.write_tracks(folder / self.merged[1], dataset, tracks_of(scenes))
         write_nuscenes_labels(folder, dataset.dataroot, dataset.version, scenes)
 
     def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
         for kind in ("tracking", "objects"):
             (folder / kind).mkdir()
-        self.write_tracks(folder / "tracking" / f"{stem}.json", dataset, _tracks(scenes))
+        self.write_tracks(folder / "tracking" / f"{stem}.json", dataset, tracks_of(scenes))
         write_label_part(folder / "objects" / f"{stem}.ndjson", scenes)
 
     def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
@@ -107,6 +107,8 @@ class NuScenesSource(DatasetSource):
         merge_label_parts(output, dataset.dataroot, dataset.version, objects)
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+        from data_tools.datasets.nuscenes.scored_scenes import read_scored_scenes
+
         with self._local() as (root, files):
             return read_scored_scenes(result, root, self.version, self._chosen(root), files)
 
@@ -117,6 +119,7 @@ class NuScenesSource(DatasetSource):
         innovations: Innovations | None = None,
     ) -> Evaluation:
         from data_tools.datasets.nuscenes.evaluation import evaluate_nuscenes
+        from data_tools.datasets.nuscenes.scored_scenes import ScoredScene
 
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredScene)}
         return evaluate_nuscenes(scored, hota, innovations)
@@ -167,7 +170,3 @@ def sensor_locations(values: Sequence[str]) -> dict[str, str]:
             raise InputError(f"--detections {value}: the sensor {sensor} is given twice")
         files[sensor] = path
     return files
-
-
-def _tracks(scenes: LabelledScenes) -> TrackedScenes:
-    return [(scene, [moment.tracks for moment in labels]) for scene, labels in scenes]

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_tools.datasets.kitti import CameraBoxes, image_boxes, observation_angles
+from data_tools.datasets.kitti import image_boxes, observation_angles
+from data_tools.kitti_objects import CameraBoxes
 
 P2 = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
 IMAGE = (1242, 375)

@@ -7,15 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.kitti import (
-    KittiTracking,
-    camera_boxes_to_world,
-    has_box,
-    image_boxes,
-    observation_angles,
-    read_kitti_labels,
-    world_boxes_to_camera,
-)
+from data_tools.datasets.kitti import KittiTracking, image_boxes, observation_angles, read_kitti_labels
+from data_tools.kitti_objects import camera_boxes_to_world, has_box, world_boxes_to_camera
 from saga_fg.numerics.geometry import inverse_transform
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.kitti import has_box, read_calibration, read_kitti_labels, read_poses
+from data_tools.datasets.kitti import read_calibration, read_kitti_labels, read_poses
+from data_tools.kitti_objects import has_box
 from saga_fg import InputError
 from saga_fg.numerics.geometry import transform_points
 from tests.data_tools.kitti_example import CALIBRATION, LABELS, calibration_text, oxts_line

@@ -1,0 +1,50 @@
+from .clusters import ClusterSettings, ObjectSize, detect_clusters
+from .curbs import CurbSettings, Line, LineSettings, extract_curbs, straight_lines
+from .deskew import azimuth_times, constant_velocity, deskewed
+from .ground import Ground, GroundSettings, segment_ground
+from .planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
+from .poles import Pole, PoleSettings, extract_poles
+from .registration import Registration, RegistrationError, RegistrationSettings, register
+from .scan import Scan
+from .scan_files import read_scan, write_ply
+from .sharpness import scan_to_map_residual
+from .surfels import SurfelMap, Surfels, surfels_of
+from .voxels import voxel_downsample, voxel_keys
+
+__all__ = [
+    "ClusterSettings",
+    "CurbSettings",
+    "Ground",
+    "GroundSettings",
+    "Line",
+    "LineSettings",
+    "ObjectSize",
+    "Plane",
+    "PlaneSettings",
+    "Pole",
+    "PoleSettings",
+    "Registration",
+    "RegistrationError",
+    "RegistrationSettings",
+    "Scan",
+    "SurfelMap",
+    "Surfels",
+    "azimuth_times",
+    "constant_velocity",
+    "deskewed",
+    "detect_clusters",
+    "extract_curbs",
+    "extract_poles",
+    "extract_walls",
+    "fit_ground",
+    "fit_plane",
+    "read_scan",
+    "register",
+    "scan_to_map_residual",
+    "segment_ground",
+    "straight_lines",
+    "surfels_of",
+    "voxel_downsample",
+    "voxel_keys",
+    "write_ply",
+]
