@@ -7,8 +7,8 @@ r"""Stationary or moving: a discrete state of every track beside its Gaussian on
 s is the probability that the object is stationary. If it moves, its state is that of the joint filter, N(m, P). If it
 is stationary, it has a position of its own, N(a, D), which drifts slowly and of which all its detections are
 measurements; the position of an object that has just halted is that of the joint filter, and the two are merged by
-their moments. Only slow objects halt, so that no outlier, and no gap, brings a fast one to rest. A measured velocity is a second piece of evidence, N(z_v; 0, R_v) against N(z_v; v, P_v + R_v), taken
-for independent of the first.
+their moments. Only slow objects halt, so that no outlier, and no gap, brings a fast one to rest. A measured velocity is
+a second piece of evidence, N(z_v; 0, R_v) against N(z_v; v, P_v + R_v), taken for independent of the first.
 
 The probability is used in two places. The joint filter's process noise over the next interval is the one expected
 under it, (1 - s + s * noise) Qc, frozen with the interval as the edges are. The reported velocity is the mixture,
@@ -49,7 +49,7 @@ class StationaritySettings(Settings):
     )
     stop_rate: NonNegative = setting(
         0.05,
-        "rate at which slow objects come to rest, 1/s; usual 0.02 to 0.1; higher: slow objects are held as stationary sooner",
+        "rate at which slow objects come to rest, 1/s; usual 0.02 to 0.1; higher: they are held as stationary sooner",
     )
     drift: NonNegative = setting(
         0.02, "standard deviation of the drift of a stationary position in one second, m; usual 0 to 0.1"
