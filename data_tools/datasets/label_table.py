@@ -10,7 +10,7 @@ besides
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -21,16 +21,13 @@ import numpy as np
 from data_tools.datasets.detection_files import TRACK_COLUMNS, TrackRows, track_rows, write_rows
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.datasets.detection_files.track_rows import REQUIRED, track_rows_of
+from data_tools.datasets.source import LabelledScenes
 from data_tools.files.atomic_files import atomic_file
 from saga_fg.errors import MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, StrArray
-from saga_fg.smoothing import Labels
-from saga_fg.types.dataset import Scene
 
 LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality")
 ROWS_AT_A_TIME = 65536  # of a Parquet file
-
-LabelledScenes = Iterable[tuple[Scene, Sequence[Labels]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +66,11 @@ def read_label_table(path: str | Path) -> LabelRows:
 
 
 def _rows(path: str, scenes: LabelledScenes) -> Iterator[list[Any]]:
-    for scene, moments in scenes:
-        tracks = [moment.tracks for moment in moments]
-        variance = np.concatenate([np.empty(0), *(moment.yaw_variance for moment in moments)])
-        source = np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in moments)])
-        quality = np.concatenate([np.empty(0, dtype="<U1"), *(moment.quality for moment in moments)])
+    for scene, frames in scenes:
+        tracks = [labels.tracks for labels in frames]
+        variance = np.concatenate([np.empty(0), *(labels.yaw_variance for labels in frames)])
+        source = np.concatenate([np.empty(0, dtype="<U1"), *(labels.source for labels in frames)])
+        quality = np.concatenate([np.empty(0, dtype="<U1"), *(labels.quality for labels in frames)])
         extra = zip(variance.tolist(), source.tolist(), quality.tolist(), strict=True)
         for row, (v, s, q) in zip(track_rows(path, [(scene, tracks)]), extra, strict=True):
             yield [*row, None if v != v else v, s, q]

@@ -49,7 +49,7 @@ TrackedScenes = Iterable[tuple["Scene", Sequence["Tracks"]]]
 Innovations = Mapping[str, "FloatArray"]
 """Squared distances of tracks and the detections they took, in sigmas, by class."""
 
-LabelledScenes = Sequence[tuple["Scene", Sequence["Labels"]]]
+LabelledScenes = Iterable[tuple["Scene", Sequence["Labels"]]]
 """Scenes with one `Labels` for each of their timestamps."""
 
 

@@ -128,7 +128,7 @@ def _method(
         "moments": [rows[a:b] for a, b in pairwise(starts)],
         "edges": [
             _whole(np.column_stack([number[target], number[source], 1000 * rate]))
-            for target, source, rate in edges_of_moments(table, moments, rules)
+            for target, source, rate in edges_of_frames(table, moments, rules)
         ],
     }
 
@@ -140,14 +140,14 @@ def _box_columns(boxes: Boxes, labels: StrArray, origin: FloatArray) -> FloatArr
     return np.column_stack([np.searchsorted(labels, boxes.label), place, 100 * size, 1000 * np.nan_to_num(boxes.yaw)])
 
 
-def edges_of_moments(table: SceneBoxes, moments: int, rules: Sequence[EdgeRule]) -> Iterator[Edges]:
-    """Yield the edges that rules find between the reported tracks of each moment.
+def edges_of_frames(table: SceneBoxes, frames: int, rules: Sequence[EdgeRule]) -> Iterator[Edges]:
+    """Yield the edges that rules find between the reported tracks of each frame.
 
     A result does not hold the graph of its tracks; but rules need only what a result has.
     """
     node_type = NodeType("track", ConstantVelocity())
     moved: set[str] = set()
-    for k in range(moments):
+    for k in range(frames):
         rows = np.flatnonzero(table.frame == k)
         boxes = table.boxes.select(rows)
         velocity = np.nan_to_num(boxes.velocity)

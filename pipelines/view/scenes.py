@@ -34,7 +34,7 @@ from data_tools.lidar import voxel_downsample
 from data_tools.lidar.scan import ScanSequence
 from data_tools.metrics import SceneBoxes
 from pipelines.report.results import result_scenes
-from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_moments, latest_detections
+from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections
 from pipelines.view.drawing import (
     VEHICLE,
     Arrows,
@@ -108,7 +108,7 @@ def _moments(report: ReportScene, origin: FloatArray, start: float) -> Iterator[
     scene, root = report.scene, report.scene.name
     detections, _ = latest_detections(scene, report.sensors)
     methods = {name: _Method(table, origin, report) for name, table in report.tracks.items()}
-    edges = {name: edges_of_moments(table, len(scene), report.rules) for name, table in report.tracks.items()}
+    edges = {name: edges_of_frames(table, len(scene), report.rules) for name, table in report.tracks.items()}
     for k, time in enumerate((scene.timestamps - start).tolist()):
         pose = scene.world_T_ego[k].copy()
         pose[:3, 3] -= origin

@@ -30,7 +30,7 @@ from pipelines.report import (
 )
 from pipelines.report.charts import SHARES
 from pipelines.report.run_record import record_path, write_run_record
-from pipelines.report.scenes import edges_of_moments, scene_data
+from pipelines.report.scenes import edges_of_frames, scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
 from tests.pipelines.page_in_browser import tried_in_browser
@@ -86,7 +86,7 @@ def test_edges_lead_from_a_leader_to_its_follower():
     rule = CONFIG.tracker.edges[0]
     boxes = Boxes.of(["car"] * 3, [[0, 0, 0], [10, 0, 0], [0, 30, 0]], [[4, 2, 1.5]] * 3, [0.0] * 3, [[8, 0]] * 3)
     table = SceneBoxes(np.zeros(3, dtype=np.int64), np.array(["behind", "ahead", "aside"]), boxes, np.ones(3))
-    ((target, source, rate),) = edges_of_moments(table, 1, (rule,))
+    ((target, source, rate),) = edges_of_frames(table, 1, (rule,))
     assert [(table.id[t], table.id[s]) for t, s in zip(target, source, strict=True)] == [("behind", "ahead")]
     assert rate[0] > 0
 
