@@ -34,6 +34,7 @@ from saga_fg.numerics.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.class_belief import ClassEvidence
 from saga_fg.tracking.ego_node import relative_covariances
 from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.relinking import relinked
 from saga_fg.tracking.retrodiction import past_cross_covariances, past_positions
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerState
@@ -80,7 +81,8 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
     groups, likelihood = state.class_groups, measurements.class_likelihood
     evidence = ClassEvidence(groups, table.class_belief, likelihood) if len(groups) else None
-    return match(predicted, P, expected, measurements, state.settings, area, cross, evidence)
+    found = match(predicted, P, expected, measurements, state.settings, area, cross, evidence)
+    return relinked(state, measurements, found, position, P)
 
 
 def match(

@@ -54,6 +54,7 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     p = measurements.probability[d]
     table.existence[missed] = after_miss(table.existence[missed], p_miss, elapsed, settings)
     table.existence[t] = after_hit(table.existence[t], p, settings)
+    table.last_existence[t] = table.existence[t]
     table.confirmed |= table.existence >= settings.confirm_above
     table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
     fused = table.sensors.probability(state.time, max(memory, measurements.delay))

@@ -9,6 +9,7 @@ from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.relinking import initiating
 from saga_fg.tracking.stationarity import Stationarity, after_evidence, log_density
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
@@ -18,10 +19,7 @@ from saga_fg.types.boxes import Boxes
 
 def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
     """Append new tracks; returns the rows of their measurements, whose delay the tracks are predicted by."""
-    free = np.ones(len(measurements), dtype=bool)
-    free[matching.detection] = False
-    initiation_score = state.class_values(measurements.boxes.label, "initiation_score")[0]
-    rows = np.flatnonzero(free & (measurements.probability >= initiation_score))
+    rows = initiating(state, measurements, matching)
     if len(rows) == 0:
         return rows
     k, delay, boxes, p = len(rows), measurements.delay, measurements.boxes.select(rows), measurements.probability[rows]
@@ -37,6 +35,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         ids,
         boxes.label,
         existence=p.copy(),
+        last_existence=p.copy(),
         score=p.copy(),
         covariance_scale=measurements.covariance_scale[rows],
         position_bias=measurements.position_bias[rows],

@@ -68,9 +68,6 @@ class ClassSettings(Settings):
         "discard the weaker of two detections within weak_nms_distance if its probability is below this "
         "share of the other's; higher: more are discarded",
     )
-    merge_distance: NonNegative = setting(
-        0.0, "delete a coasting track when a detected track of its class is closer than this, m; 0: never"
-    )
     cross_class_nms_iou: Fraction = setting(
         1.0, "discard a detection whose IoU, from above, with a surer one of another class is larger; 1: never"
     )
@@ -84,7 +81,9 @@ class ClassSettings(Settings):
         4.0, "largest distance between a prediction and its detection, whatever the gate says, m; usual 1.5 to 12"
     )
     max_coasting: PositiveOrInf = setting(
-        1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
+        1.2,
+        "delete a track this long after its last detection, s, unless it can be re-linked; usual 1 to 2; higher: "
+        "doubtful tracks live longer",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
@@ -120,6 +119,16 @@ class AssociationSettings(Settings):
         0.5,
         "weight of a detection's probability in the cost of leaving it unmatched; 0: none, 1: as the model "
         "says; without effect while clutter_area is .inf",
+    )
+    relink_above: Fraction = setting(
+        0.9,
+        "re-link a track that was not detected with a detection that would initiate another one, from this "
+        "probability on; usual 0.8 to 0.99; higher: fewer wrong links, more lost identities, 1: never",
+    )
+    relink_within: NonNegative = setting(
+        6.0,
+        "keep a track beyond max_coasting, up to this long after its last detection, while its place is known "
+        "well enough to re-link it, s; usual 3 to 10; higher: longer occlusions, more tracks",
     )
 
 
@@ -275,7 +284,8 @@ class TrackerSettings(Settings):
     )
     max_out_of_view: PositiveOrInf = setting(
         0.5,
-        "delete a track this long after it left every sensor's field of view, s; usual 0.2 to 2; higher: kept longer",
+        "report a track for this long after it left every sensor's field of view, and keep it no longer unless it can "
+        "be re-linked, s; usual 0.2 to 2; higher: reported for longer",
     )
     report_coasting: NonNegative = setting(
         0.6, "report a track for this long after its last detection, s; higher: fewer gaps, more false positives"

@@ -25,6 +25,7 @@ class TrackTable(Columns):
     id                (n,)
     label             (n,) class
     existence         (n,) probability that the track is a real object
+    last_existence    (n,) its existence at its latest detection
     score             (n,) probability of its latest detection
     covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
     position_bias     (n,) standard deviation of the position error that all its detections share, m
@@ -45,6 +46,7 @@ class TrackTable(Columns):
     id: IntArray
     label: StrArray
     existence: FloatArray
+    last_existence: FloatArray
     score: FloatArray
     covariance_scale: FloatArray
     position_bias: FloatArray
@@ -68,7 +70,7 @@ class TrackTable(Columns):
         return cls(
             np.empty(0, dtype=np.int64),
             np.empty(0, dtype="<U1"),
-            *(number,) * 6,
+            *(number,) * 7,
             *(truth,) * 2,
             *(number,) * 2,
             *(truth,) * 2,
@@ -85,6 +87,10 @@ class TrackTable(Columns):
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""
         return np.maximum(np.round(now - self.last_detected, 6), 0.0)
+
+    def out_of_view(self, now: float) -> FloatArray:
+        """(n,) time since it was last in a sensor's field of view, s, rounded to the microsecond."""
+        return np.asarray(np.round(now - self.last_in_view, 6))
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2)."""

@@ -13,7 +13,7 @@ from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
-from saga_fg.tracking import Journal
+from saga_fg.tracking import AssociationSettings, Journal
 from saga_fg.tracking.edge_effects import edge_effects
 from saga_fg.tracking.observer import TrackerView
 
@@ -72,7 +72,9 @@ def test_what_another_track_took_is_named() -> None:
 
 
 def test_ends_have_a_reason() -> None:
-    events, _ = run(frame(0.0, 0.0, score=0.99), frame(0.1, 0.0, score=0.99), *(frame(0.1 * k) for k in range(2, 20)))
+    detected = (frame(0.1 * k, 0.0, score=0.99) for k in range(2))
+    settings = replace(SETTINGS, association=AssociationSettings(relink_above=1.0))
+    events, _ = run(*detected, *(frame(0.1 * k) for k in range(2, 20)), settings=settings)
     (deleted,) = of_kind(events, "deleted")
     assert deleted["confirmed"]
     assert deleted["reason"] == "not detected for longer than 1.2 s"

@@ -15,7 +15,7 @@ from saga_fg import (
 )
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.tracking import ClassSettings, ExistenceSettings
+from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 TENTHS = np.arange(0, 5, 0.1)
@@ -25,8 +25,10 @@ def settings(edges=(), **values):
     """Independent objects of one kind of class settings."""
     existence = {k: values.pop(k) for k in ("report_above", "confirm_above", "delete_below", "lifetime") if k in values}
     overall = {k: values.pop(k) for k in ("max_delay", "report_coasting", "max_out_of_view") if k in values}
+    association = AssociationSettings(relink_above=values.pop("relink_above", 0.9))
+    classes = {"default": ClassSettings(**values)}
     return TrackerSettings(
-        {"default": ClassSettings(**values)}, edges=edges, existence=ExistenceSettings(**existence), **overall
+        classes, edges=edges, association=association, existence=ExistenceSettings(**existence), **overall
     )
 
 
@@ -118,7 +120,7 @@ def test_weak_detections_start_no_track_but_keep_one_alive():
 
 
 def test_a_track_coasts_is_no_longer_reported_and_dies():
-    tracker = Tracker(settings(max_coasting=1.0, report_coasting=0.55))
+    tracker = Tracker(settings(max_coasting=1.0, report_coasting=0.55, relink_above=1.0))
     run(tracker, [frame(t, [(10 * t, 0)]) for t in np.arange(0, 1.05, 0.1)])
     coasting = [tracker.step(frame(1.0 + t, [])) for t in np.arange(0.1, 1.25, 0.1)]
     reported = [len(tracks) for tracks in coasting]
@@ -139,7 +141,7 @@ def test_an_object_seen_again_in_time_keeps_its_id():
 
 def test_ids_are_never_reused():
     rng = np.random.default_rng(4)
-    tracker, met = Tracker(settings(max_coasting=0.3)), {}
+    tracker, met = Tracker(settings(max_coasting=0.3, relink_above=1.0)), {}
     for k in range(60):
         position = rng.uniform(-60, 60, (int(rng.integers(0, 5)), 2))
         for track in tracker.step(frame(0.2 * k, position, score=0.95)):

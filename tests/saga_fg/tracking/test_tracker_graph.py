@@ -84,7 +84,7 @@ def test_classical_settings_have_no_edges_and_others_have():
 
 
 def test_a_node_that_dies_leaves_its_information_and_its_neighbours():
-    tracker = Tracker(TrackerSettings())
+    tracker = Tracker(TrackerSettings(association=AssociationSettings(relink_above=1.0)))
     run(tracker, seen(np.random.default_rng(0), braking_platoon, np.arange(0, 2, 0.1)))
     rest = lambda t: braking_platoon(t)[[0, 2, 3]]  # noqa: E731
     history = run(tracker, seen(np.random.default_rng(1), rest, np.arange(2, 5, 0.1)))

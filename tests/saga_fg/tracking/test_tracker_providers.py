@@ -162,8 +162,9 @@ def test_names_that_lead_to_no_provider(name: str, message: str) -> None:
 
 @pytest.mark.parametrize(("name", "size"), [("isam2", 6), ("fixed-lag", 14)])
 def test_tracks_come_and_go_in_a_graph_that_stays_small(name: str, size: int) -> None:
-    tracker = Tracker(TrackerSettings(estimator=name, lag=0.5), providers=[Range()])
-    sizes = []
+    association = AssociationSettings(relink_above=1.0)
+    settings = TrackerSettings(estimator=name, lag=0.5, association=association)
+    tracker, sizes = Tracker(settings, providers=[Range()]), []
     for k in range(60):
         where = CARS(0.1 * k)[[k // 20]] if k % 20 < 12 else np.empty((0, 2))
         tracker.step(frame(0.1 * k, where))

@@ -1,0 +1,112 @@
+r"""Re-link: a detection that would initiate a track may be the return of an object that has a track already.
+
+    odds_ij = r_i e^(-T_i / lifetime) ( (1 - s_i) N(z_j; m_i, P_i + R_j) + s_i N(z_j; a_i, D_i + R_j) ) / density
+    density = (number of detections of the class that would initiate tracks) / area
+
+are the odds that detection j is track i, not detected for T_i s, against its being one of the others, anywhere in the
+area. N(m, P) is the state in the joint filter, so that neighbours that are still detected count; s is the probability
+that the object is stationary, N(a, D) its place if it is. r is the existence of the track *at its latest detection*.
+
+This pass comes after the assignment (`saga_fg.tracking.association`), which asks another question: whether a detection
+is of a track that was missed a few times, or false. There existence counts, which collapses with each miss. Here the
+detection counts as an object in any case, and misses in a row tell no more than that the object was hidden: they are
+not independent. So a track competes for detections with others only while it has just been detected.
+
+A track whose place is so uncertain that no detection could be re-linked with it, of all places at its predicted one,
+is of no use, see `relinkable`: well-seen objects and stationary ones are remembered for longer.
+
+Source: Reid, An Algorithm for Tracking Multiple Targets, IEEE Transactions on Automatic Control 24(6), 1979: the
+densities of a continued and of a new target.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
+from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.tracker_state import TrackerState
+
+NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite
+
+
+def relinked(
+    state: TrackerState, measurements: FrameMeasurements, matching: Matching, position: FloatArray, P: FloatArray
+) -> Matching:
+    """The matching, with the returns of tracks that it left unmatched.
+
+    position  (n, 2) of the tracks at the time of the frame, local, m; P (n, 2, 2) their covariances
+    """
+    rows = initiating(state, measurements, matching)
+    free = relinkable(state)
+    free[matching.track] = False
+    tracks, label = np.flatnonzero(free), measurements.boxes.label[rows]
+    if len(rows) == 0 or len(tracks) == 0:
+        return matching
+    i, j = np.nonzero(state.table.label[tracks][:, None] == label)
+    t, d, others = tracks[i], rows[j], (label[:, None] == label).sum(axis=1)[j]
+    z, R = measurements.boxes.position[d, :2] - state.origin, measurements.R[d, :2, :2]
+    moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
+    still = _log_density(z - state.table.stationarity.position[t], S)
+    log_odds = _log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / _area(state))
+    chosen = least_total(t, d, _least_log_odds(state) - log_odds)
+    t, d = t[chosen], d[chosen]
+    distance, _ = mahalanobis_of_pairs(z[chosen] - position[t], P[t] + R[chosen])
+    return Matching(
+        np.concatenate([matching.track, t]),
+        np.concatenate([matching.detection, d]),
+        np.concatenate([matching.distance, distance]),
+    )
+
+
+def relinkable(state: TrackerState) -> BoolArray:
+    """(n,) tracks with which a detection at their predicted place, and no other in the area, would be re-linked."""
+    association, table = state.settings.association, state.table
+    if association.relink_above == 1 or len(table) == 0:
+        return np.zeros(len(table), dtype=bool)
+    none = np.zeros((len(table), 2))
+    peaks = _log_density(none, state.kinematics().P), _log_density(none, table.stationarity.P)
+    log_odds = _log_survival(state) + _mixed(state, np.arange(len(table)), *peaks) + math.log(_area(state))
+    within = table.coasting(state.time) <= association.relink_within
+    return np.asarray(within & (log_odds >= _least_log_odds(state)))
+
+
+def initiating(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
+    """Rows of the unmatched measurements that are probable enough to initiate a track."""
+    free = np.ones(len(measurements), dtype=bool)
+    free[matching.detection] = False
+    initiation_score = state.class_values(measurements.boxes.label, "initiation_score")[0]
+    return np.flatnonzero(free & (measurements.probability >= initiation_score))
+
+
+def _area(state: TrackerState) -> float:
+    """Area over which objects spread, m^2: a sensor's own `clutter_area` says how its false detections do."""
+    area = state.settings.association.clutter_area
+    return area if math.isfinite(area) else NOMINAL_AREA
+
+
+def _least_log_odds(state: TrackerState) -> float:
+    above = state.settings.association.relink_above
+    return math.log(above / (1 - above))
+
+
+def _log_survival(state: TrackerState) -> FloatArray:
+    """(n,) log of the probability that the track is an object that is still there."""
+    table, lifetime = state.table, state.settings.existence.lifetime
+    real = np.maximum(table.last_existence, 1e-3)
+    return np.asarray(np.log(real) - table.coasting(state.time) / lifetime)
+
+
+def _mixed(state: TrackerState, rows: IntArray, moving: FloatArray, still: FloatArray) -> FloatArray:
+    """(k,) log densities of the tracks `rows` (k,) from those of moving and of stationary objects (k,)."""
+    s = np.clip(state.table.stationarity.probability[rows], 0.0, 1 - 1e-9)
+    return np.asarray(np.logaddexp(np.log1p(-s) + moving, np.log(np.maximum(s, 1e-300)) + still))
+
+
+def _log_density(innovation: FloatArray, S: FloatArray) -> FloatArray:
+    """(k,) log N(innovation; 0, S) in the plane, 1/m^2."""
+    d2, log_det = mahalanobis_of_pairs(innovation, S)
+    return np.asarray(-0.5 * (d2 + log_det) - math.log(2 * math.pi))
