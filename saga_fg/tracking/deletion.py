@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import logging
 
-import numpy as np
-
 from saga_fg.numerics.arrays import BoolArray
 from saga_fg.tracking.relinking import relinkable
 from saga_fg.tracking.tracker_state import TrackerState
