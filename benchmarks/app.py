@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from benchmarks.fusion import fusion
 from benchmarks.gaps import gaps
 from benchmarks.joint import joint
 from benchmarks.metrics import metrics
@@ -14,7 +15,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (gaps, joint, metrics, occlusion, scaling, smoothing, streaming, synthetic):
+for command in (fusion, gaps, joint, metrics, occlusion, scaling, smoothing, streaming, synthetic):
     app.command()(command)
 
 
