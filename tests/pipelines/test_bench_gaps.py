@@ -12,16 +12,20 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.simulator import SimulatorSettings, simulate_scene
-from pipelines.bench.gaps.bench import Contender, GapBenchSettings, RecordingSource, bench_gaps, hidden, run_of
+from pipelines.bench.gaps import fitted
+from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps, hidden, run_of
 from pipelines.bench.gaps.contenders import CONTENDERS, KEPT_ALIVE, LIFE, with_life
+from pipelines.bench.gaps.fitted import Split, splits_of
 from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
 from pipelines.bench.variants import changed
 from pipelines.cli import app
 from pipelines.config import Family, load_config
 from saga_fg import Annotations, Boxes, Detections, Frame, InputError, Scene, Tracks
+from saga_fg.model.learned_interactions import LearnedInteractions
 
 SHORT = replace(SimulatorSettings(), duration=12.0, warm_up=5.0)
 TIMES = 0.5 * np.arange(16)
@@ -212,9 +216,53 @@ def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     assert kept.outcomes[0].kept
     assert shipped.outcomes[0].lost
     rows = {(f.life, f.contender): f for f in gap_figures([kept, shipped], "kf")}
-    assert rows["kept", "kf"].kept == 1.0
+    assert rows["kept", "kf"].kept.estimate == 1.0
     assert rows["shipped", "kf"].lost == 1.0
     assert [each.right for each in link_figures([kept, shipped])] == [1, 0]
+
+
+def test_recordings_are_dealt() -> None:
+    five = ("a", "b", "c", "d", "e")
+    assert splits_of(five) == [Split((), five)]
+    assert splits_of(five, train=("a", "x")) == [Split(("a",), ("b", "c", "d", "e"))]
+    assert splits_of(five, train=("a",), test=("b",)) == [Split(("a",), ("b",))]
+    assert splits_of(five, test=("x",)) == []
+    assert splits_of(five, folds=2) == [Split(("b", "d"), ("a", "c", "e")), Split(("a", "c", "e"), ("b", "d"))]
+    with pytest.raises(InputError, match="--folds 6: expected at most the number of recordings, 5"):
+        splits_of(five, folds=6)
+
+
+def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
+    config = load_config("simulated")
+    fitted = config.with_acceleration_noise({"default": 0.5, "truck": 0.25})
+    classes = fitted.tracker.classes
+    assert classes["truck"].motion.acceleration_noise == 0.25
+    assert classes["default"].motion.acceleration_noise == 0.5
+    assert classes["pedestrian"] == config.tracker.classes["pedestrian"]
+    assert classes["truck"].max_distance == classes["default"].max_distance
+    assert fitted.tracker.edges == config.tracker.edges
+
+
+def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learning finds no interactions here: then saga is kf."""
+    taught_by = []
+
+    def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
+        taught_by.append(origin)
+        return LearnedInteractions(learned_from=origin)
+
+    monkeypatch.setattr(fitted, "learn_interactions", learn)
+    base = load_config("simulated")
+    kf = Contender.of(CONTENDERS["kf"], base)
+    source = RecordingSource("simulated", scenes=2, labels=True)
+    splits, settings = splits_of(("scene-0001", "scene-0002"), folds=2), GapBenchSettings(0, ("kept",))
+    runs = fitted.bench_splits(source, splits, [kf], base, settings)
+    assert taught_by == ["recordings scene-0002", "recordings scene-0001"]
+    names = ["kf", "kf, fitted noise", "saga, learned edges"]
+    assert [(run.recording, run.contender) for run in runs] == [
+        (s, n) for s in ("scene-0001", "scene-0002") for n in names
+    ]
+    assert runs[0].outcomes == runs[2].outcomes
 
 
 def test_scenes_without_truth_or_detections_are_refused() -> None:
@@ -237,7 +285,7 @@ def test_contenders_are_judged_on_the_same_gaps() -> None:
         assert (ours.contender, theirs.contender) == ("saga", "kf")
         assert (ours.gaps, ours.group, ours.length) == (theirs.gaps, theirs.group, theirs.length)
         if ours.error_change is not None and ours.places:
-            assert ours.error_change.estimate == pytest.approx(ours.error / theirs.error - 1)
+            assert ours.error_change.estimate == pytest.approx(ours.error.estimate / theirs.error.estimate - 1)
 
 
 def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
@@ -245,9 +293,11 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     own.write_text("tracker: {explained_noise: 0.5}\n")
     arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--life", "shipped"]
     arguments += ["--contenders", "kf", "--contender", f"own:saga={own}", "--json", str(out)]
+    arguments += ["--plot", str(tmp_path / "gaps.png")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "real gaps of 1 to 6 s" in result.output
+    assert (tmp_path / "gaps.png").read_bytes().startswith(b"\x89PNG")
     figures = json.loads(out.read_text())["simulated"]
     assert figures["recordings"] == ["scene-0001"]
     assert {row["contender"] for row in figures["gaps"]} == {"kf", "own"}
