@@ -19,6 +19,7 @@ from pipelines.bench.gaps.fitted import Split, splits_of
 from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
 from pipelines.bench.variants import changed
@@ -161,6 +162,23 @@ def test_a_tracker_that_reports_nothing_unseen_is_extrapolated() -> None:
     found = tracks({"7": without(straight(), HIDDEN)}, {"7": SEEN})
     assert JudgedRun(drawn, found, extrapolated=True).outcome(gap).error == pytest.approx(0.0, abs=1e-9)
     assert JudgedRun(drawn, found).outcome(gap).error == CAP
+
+
+def test_the_picture_shows_the_gap_that_tells_most() -> None:
+    drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
+    gaps, base = real_gaps(drawn), load_config("file")
+    pair = [Contender.of(CONTENDERS[name], base) for name in ("centerpoint", "kf")]
+    worse, better = ([run_of(drawn, gaps, each, life)] for each, life in zip(pair, ("shipped", "kept"), strict=True))
+    assert telling_gap(better, worse) == ("drawn", gaps[0])
+    shown = [drawn_gap(drawn, gaps, gaps[0], each, "kept") for each in pair]
+    assert [each.holders[4] for each in shown] == [each.holders[9] for each in shown] != [None, None]
+    figure = gap_picture(drawn, gaps[0], shown)
+    assert [ax.get_title(loc="left").split(",")[0] for ax in figure.axes] == [
+        "centerpoint: identity kept",
+        "kf: identity kept",
+    ]
+    with pytest.raises(InputError, match="--picture: expected recordings with gaps"):
+        telling_gap([], [])
 
 
 def test_made_gaps_hide_one_object_among_others() -> None:

@@ -30,7 +30,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.track import Tracks
 
 BEFORE, AFTER = 1.5, 1.0  # s
-MARGIN, LEAST = 8.0, 12.0  # m around the object's way; least half width of the picture
+MARGIN, LEAST = 8.0, 10.0  # m: before and after the object's way, and the least height of a panel
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: Sequence[DrawnGap]) ->
     origin, turn = _frame(way[known])
     way = (way - origin) @ turn
     length = float(np.ptp(way[known][:, 0])) + 2 * MARGIN
-    height = max(float(np.ptp(way[known][:, 1])) + 2 * MARGIN, LEAST)
+    height = max(float(np.ptp(way[known][:, 1])) + MARGIN, LEAST)
     figure = Figure(figsize=(11.0, (11.0 * height / length + 0.6) * len(drawn) + 0.5), layout="constrained")
     axes = figure.subplots(len(drawn), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for ax, each in zip(axes, drawn, strict=True):
@@ -167,9 +167,7 @@ def _draw_tracks(
                 ax.plot(*ring.T, color=colour, linewidth=1.0, alpha=0.8, zorder=5)
         if places:
             ax.plot(*np.array(places).T, "-o", color=colour, markersize=3, linewidth=1.2, zorder=6)
-            ax.annotate(
-                f"track {name}", places[-1], xytext=(0, 7), textcoords="offset points", color=colour, fontsize=8
-            )
+            ax.annotate(f"track {name}", places[0], xytext=(0, 9), textcoords="offset points", color=colour, fontsize=8)
 
 
 def _legend() -> list[Any]:
