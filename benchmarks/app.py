@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from benchmarks.fusion import fusion
-from benchmarks.gaps import gaps
 from benchmarks.joint import joint
 from benchmarks.metrics import metrics
-from benchmarks.occlusion import occlusion
 from benchmarks.scaling import scaling
 from benchmarks.smoothing import smoothing
 from benchmarks.streaming import streaming
@@ -15,7 +13,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (fusion, gaps, joint, metrics, occlusion, scaling, smoothing, streaming, synthetic):
+for command in (fusion, joint, metrics, scaling, smoothing, streaming, synthetic):
     app.command()(command)
 
 
