@@ -78,7 +78,7 @@ def judge(scene: Scene, tracks: Sequence[Tracks], settings: SimulatorSettings) -
         members = members & moment.visible
         tracked += np.stack([(members & found).sum(axis=1), members.sum(axis=1)], axis=1)
         errors = pairs.distance[moment.visible[pairs.object_row]]
-        square_sums += (errors @ errors, len(errors))
+        square_sums += np.array([errors @ errors, len(errors)])
         matched += len(pairs.object_row)
     scored = NuScenesTrackingScene(
         scene.timestamps - scene.timestamps[0],
@@ -109,9 +109,10 @@ def fusion_figures(scenes: Sequence[FusedScene], reach: float) -> dict[str, floa
         [scene.scored for scene in scenes], NuScenesTrackingSettings(class_range=dict.fromkeys(CLASSES, reach))
     )
     figures = {"AMOTA": metrics.overall.amota}
-    for name, (found, all_of_them) in zip((*GROUPS, "all"), sum(scene.tracked for scene in scenes), strict=True):
-        figures[name] = float(found / all_of_them) if all_of_them else float("nan")
-    squares, number = sum(scene.square_sums for scene in scenes)
+    tracked = np.sum([scene.tracked for scene in scenes], axis=0)
+    for name, (found, all_of_them) in zip((*GROUPS, "all"), tracked.tolist(), strict=True):
+        figures[name] = found / all_of_them if all_of_them else float("nan")
+    squares, number = np.sum([scene.square_sums for scene in scenes], axis=0)
     frames = sum(len(scene.scored.timestamps) for scene in scenes)
     figures["position RMSE"] = float(np.sqrt(squares / max(number, 1)))
     figures["false boxes"] = sum(scene.false for scene in scenes) / max(frames, 1)
