@@ -40,7 +40,8 @@ def gaps(
         str | None,
         typer.Option(
             "--contenders",
-            help="Of saga, kf, turn, stationary, stationary + turn and centerpoint, with commas.  [default: all]",
+            help="Of saga, kf, constant velocity, turn, stationary, stationary + turn and centerpoint, with commas.  "
+            "[default: all that differ]",
         ),
     ] = None,
     against: Annotated[str, typer.Option("--against", help="The contender that all others are compared with.")] = "kf",
@@ -172,11 +173,13 @@ def _contenders(
     from pipelines.config import METHODS
     from pipelines.configuration import load_settings
 
-    found = []
+    found: list[Contender] = []
     for name in names("--contenders", chosen) if chosen else CONTENDERS:
         if name not in CONTENDERS:
             raise InputError(f"--contenders: {unknown_name('contender', name, tuple(CONTENDERS))}")
-        found.append(Contender.of(CONTENDERS[name], base))
+        contender = Contender.of(CONTENDERS[name], base)
+        if chosen or not any(contender.same_as(other) for other in found):
+            found.append(contender)
     for text in own:
         title, _, path = text.partition("=")
         name, _, method = title.partition(":")

@@ -27,6 +27,8 @@ from pipelines.cli import app
 from pipelines.config import Family, load_config
 from saga_fg import Annotations, Boxes, Detections, Frame, InputError, Scene, Tracks
 from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.turning import CoordinatedTurn
 
 SHORT = replace(SimulatorSettings(), duration=12.0, warm_up=5.0)
 TIMES = 0.5 * np.arange(16)
@@ -223,6 +225,19 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family)
         config.new_tracker(variant.method)
         assert {each.max_coasting for each in config.tracker.classes.values()} == {LIFE}
         assert with_life(config, "shipped") is config
+
+
+def test_classical_contenders_differ_in_motion_alone() -> None:
+    base = load_config("kitti")
+    turn = CONTENDERS["stationary + turn"].config(base).tracker
+    assert isinstance(turn.classes["default"].motion, CoordinatedTurn)
+    assert isinstance(turn.classes["pedestrian"].motion, ConstantVelocity)
+    assert turn.stationarity.prior == 0.5
+    alone = CONTENDERS["constant velocity"].config(base).tracker
+    assert alone.stationarity.prior == 0
+    assert alone.classes["default"].max_coasting == base.tracker.classes["default"].max_coasting
+    assert Contender.of(CONTENDERS["kf"], base).same_as(Contender("classical", "kf", base))
+    assert not Contender.of(CONTENDERS["saga"], base).same_as(Contender("classical", "kf", base))
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:

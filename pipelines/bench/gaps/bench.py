@@ -40,7 +40,12 @@ class Contender:
 
     @classmethod
     def of(cls, variant: Variant, base: TrackConfig) -> Contender:
+        """A variant of a configuration."""
         return cls(variant.name, variant.method, variant.config(base))
+
+    def same_as(self, other: Contender) -> bool:
+        """Whether the other does the same under another name."""
+        return (self.method, self.config) == (other.method, other.config)
 
 
 @dataclass(frozen=True)
