@@ -80,7 +80,7 @@ class SurfelMap:
         inside = row < len(old)
         known[inside] = old.voxel[row[inside]] == new.voxel[inside]
         merged = _merged(old.select(row[known]), new.select(known))
-        both = old.extended(new.select(~known))
+        both = old.append(new.select(~known))
         for name in ("count", "mean", "scatter"):
             getattr(both, name)[row[known]] = getattr(merged, name)
         changed = np.zeros(len(both), dtype=np.bool_)

@@ -40,7 +40,7 @@ class Columns:
         columns = ([getattr(part, name) for part in parts] for name in cls.__dataclass_fields__)
         return cls(*map(_concatenated, columns))
 
-    def extended(self, other: Self) -> Self:
+    def append(self, other: Self) -> Self:
         """With the rows of another at the end."""
         return self.concatenate([self, other])
 

@@ -121,7 +121,7 @@ class GreedyTracker:
         unseen = np.ones(len(memory.id), dtype=bool)
         unseen[match[seen]] = False
         kept = np.flatnonzero(unseen & (now - memory.last_seen <= self.settings.max_coasting))
-        self._memory = fresh.extended(memory.select(kept))
+        self._memory = fresh.append(memory.select(kept))
         return _tracks(fresh, now)
 
     def tracks(self, timestamp: float) -> Tracks:

@@ -78,10 +78,6 @@ class TrackTable(Columns):
             SensorEvidence.empty(),
         )
 
-    def append(self, new: Self) -> Self:
-        """The table with the rows of new tracks at the end."""
-        return self.extended(new)
-
     def snapshot(self) -> Self:
         """A copy that shares no array with this table."""
         return self.select(np.arange(len(self)))

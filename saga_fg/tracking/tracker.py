@@ -74,6 +74,9 @@ class Tracker:
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.observer = observer
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
+        max_coastings = [c.max_coasting for c in self.settings.classes.values() if math.isfinite(c.max_coasting)]
+        max_jump = max(self.settings.clock.max_jump, *max_coastings, 0.0)
+        self._clock = replace(self.settings.clock, max_jump=max_jump)
         self._state = TrackerState(self.settings, self.rules, self.providers)
         self._last_step_failed = False
 
@@ -110,7 +113,7 @@ class Tracker:
         """Take a frame into a state."""
         sensor = self.sensor(frame.sensor)
         timestamp = frame.timestamp + sensor.time_offset
-        if state.accept_time(timestamp, frame.sensor, self.max_jump, self.max_delay):
+        if state.accept_time(timestamp, frame.sensor, self._clock, self.max_delay):
             return self._process_frame(state, frame, sensor, state.relative(timestamp))
         state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
@@ -238,8 +241,7 @@ class Tracker:
     @property
     def max_jump(self) -> float:
         """Distance from the newest frame from which another has to be confirmed, s; tracks can outlive shorter ones."""
-        max_coastings = [c.max_coasting for c in self.settings.classes.values() if math.isfinite(c.max_coasting)]
-        return max(self.settings.clock.max_jump, *max_coastings, 0.0)
+        return self._clock.max_jump
 
     @property
     def max_delay(self) -> float:

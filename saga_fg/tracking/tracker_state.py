@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,7 +25,7 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.class_belief import ClassGroups
-from saga_fg.tracking.clock import Clock, TimeVerdict
+from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.tracking.ego_node import EgoNode
 from saga_fg.tracking.joint_state import JointTrackState, new_estimator
 from saga_fg.tracking.kinematics import Kinematics
@@ -152,12 +152,12 @@ class TrackerState:
             place = frame.detections.boxes.position[0, :2]
         self.origin = np.round(place)
 
-    def accept_time(self, timestamp: float, sensor: str, max_jump: float, max_delay: float) -> bool:
-        """Judge the time of a frame, s; return whether it is to be used; `max_jump` in place of the clock's own.
+    def accept_time(self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float) -> bool:
+        """Judge the time of a frame, s; return whether it is to be used.
 
         Where the clock was set back, all tracks are deleted; where it was set ahead, those that coast for too long.
         """
-        before, settings = self.clock.newest, replace(self.settings.clock, max_jump=max_jump)
+        before = self.clock.newest
         verdict, self.clock = self.clock.judged(timestamp, sensor, settings, max_delay)
         self.time_verdict = verdict
         if verdict in ("late", "unconfirmed"):

@@ -75,7 +75,7 @@ class TrafficFlowPrior:
             return
         new = passages.select(known)
         if self.passages is not None:
-            new = self.passages.select(self.passages.time >= passages.time[0] - settings.memory).extended(new)
+            new = self.passages.select(self.passages.time >= passages.time[0] - settings.memory).append(new)
         self.passages = new
 
     def expected(

@@ -119,5 +119,5 @@ def _filled(rows: ScoredBoxes, micros: IntArray) -> ScoredBoxes:
     xy = (1.0 - ratio[:, None]) * a.xy + ratio[:, None] * b.xy
     score = (1.0 - ratio) * a.score + ratio * b.score
     added = ScoredBoxes(frame, b.identity, b.label, xy, score)
-    both = rows.extended(added)
+    both = rows.append(added)
     return both.select(np.argsort(both.frame, kind="stable"))

@@ -104,7 +104,7 @@ def test_headings_face_a_clear_motion():
 
 
 def test_only_hidden_headings_turn_with_the_predicted_course():
-    box = new_box(yaw=0.1).extended(new_box(yaw=0.1)).extended(new_box(yaw=0.1))
+    box = new_box(yaw=0.1).append(new_box(yaw=0.1)).append(new_box(yaw=0.1))
     before = np.array([[5.0, 0.0], [5.0, 0.0], [0.5, 0.0]])  # the last one all but stands
     after = np.stack([before[:, 0] * np.cos(0.2), before[:, 0] * np.sin(0.2)], axis=-1)
     box.turn_with(before, after, np.array([True, False, True]))
@@ -118,7 +118,7 @@ def test_the_heading_drifts():
 
 
 def test_only_the_rows_named_are_touched():
-    box = new_box().extended(new_box(z=3.0)).extended(new_box(yaw=1.0))
+    box = new_box().append(new_box(z=3.0)).append(new_box(yaw=1.0))
     update(box, size=(9.0, 9.0, 9.0), z=5.0, yaw=0.2, row=1)
     assert box.size[[0, 2]].tolist() == [[4.0, 2.0, 1.5]] * 2
     assert box.z[[0, 2]].tolist() == [1.0, 1.0]

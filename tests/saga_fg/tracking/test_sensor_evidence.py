@@ -82,7 +82,7 @@ def test_tracks_that_end_take_their_evidence_with_them():
     evidence = initiated([0.6, 0.4, 0.2])
     evidence = evidence.select(np.array([False, True, True]))
     new = evidence.initiated("camera", np.array([0.9]), 0.0)
-    evidence = evidence.extended(new)
+    evidence = evidence.append(new)
     assert evidence.probability(0.0, 0.2) == pytest.approx([0.4, 0.2, 0.9])
 
 
