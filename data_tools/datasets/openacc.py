@@ -108,7 +108,7 @@ def _jumps(moment: IntArray, vehicle: IntArray, position: FloatArray, speed: Flo
 
 
 def _lengths(moment: IntArray, vehicle: IntArray, position: FloatArray, gap: FloatArray) -> dict[int, float]:
-    """Length of each vehicle, m: the least squares of half the sums that the gaps give, weakly around a usual one."""
+    """Length of each vehicle, m: least squares of half the sums that the gaps give, drawn to a usual one."""
     numbers = np.unique(vehicle).tolist()
     rows, sums = [], []
     for k, (one, other) in enumerate(zip(numbers, numbers[1:], strict=False)):
@@ -120,7 +120,7 @@ def _lengths(moment: IntArray, vehicle: IntArray, position: FloatArray, gap: Flo
         if np.isfinite(between).any():
             rows.append(np.eye(len(numbers))[[k, k + 1]].mean(axis=0))
             sums.append(float(np.nanmedian(between)))
-    weak = 0.1
+    weak = 0.5
     A = np.concatenate([np.array(rows).reshape(-1, len(numbers)), weak * np.eye(len(numbers))])
     b = np.append(np.array(sums), np.full(len(numbers), weak * SIZE[0]))
     length = np.clip(np.linalg.lstsq(A, b, rcond=None)[0], *LENGTHS)
