@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.track import known_velocities
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +80,7 @@ def scene_result(scene: Scene, rows: TrackRows, path: str | Path) -> SceneResult
         )
     order = np.argsort(moment, kind="stable")
     chosen = mine[order]
-    found = SceneBoxes(
-        moment[order], rows.id[chosen], rows.boxes.select(chosen), rows.score[chosen], rows.position_covariance[chosen]
-    )
+    boxes = rows.boxes.select(chosen)
+    boxes = replace(boxes, velocity=known_velocities(boxes.velocity, rows.velocity_covariance[chosen]))
+    found = SceneBoxes(moment[order], rows.id[chosen], boxes, rows.score[chosen], rows.position_covariance[chosen])
     return SceneResult(scene, found, coasting=rows.coasting[chosen])

@@ -12,7 +12,7 @@ from data_tools.plots import calibration_plot, error_histograms
 
 _ERRORS = (
     *("class", "labels", "with track", "position", "detection", "velocity", "velocity parked"),
-    *("velocity moving", "heading", "flipped"),
+    *("velocity moving", "unknown", "heading", "flipped"),
 )
 _CALIBRATION = ("class", "objects", "boxes", "ANEES / 2", "median", "in 50 %", "in 90 %", "in 99 %", "verdict")
 
@@ -60,7 +60,14 @@ def error_pictures(errors: LabelErrors) -> dict[str, Any]:
 def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
     errors = (f.position, f.detection, f.velocity, f.velocity_parked, f.velocity_moving)
     heading = cell(float(np.degrees(f.heading)), 1)
-    return (cell(f.labels), cell(f.tracked), *(cell(x) for x in errors), heading, cell(f.flipped))
+    return (
+        cell(f.labels),
+        cell(f.tracked),
+        *(cell(x) for x in errors),
+        cell(f.velocity_unknown),
+        heading,
+        cell(f.flipped),
+    )
 
 
 def _calibration_cells(c: EllipseCoverage) -> tuple[str, ...]:

@@ -25,7 +25,8 @@ class ErrorSummary:
 
     labels, tracked      matched labels, and those of them with a track
     position, detection  RMSE of tracks and of detections on the same labels, m
-    velocity, velocity_parked, velocity_moving   RMSE, m/s
+    velocity, velocity_parked, velocity_moving   RMSE, m/s, of known velocities
+    velocity_unknown     labels of known velocity whose track has none
     heading              RMSE, rad; flipped: share of headings off by more than 90 degrees
     """
 
@@ -36,6 +37,7 @@ class ErrorSummary:
     velocity: float
     velocity_parked: float
     velocity_moving: float
+    velocity_unknown: int
     heading: float
     flipped: float
 
@@ -71,14 +73,16 @@ def error_summary(errors: LabelErrors) -> ErrorSummary:
     """Summarise errors."""
     heading = errors.sample("heading").values
     moving = errors.moving
+    tracked = errors.matched & errors.tracked
     return ErrorSummary(
         labels=int(errors.matched.sum()),
-        tracked=int((errors.matched & errors.tracked).sum()),
+        tracked=int(tracked.sum()),
         position=errors.sample("position").rmse,
         detection=errors.sample("detection").rmse,
         velocity=errors.sample("velocity").rmse,
         velocity_parked=errors.sample("velocity", ~moving).rmse,
         velocity_moving=errors.sample("velocity", moving).rmse,
+        velocity_unknown=int((tracked & np.isfinite(errors.speed) & np.isnan(errors.velocity)).sum()),
         heading=errors.sample("heading").rmse,
         flipped=float(np.mean(heading > np.pi / 2)) if len(heading) else float("nan"),
     )

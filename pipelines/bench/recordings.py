@@ -124,7 +124,11 @@ class KittiSet:
                 f = kitti_tracking_metrics([pairs[row] for row in rows], label, iou)
                 if f is not None:
                     name = label if iou == 0.25 else f"{label} at {iou:g}"
-                    figures |= {f"{name} sAMOTA": f.samota, f"{name} AMOTA": f.amota}
+                    figures |= {
+                        f"{name} sAMOTA": f.samota,
+                        f"{name} safe sAMOTA": f.samota_safe,
+                        f"{name} AMOTA": f.amota,
+                    }
                     figures |= {f"{name} MOTA": f.mota, f"{name} IDS": float(f.ids)}
             return figures
 

@@ -11,6 +11,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
+from saga_fg.types.track import speed_deviation
 
 
 class Kinematics(NamedTuple):
@@ -29,8 +30,7 @@ class Kinematics(NamedTuple):
     @property
     def speed_deviation(self) -> FloatArray:
         """(n,) standard deviation of the velocity in a mean direction, m/s."""
-        P = self.P_velocity
-        return np.asarray(np.sqrt((P[:, 0, 0] + P[:, 1, 1]) / 2))
+        return speed_deviation(self.P_velocity)
 
     def within_limits(self, origin: FloatArray) -> BoolArray:
         """(n,) which states are finite and inside the limits of detections; positions are from `origin` (2,).

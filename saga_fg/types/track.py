@@ -12,6 +12,22 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids
 from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
 
+KNOWN_SPEED_DEVIATION = 2.0  # m/s; a velocity of a larger standard deviation counts as unknown
+
+
+def speed_deviation(covariance: FloatArray) -> FloatArray:
+    """(N,) standard deviation in a mean direction, m/s, of velocities with the covariance (N, 2, 2)."""
+    return np.asarray(np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2))
+
+
+def known_velocities(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(N, 2) the velocities (N, 2), m/s, NaN where their covariance (N, 2, 2) tells that they are unknown.
+
+    A covariance of NaN tells nothing.
+    """
+    unknown = speed_deviation(covariance) > KNOWN_SPEED_DEVIATION
+    return np.where(unknown[:, None], np.nan, velocity)
+
 
 @dataclass(frozen=True)
 class Track:

@@ -136,6 +136,27 @@ def test_innovations_need_a_journal(drive: Path) -> None:
     assert "track with --explain" in result.stderr
 
 
+@pytest.mark.parametrize(("option", "false_positives"), [([], 1), (["--persons", "exempt"], 0)])
+def test_who_sits_is_unknown_to_the_usual_evaluation(tmp_path: Path, option: list[str], false_positives: int) -> None:
+    root, results, file = write_sequence(tmp_path / "kitti"), tmp_path / "results", tmp_path / "figures.json"
+    results.mkdir()
+    labels = root / "training" / "label_02" / "0007.txt"
+    sitting = "2 5 Person 0 0 0 700 150 720 250 1.2 0.5 0.6 -3 1.6 8 0"
+    standing = "2 6 Pedestrian 0 0 0 800 150 820 250 1.8 0.5 0.6 3 1.6 8 0"
+    labels.write_text(f"{sitting}\n{standing}\n")
+    found = (line.replace("Person ", "Pedestrian ") for line in (sitting, standing))
+    (results / "0007.txt").write_text("".join(f"{line} 0.9\n" for line in found))
+    result = evaluate("kitti", results, "--dataroot", root, "--iou", "0.5", "--json", file, *option)
+    assert result.exit_code == 0, result.output
+    assert json.loads(file.read_text())["per_class"]["pedestrian"]["0.5"]["fp"] == false_positives
+
+
+def test_persons_are_false_or_exempt(tmp_path: Path) -> None:
+    result = evaluate("kitti", tmp_path, "--dataroot", tmp_path, "--persons", "sitting")
+    assert result.exit_code == 2
+    assert "--persons: expected false or exempt, got 'sitting'" in result.stderr
+
+
 @pytest.mark.parametrize("iou", ["half", "0", "1.5", ","])
 def test_overlaps_that_are_none(tmp_path: Path, iou: str) -> None:
     result = evaluate("kitti", tmp_path, "--dataroot", tmp_path, "--iou", iou)

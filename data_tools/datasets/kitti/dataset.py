@@ -21,7 +21,7 @@ import numpy as np
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.kitti.calibration import Calibration, read_calibration
 from data_tools.datasets.kitti.detections import CLASS_CODES, detection_files, read_kitti_detections
-from data_tools.datasets.kitti.labels import read_kitti_labels
+from data_tools.datasets.kitti.labels import lower_case_classes, read_kitti_labels
 from data_tools.datasets.kitti.oxts import read_poses
 from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.files.remote_files import local_tree
@@ -126,7 +126,9 @@ class KittiTracking:
         if len(objects) and objects.frame.max() >= len(times):
             raise InputError(f"{path}: frame {objects.frame.max()}: expected frames 0 to {len(times) - 1} only")
         with error_context(f"{path}"):
-            boxes = camera_boxes_to_world(objects.boxes, np.strings.lower(objects.type), world_T_camera[objects.frame])
+            boxes = camera_boxes_to_world(
+                objects.boxes, lower_case_classes(objects.type), world_T_camera[objects.frame]
+            )
         ids = objects.track_id.astype(np.str_)
         velocity = central_differences(ids, times[objects.frame], boxes.position[:, :2], _LONGEST_GAP, _REACH)
         boxes = replace(boxes, velocity=velocity)

@@ -33,7 +33,7 @@ CLASSES = ("car", "pedestrian", "cyclist")
 IOUS = (0.25, 0.5, 0.7)
 REACH = 5  # frames to either side for a label's velocity, 0.5 s
 _COLUMNS = (
-    *("class", "3D IoU", "sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
+    *("class", "3D IoU", "sAMOTA", "safe", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
     *("TP", "FP", "FN", "GT", "MT", "ML"),
 )
 SIMILARITIES: dict[str, KittiSimilarity] = {"image": "image", "2D": "bev_iou", "3D": "iou_3d"}
@@ -46,9 +46,11 @@ def evaluate_kitti(
     ious: Sequence[float] = IOUS,
     with_hota: bool = False,
     innovations: Mapping[str, FloatArray] | None = None,
+    persons: bool = False,
 ) -> Evaluation:
     """Score the tracks of the sequences that were read; errors are those at the labels that their detections match.
 
+    persons      whether boxes at `Person` labels are exempt for pedestrians, see `kitti_tracking_metrics`
     innovations  of the journal of the run, by class, to be among the figures
 
     Raises `MissingExtraError` for HOTA without trackeval.
@@ -56,7 +58,8 @@ def evaluate_kitti(
     pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
     tracking: dict[str, ByIou] = {}
     for label in classes:
-        by_iou = {iou: figures for iou in ious if (figures := kitti_tracking_metrics(pairs, label, iou)) is not None}
+        found = ((iou, kitti_tracking_metrics(pairs, label, iou, persons)) for iou in ious)
+        by_iou = {iou: figures for iou, figures in found if figures is not None}
         if by_iou:
             tracking[label] = by_iou
     best = {label: next(iter(by_iou.values())).threshold for label, by_iou in tracking.items()}
@@ -104,5 +107,5 @@ def _cells(f: KittiTrackingMetrics) -> tuple[str, ...]:
         return tuple(cell(100 * value, 2) for value in values)
 
     counts = (cell(value) for value in (f.tp, f.fp, f.fn, f.gt))
-    first = percent(f.samota, f.amota, f.amotp, f.mota, f.motp)
+    first = percent(f.samota, f.samota_safe, f.amota, f.amotp, f.mota, f.motp)
     return (*first, cell(f.ids), cell(f.frag), *percent(f.recall, f.precision), *counts, *percent(f.mt, f.ml))

@@ -3,8 +3,8 @@
     frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y [score]
 
 2D boxes in pixels, sizes and positions in m in the rectified camera frame (bottom centre), angles in rad. `DontCare`
-lines mark regions of the image and have id -1. `Person` is the other name of `Person_sitting`. Source: development kit
-of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
+lines mark regions of the image and have id -1. `Person` is a person that sits, `Person_sitting` in KITTI's other
+benchmarks. Source: development kit of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import numpy as np
 from data_tools.files.error_messages import unknown_name
 from data_tools.files.text_tables import TextTable, read_table
 from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
+from saga_fg.numerics.arrays import StrArray
 
-TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
+TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 
 _IMAGE_COLUMNS = ("truncated", "occluded", "alpha", "x1", "y1", "x2", "y2")
 _BOX_COLUMNS = ("h", "w", "l", "x", "y", "z", "rotation_y", "score")
@@ -31,7 +32,7 @@ def read_kitti_labels(path: str | Path) -> KittiObjects:
     objects = KittiObjects(
         frame=table.integers(0, "frame", 0),
         track_id=table.integers(1, "id", -1),
-        type=np.where(table.values[:, 2] == "Person", "Person_sitting", table.values[:, 2]),
+        type=table.values[:, 2],
         truncated=numbers[:, 0],
         occluded=numbers[:, 1],
         alpha=numbers[:, 2],
@@ -41,6 +42,12 @@ def read_kitti_labels(path: str | Path) -> KittiObjects:
     )
     _check(table, objects)
     return objects
+
+
+def lower_case_classes(type_: StrArray) -> StrArray:
+    """(N,) classes of objects in the world for the types of a file: in lower case, with one name for who sits."""
+    names = np.strings.lower(type_)
+    return np.where(names == "person", "person_sitting", names)
 
 
 def _check(table: TextTable, objects: KittiObjects) -> None:

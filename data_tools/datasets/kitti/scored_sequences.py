@@ -1,6 +1,7 @@
 """Tracking results in KITTI's text format beside the labels: as the benchmark scores them, and in world coordinates.
 
 Velocities and covariances come from the table `tracks.csv` beside the results, if there is one; else they are unknown.
+So is a velocity of a large standard deviation there (`saga_fg.types.track.known_velocities`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows, read_tracks
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD, KittiTracking
-from data_tools.datasets.kitti.labels import read_kitti_labels
+from data_tools.datasets.kitti.labels import lower_case_classes, read_kitti_labels
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE
 from data_tools.datasets.results import SceneResult
 from data_tools.files.error_messages import error_context
@@ -22,6 +23,7 @@ from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.types.track import known_velocities
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:
     """Objects with a 3D box; `world_T_camera` (K, 4, 4) of the frames."""
     objects = objects.select(has_box(objects) & (objects.track_id >= 0))
     objects = objects.select(np.argsort(objects.frame, kind="stable"))
-    boxes = camera_boxes_to_world(objects.boxes, np.strings.lower(objects.type), world_T_camera[objects.frame])
+    boxes = camera_boxes_to_world(objects.boxes, lower_case_classes(objects.type), world_T_camera[objects.frame])
     return SceneBoxes(objects.frame, objects.track_id.astype(np.str_), boxes, np.nan_to_num(objects.score))
 
 
@@ -96,6 +98,6 @@ def _with_motion(found: SceneBoxes, table: TrackRows, scene: str) -> SceneBoxes:
     at = np.array([row_of.get(key, -1) for key in wanted], dtype=np.int64)
     known = at >= 0
     velocity, covariance = found.boxes.velocity.copy(), found.position_covariance.copy()
-    velocity[known] = table.boxes.velocity[at[known]]
+    velocity[known] = known_velocities(table.boxes.velocity[at[known]], table.velocity_covariance[at[known]])
     covariance[known] = table.position_covariance[at[known]]
     return replace(found, boxes=replace(found.boxes, velocity=velocity), position_covariance=covariance)

@@ -51,7 +51,16 @@ class KittiSource(DatasetSource):
     iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate",))
     classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate",))
 
+    persons: str = option(
+        "Boxes at `Person` labels (who sits): false, as in the usual evaluation, or exempt, as in HOTA.",
+        "false",
+        metavar="false|exempt",
+        verbs=("evaluate",),
+    )
+
     def __post_init__(self) -> None:
+        if self.persons not in ("false", "exempt"):
+            raise InputError(f"--persons: expected false or exempt, got {self.persons!r}")
         overlaps(self.iou)
 
     @contextmanager
@@ -116,7 +125,8 @@ class KittiSource(DatasetSource):
         from data_tools.datasets.kitti.evaluation import evaluate_kitti
 
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
-        return evaluate_kitti(scored, names("--classes", self.classes), overlaps(self.iou), hota, innovations)
+        classes, exempt = names("--classes", self.classes), self.persons == "exempt"
+        return evaluate_kitti(scored, classes, overlaps(self.iou), hota, innovations, exempt)
 
     def _chosen(self) -> tuple[str, ...] | None:
         return None if self.sequences is None else names("--sequences", self.sequences)

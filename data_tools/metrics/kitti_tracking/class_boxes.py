@@ -5,6 +5,9 @@ an error. True boxes count unless they are of the neighbour class, truncated, or
 matched but count neither as found nor as missed. Unmatched found boxes are not false positives if they are of the
 neighbour class, at most 25 px high in the image, or lie by more than half in a DontCare area.
 
+The labels of the benchmark call sitting persons `Person`. The evaluation of Weng et al. reads `Person_sitting` only: a
+box found at a `Person` is a false positive. HOTA of the benchmark has them as neighbours of pedestrians.
+
 Source: Geiger et al., Are we ready for autonomous driving?, CVPR 2012, and the benchmark's evaluation rules,
 https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
 """
@@ -21,7 +24,8 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
 
-NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting"}
+NEIGHBOURS = {"car": ("van",), "pedestrian": ("person_sitting",)}
+PERSON = "person"
 MIN_HEIGHT = 25.0  # px
 MAX_OCCLUSION = 2
 MAX_TRUNCATION = 0
@@ -57,16 +61,16 @@ class ClassBoxes(Columns):
     score: FloatArray
 
 
-def true_boxes(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
-    """The true boxes of a class (name in lower case)."""
-    kept = [_of_class(sequence.truth, label) for sequence in sequences]
+def true_boxes(sequences: Sequence[KittiTrackingSequence], label: str, persons: bool = False) -> ClassBoxes:
+    """The true boxes of a class (name in lower case). persons: whether `Person` is a neighbour of pedestrians."""
+    kept = [of_class(sequence.truth, label, persons) for sequence in sequences]
     exempt = [is_hidden(rows) | _neighbour(rows, label) for rows in kept]
     return _joined(kept, exempt, _frames(sequences))
 
 
-def found_boxes(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
-    """The found boxes of a class (name in lower case)."""
-    kept = [_of_class(sequence.found, label) for sequence in sequences]
+def found_boxes(sequences: Sequence[KittiTrackingSequence], label: str, persons: bool = False) -> ClassBoxes:
+    """The found boxes of a class (name in lower case). persons: whether `Person` is a neighbour of pedestrians."""
+    kept = [of_class(sequence.found, label, persons) for sequence in sequences]
     exempt = [
         is_small(rows) | _neighbour(rows, label) | in_ignored_area(rows, sequence.truth)
         for rows, sequence in zip(kept, sequences, strict=True)
@@ -81,9 +85,10 @@ def joined_ranges(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
     return n, np.arange(len(n)) - np.repeat(np.cumsum(count) - count - first, count)
 
 
-def _of_class(objects: KittiObjects, label: str) -> KittiObjects:
-    types = np.char.lower(objects.type)
-    return objects.select(((types == label) | (types == NEIGHBOUR.get(label, label))) & (objects.track_id != -1))
+def of_class(objects: KittiObjects, label: str, persons: bool) -> KittiObjects:
+    """The objects of a class and its neighbours. persons: whether `Person` is a neighbour of pedestrians."""
+    asked = (label, *NEIGHBOURS.get(label, ()), *([PERSON] if persons and label == "pedestrian" else []))
+    return objects.select(np.isin(np.char.lower(objects.type), asked) & (objects.track_id != -1))
 
 
 def _neighbour(objects: KittiObjects, label: str) -> BoolArray:

@@ -1,7 +1,7 @@
 """The objects that HOTA evaluates on KITTI, by the rules of the benchmark.
 
 Frame by frame, found boxes of the class are matched to true ones of the class and its neighbour (car: van; pedestrian:
-person sitting) by the overlap of their image boxes, at least 0.5, with the largest sum. Found boxes are removed
+sitting person) by the overlap of their image boxes, at least 0.5, with the largest sum. Found boxes are removed
 
 * that match a true one which is of the neighbour class, truncated, or occluded beyond "largely";
 * that match nothing and are at most 25 px high in the image, or lie by more than half in a DontCare area.
@@ -21,12 +21,12 @@ from scipy.optimize import linear_sum_assignment
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.metrics.hota import HotaMetrics, SceneSimilarities, box_similarities, similarity_metrics
 from data_tools.metrics.kitti_tracking.class_boxes import (
-    NEIGHBOUR,
     UPRIGHT_T_CAMERA,
     KittiTrackingSequence,
     in_ignored_area,
     is_hidden,
     is_small,
+    of_class,
 )
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
@@ -65,9 +65,7 @@ def _areas(objects: KittiObjects) -> FloatArray:
 
 def _evaluated(sequence: KittiTrackingSequence, label: str) -> tuple[KittiObjects, KittiObjects]:
     """The true and the found objects that are evaluated."""
-    types = np.char.lower(sequence.truth.type)
-    asked = (types == label) | (types == NEIGHBOUR.get(label, label))
-    truth = sequence.truth.select(asked & (sequence.truth.track_id >= 0))
+    truth = of_class(sequence.truth, label, persons=True)
     found = sequence.found.select((np.char.lower(sequence.found.type) == label) & (sequence.found.track_id >= 0))
     exempt = is_hidden(truth) | (np.char.lower(truth.type) != label)
     matched, out = _matches(truth, found, exempt)

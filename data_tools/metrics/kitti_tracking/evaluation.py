@@ -13,6 +13,10 @@ and the CLEAR metrics at the threshold with the highest MOTA. Implemented from t
 authors' evaluation: thresholds are run from few tracks to many, after a run with all, and a found box that matched in
 any of these runs is never exempt (`class_boxes`) in a later one.
 
+The authors' evaluation averages a track's score anew before each run, so that rounding drops some tracks from the very
+run whose threshold is their score (`track_scores`). One long track can change sAMOTA by many points this way.
+`samota_safe` is sAMOTA with the mean scores computed once: a track whose score equals the threshold is always present.
+
 Source: Weng et al., 3D Multi-Object Tracking: A Baseline and New Evaluation Metrics, IROS 2020, section IV.
 """
 
@@ -44,11 +48,13 @@ class KittiTrackingMetrics:
     """Metrics of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
 
     gt: true boxes that count; mt, ml: shares of trajectories mostly tracked, mostly lost; tp, recall and precision
-    include pairs with true boxes that don't count. All but samota, amota, amotp are at the `threshold` on a track's
-    mean score that gives the best MOTA (-inf: all tracks).
+    include pairs with true boxes that don't count. samota_safe: sAMOTA without the rounding of the reference evaluation
+    (see the module), the one to compare results by. All but samota, samota_safe, amota, amotp are at the `threshold` on
+    a track's mean score that gives the best MOTA (-inf: all tracks).
     """
 
     samota: float
+    samota_safe: float
     amota: float
     amotp: float
     mota: float
@@ -67,14 +73,15 @@ class KittiTrackingMetrics:
 
 
 def kitti_tracking_metrics(
-    sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float
+    sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float, persons: bool = False
 ) -> KittiTrackingMetrics | None:
     """Metrics of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
 
-    Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. Raises `InputError` for objects
+    Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. persons: whether `Person` lines are
+    neighbours of pedestrians (`class_boxes`); the reference evaluation leaves them out. Raises `InputError` for objects
     of the class without a 3D box.
     """
-    true, found = true_boxes(sequences, label.lower()), found_boxes(sequences, label.lower())
+    true, found = (boxes(sequences, label.lower(), persons) for boxes in (true_boxes, found_boxes))
     gt = int((~true.exempt).sum())
     if gt == 0:
         return None
@@ -85,14 +92,17 @@ def kitti_tracking_metrics(
 
     cuts = np.array([-np.inf, *thresholds])
     scores = track_scores(found.score, found.identity, len(cuts) + 1)
-    runs = _runs(true, found, candidates, scores[:, :-1] >= cuts, np.zeros(len(found), dtype=np.bool_))
+    unmatched = np.zeros(len(found), dtype=np.bool_)
+    present, safely = scores[:, :-1] >= cuts, mean[:, None] >= cuts
+    runs = _runs(true, found, candidates, present, unmatched)
+    safe = runs if np.array_equal(present, safely) else _runs(true, found, candidates, safely, unmatched)
     best = int(np.argmax([0.0, *runs.mota[1:]]))  # the run with all tracks, if no threshold makes MOTA positive
     final = _runs(true, found, candidates, scores[:, -1:] >= cuts[best], runs.matched)
 
-    smota = 1.0 - (runs.errors[1:] - (1.0 - recalls) * gt) / (recalls * gt)
     tp, fn, fp = int(final.tp[0]), int(final.fn[0]), int(final.fp[0])
     return KittiTrackingMetrics(
-        samota=float(np.clip(smota, 0.0, 1.0).sum() / RECALLS),
+        samota=_samota(runs, recalls),
+        samota_safe=_samota(safe, recalls),
         amota=float(runs.mota[1:].sum() / RECALLS),
         amotp=float(runs.motp[1:].sum() / RECALLS),
         mota=float(final.mota[0]),
@@ -138,6 +148,12 @@ class _Runs:
     @property
     def motp(self) -> FloatArray:
         return np.asarray(self.overlap / np.maximum(self.tp, 1))
+
+
+def _samota(runs: _Runs, recalls: FloatArray) -> float:
+    """sAMOTA of a run with all tracks, followed by one for each target recall."""
+    smota = 1.0 - (runs.errors[1:] - (1.0 - recalls) * runs.gt) / (recalls * runs.gt)
+    return float(np.clip(smota, 0.0, 1.0).sum() / RECALLS)
 
 
 def _candidates(true: ClassBoxes, found: ClassBoxes, min_iou: float) -> Candidates:

@@ -46,8 +46,8 @@ def objects(*rows):
     )
 
 
-def figures(truth, found, label="car", min_iou=0.25):
-    return kitti_tracking_metrics([KittiTrackingSequence(objects(*truth), objects(*found))], label, min_iou)
+def figures(truth, found, label="car", min_iou=0.25, persons=False):
+    return kitti_tracking_metrics([KittiTrackingSequence(objects(*truth), objects(*found))], label, min_iou, persons)
 
 
 CARS = [(f, n, 10.0 * n) for f in range(25) for n in range(4)]  # 100 boxes
@@ -140,6 +140,25 @@ def test_neighbours_by_class():
     )
     assert (f.gt, f.fn, f.fp) == (25, 0, 0)
     assert figures(truth, [], "Cyclist") is None
+
+
+@pytest.mark.parametrize(("persons", "false_positives"), [(False, 25), (True, 0)])
+def test_the_usual_evaluation_leaves_out_labels_of_persons(persons, false_positives):
+    truth = [(f, 0, 0.0, {"type": "Pedestrian"}) for f in range(25)] + [
+        (f, 1, 9.0, {"type": "Person"}) for f in range(25)
+    ]
+    found = [(f, n, 9.0 * n, {"type": "Pedestrian", "score": 1.0}) for f in range(25) for n in range(2)]
+    f = figures(truth, found, "pedestrian", persons=persons)
+    assert (f.gt, f.tp, f.fn, f.fp) == (25, 50 - false_positives, 0, false_positives)
+
+
+@pytest.mark.parametrize(("score", "official"), [(0.5, 1.0), (0.9, 0.0)])
+def test_rounding_costs_points_only_in_the_official_value(score, official):
+    # The mean of 25 times 0.9 falls a bit short of 0.9, the mean of these means again: at every threshold all are gone.
+    f = figures(CARS, [(*row, {"score": score}) for row in CARS])
+    assert f.samota == pytest.approx(official)
+    assert f.samota_safe == pytest.approx(1.0)
+    assert f.mota == f.recall == 1.0
 
 
 def test_nothing_found():

@@ -80,6 +80,13 @@ def test_parked_and_moving_are_told_apart() -> None:
     assert f.velocity == pytest.approx(math.sqrt(5.0))
 
 
+def test_unknown_velocities_of_tracks_are_counted_apart() -> None:
+    found = [(k, "7", 2.0 * k, 0.0, {"v": (4.0, 1.0) if k > 1 else (math.nan, math.nan)}) for k in range(5)]
+    f = error_summary(errors(DRIVE, found))
+    assert f.velocity_unknown == 1  # the first label and the last have no velocity themselves
+    assert f.velocity == pytest.approx(1.0)
+
+
 def test_only_labels_that_a_detection_matches_count() -> None:
     found = [(k, "7", 2.0 * k + 0.2, 0.0) for k in range(4)]  # none at the last
     seen = [(k, "d", 2.0 * k, 0.1 if k != 2 else 5.0) for k in range(5)]  # not at the third

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, InputError, Tracks
+from saga_fg.types.track import KNOWN_SPEED_DEVIATION, known_velocities
 
 
 def table(n=2, **columns):
@@ -17,6 +18,12 @@ def table(n=2, **columns):
         "coasting": np.zeros(n),
     }
     return Tracks(**(good | columns))
+
+
+def test_velocities_of_a_large_deviation_are_unknown():
+    P = np.array([s**2 * np.eye(2) for s in (0.1, KNOWN_SPEED_DEVIATION, 2.1, np.nan)])
+    known = known_velocities(np.ones((4, 2)), P)
+    assert np.isfinite(known).all(axis=1).tolist() == [True, True, False, True]
 
 
 def test_rows_of_the_table():
