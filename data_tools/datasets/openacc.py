@@ -17,6 +17,7 @@ Source: Makridis et al., OpenACC, Transport Research Part C 2021; JRC of the Eur
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,10 @@ class OpenAccPlatoons:
         self._path = Path(root) / FILE
         self._columns = _columns(self._path)
         settings, runs = self._columns["setting"], self._columns["run"]
+        if not len(settings):
+            raise InputError(f"{self._path}: expected rows, there are none")
         names = np.char.replace(np.char.add(np.char.add(settings, "-"), runs), " ", "_")
         self._rows = {str(name): np.flatnonzero(names == name) for name in np.unique(names)}
-        if not self._rows:
-            raise InputError(f"{self._path}: expected rows, there are none")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,7 +97,7 @@ def _moments(time: FloatArray) -> IntArray:
     odd = np.abs(step - np.round(step)) > 0.2
     if odd.any():
         raise InputError(f"t: expected times every {PERIOD} s, got {time[np.argmax(odd)]:g}")
-    return np.round(step).astype(np.int64)
+    return np.asarray(np.round(step).astype(np.int64))
 
 
 def _jumps(moment: IntArray, vehicle: IntArray, position: FloatArray, speed: FloatArray) -> BoolArray:
@@ -104,14 +105,14 @@ def _jumps(moment: IntArray, vehicle: IntArray, position: FloatArray, speed: Flo
     travelled = np.hypot(*np.diff(position, axis=0).T) / PERIOD
     excess = np.abs(travelled - (speed[1:] + speed[:-1]) / 2)
     step = (vehicle[1:] == vehicle[:-1]) & (np.diff(moment) == 1) & (excess > JUMP)  # NaN is no jump
-    return np.append(step, False) | np.append(False, step)
+    return np.asarray(np.append(step, False) | np.append(False, step))
 
 
 def _lengths(moment: IntArray, vehicle: IntArray, position: FloatArray, gap: FloatArray) -> dict[int, float]:
     """Length of each vehicle, m: least squares of half the sums that the gaps give, drawn to a usual one."""
     numbers = np.unique(vehicle).tolist()
     rows, sums = [], []
-    for k, (one, other) in enumerate(zip(numbers, numbers[1:], strict=False)):
+    for k, (one, other) in enumerate(pairwise(numbers)):
         if other != one + 1:
             continue
         a, b = np.flatnonzero(vehicle == one), np.flatnonzero(vehicle == other)

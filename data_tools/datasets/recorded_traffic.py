@@ -49,7 +49,7 @@ class RecordedTraffic:
     @property
     def time(self) -> FloatArray:
         """(K,) s."""
-        return PERIOD * np.arange(len(self))
+        return np.arange(len(self), dtype=np.float64) * PERIOD
 
     def moments(self, kept: slice) -> Self:
         """Successive moments, the first of which is at time 0 again."""

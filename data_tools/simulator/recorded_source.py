@@ -58,7 +58,7 @@ class TrueRecordings:
 class RecordedTrafficSource(DatasetSource):
     """Recorded trajectories, and detections made from them by the sensors of the simulator."""
 
-    family = "simulated"
+    family = "traffic"
     dataroot: str
     scenes: str | None = option("Recordings with commas between them; all if left out.", None)
     viewpoint: str = option(_VIEWPOINT, MAST)

@@ -14,7 +14,7 @@ signal controller, without errors: in the first frame, each second, and when one
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -136,14 +136,14 @@ def _stationary(
 ) -> tuple[FloatArray, dict[str, SensorSettings]]:
     """Poses (K, 3) without a vehicle, and the sensors at the height of the viewpoint."""
     if viewpoint == ABOVE:
-        changes = {"range_noise": 0.0, "bearing_noise": 0.0}
         far = {
             name: replace(
                 sensor,
                 position=(0.0, 0.0, ABOVE_HEIGHT),
                 max_range=ABOVE_RANGE,
                 reach=10 * ABOVE_RANGE,
-                **{each: (getattr(sensor, each)[0], slope) for each, slope in changes.items()},
+                range_noise=(sensor.range_noise[0], 0.0),
+                bearing_noise=(sensor.bearing_noise[0], 0.0),
             )
             for name, sensor in sensors.items()
         }
@@ -162,14 +162,14 @@ def _middle(traffic: RecordedTraffic) -> FloatArray:
 def _place(text: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
-        if not (max(abs(x), abs(y), abs(z)) <= MAX_POSITION and z >= 0):
+        if not (np.abs([x, y, z]) <= MAX_POSITION).all() or z < 0:
             raise ValueError
     except ValueError:
         raise InputError(f"--viewpoint: expected X,Y,Z of finite numbers, m, Z not below 0, got {text!r:.60}") from None
     return x, y, z
 
 
-def _with_colours(frames: tuple[Frame, ...], traffic: RecordedTraffic) -> tuple[Frame, ...]:
+def _with_colours(frames: Sequence[Frame], traffic: RecordedTraffic) -> Sequence[Frame]:
     """The frames with reports of the lights among the detections of some."""
     if traffic.road_map is None:
         return frames
@@ -186,6 +186,6 @@ def _with_colours(frames: tuple[Frame, ...], traffic: RecordedTraffic) -> tuple[
             labels = [f"traffic_light_{shown[k]}" for k in lit]
             places = np.array([(*lights[names[k]], HEIGHT) for k in lit]).reshape(-1, 3)
             reports = Detections(Boxes.of(labels, places), np.ones(len(lit)))
-            frame = replace(frame, detections=Detections.concatenate([frame.detections, reports]))  # noqa: PLW2901
+            frame = replace(frame, detections=Detections.concatenate([frame.detections, reports]))
         result.append(frame)
-    return tuple(result)
+    return result

@@ -7,7 +7,17 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from saga_fg.errors import InputError
-from saga_fg.settings import Finite, Fraction, NonNegative, Positive, PositiveOrInf, Range, Settings, setting, settings_group
+from saga_fg.settings import (
+    Finite,
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveOrInf,
+    Range,
+    Settings,
+    setting,
+    settings_group,
+)
 
 PositiveSpan = Annotated[tuple[float, float], Range(0, above=True, ascending=True)]
 NonNegativeSpan = Annotated[tuple[float, float], Range(0, ascending=True)]
@@ -245,7 +255,9 @@ class SimulatorSettings(Settings):
     keyframe_rate: Positive = setting(10.0, "rate of ground truth and of track output, 1/s")
     step: Positive = setting(0.05, "integration step, s")
     warm_up: NonNegative = setting(15.0, "time simulated before the scene starts, s")
-    annotation_range: PositiveOrInf = setting(60.0, "distance from the ego vehicle within which objects are annotated, m")
+    annotation_range: PositiveOrInf = setting(
+        60.0, "distance from the ego vehicle within which objects are annotated, m"
+    )
     visible_share: Fraction = setting(
         0.25, "least share of an object that a sensor must see for it to count as visible"
     )

@@ -78,7 +78,8 @@ class Light:
     def __call__(self, step: IntArray) -> StrArray:
         """Colours (n,) at steps (n,)."""
         ends = np.cumsum(self.durations)
-        return np.array(self.colours)[np.searchsorted(ends, (step - self.offset) % ends[-1], side="right")]
+        phase = np.searchsorted(ends, (step - self.offset) % ends[-1], side="right")
+        return np.asarray(np.array(self.colours)[phase])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ class GoverningLights:
 
     def __call__(self, step: IntArray) -> StrArray:
         shown = np.stack([light(step) for light in self.lights])
-        return np.select([(shown == colour).any(axis=0) for colour in _ORDER], list(_ORDER), "")
+        return np.asarray(np.select([(shown == colour).any(axis=0) for colour in _ORDER], list(_ORDER), ""))
 
 
 def road_of(entry: Any, what: str, with_cycles: bool) -> tuple[RoadMap, dict[str, Colours]]:
@@ -125,11 +126,8 @@ def _lanes(lanelets: dict[int, Lanelet]) -> Iterator[Lane]:
     for lanelet in lanelets.values():
         for successor in lanelet.successors:
             before.setdefault(successor, []).append(lanelet.id)
-    following = {
-        lanelet.id: lanelet.successors[0]
-        for lanelet in lanelets.values()
-        if len(lanelet.successors) == 1 and lanelet.successors[0] in lanelets and len(before[lanelet.successors[0]]) == 1
-    }
+    single = {lanelet.id: lanelet.successors[0] for lanelet in lanelets.values() if len(lanelet.successors) == 1}
+    following = {one: other for one, other in single.items() if other in lanelets and len(before[other]) == 1}
     continued = set(following.values())
     starts = [each for each in lanelets if each not in continued]
     done: set[int] = set()

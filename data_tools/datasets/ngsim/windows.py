@@ -90,7 +90,7 @@ class NgsimWindows:
 
     @cached_property
     def _maps(self) -> tuple[Path, dict[str, Any]]:
-        path = _existing(self._root, MAPS)
+        path = _existing(self._root, MAPS, "; --road none goes without")
         try:
             maps = json.loads(_read_text(path))
         except (ValueError, RecursionError) as error:
@@ -126,11 +126,11 @@ def _read_windows(path: Path) -> TextTable:
     return table
 
 
-def _existing(root: Path, names: tuple[str, ...]) -> Path:
+def _existing(root: Path, names: tuple[str, ...], otherwise: str = "") -> Path:
     """The first of the files that is there."""
     found = next((root / name for name in names if (root / name).is_file()), None)
     if found is None:
-        raise InputError(f"{root}: expected {' or '.join(names)}, there is neither")
+        raise InputError(f"{root}: expected {' or '.join(names)}, there is neither{otherwise}")
     return found
 
 
