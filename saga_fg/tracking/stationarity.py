@@ -1,13 +1,14 @@
 r"""Stationary or moving: a discrete state of every track beside its Gaussian one, and its use.
 
-    s <- b + (s - b) exp(-(start + stop) dt),   b = stop / (start + stop)     prediction over dt
+    s <- b + (s - b) exp(-(start + halt) dt),   b = halt / (start + halt)       prediction over dt
+    halt = stop E[ exp(-|v|^2 / (2 h^2)) ],   h = `HALTING_SPEED`,   v ~ N(v, P_v)
     s / (1 - s) <- s / (1 - s)  N(z; a, D + R) / N(z; H m, H P H^T + R)         update with a detection z
 
 s is the probability that the object is stationary. If it moves, its state is that of the joint filter, N(m, P). If it
 is stationary, it has a position of its own, N(a, D), which drifts slowly and of which all its detections are
 measurements; the position of an object that has just halted is that of the joint filter, and the two are merged by
-their moments. A measured velocity is a second piece of evidence, N(z_v; 0, R_v) against N(z_v; v, P_v + R_v), taken
-for independent of the first.
+their moments. Only slow objects halt, so that no outlier, and no gap, brings a fast one to rest. A measured velocity is
+a second piece of evidence, N(z_v; 0, R_v) against N(z_v; v, P_v + R_v), taken for independent of the first.
 
 The probability is used in two places. The joint filter's process noise over the next interval is the one expected
 under it, (1 - s + s * noise) Qc, frozen with the interval as the edges are. The reported velocity is the mixture,
@@ -21,7 +22,6 @@ a Kalman filter.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +33,7 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.settings import Fraction, NonNegative, Settings, setting
 from saga_fg.tracking.kinematics import Kinematics
 
+HALTING_SPEED = 1.0  # m/s, scale of the speeds from which an object comes to rest at once
 _MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
 
 
@@ -48,7 +49,7 @@ class StationaritySettings(Settings):
     )
     stop_rate: NonNegative = setting(
         0.05,
-        "rate at which moving objects stop, 1/s; usual 0.02 to 0.1; higher: slow objects are held as stationary sooner",
+        "rate at which slow objects come to rest, 1/s; usual 0.02 to 0.1; higher: they are held as stationary sooner",
     )
     drift: NonNegative = setting(
         0.02, "standard deviation of the drift of a stationary position in one second, m; usual 0 to 0.1"
@@ -85,8 +86,9 @@ class Stationarity(Columns):
 
     def predict(self, dt: float, moving: Kinematics, settings: StationaritySettings) -> None:
         """Predict by `dt` s; `moving` is the joint filter's state before."""
-        rate = settings.start_rate + settings.stop_rate
-        balance, lost = settings.stop_rate / max(rate, 1e-12), -math.expm1(-rate * dt)
+        halting = settings.stop_rate * _share_of_slow(moving)
+        rate = settings.start_rate + halting
+        balance, lost = halting / np.maximum(rate, 1e-12), -np.expm1(-rate * dt)
         stays, halts = self.probability * (1 - (1 - balance) * lost), (1 - self.probability) * balance * lost
         self.probability = stays + halts
         new = (halts / np.maximum(self.probability, 1e-12))[:, None]
@@ -128,6 +130,13 @@ class Stationarity(Columns):
         s, v = self.probability[:, None], moving.velocity
         P = (1 - s)[..., None] * moving.P_velocity + (s * (1 - s))[..., None] * v[:, :, None] * v[:, None]
         return moving._replace(velocity=(1 - s) * v, P_velocity=P)
+
+
+def _share_of_slow(moving: Kinematics) -> FloatArray:
+    """(n,) exp(-|v|^2 / (2 h^2)) expected over velocities N(v, P_v)."""
+    h2 = HALTING_SPEED**2
+    distance, log_det = mahalanobis_of_pairs(moving.velocity, moving.P_velocity + h2 * np.eye(2))
+    return np.asarray(h2 * np.exp(-0.5 * (distance + log_det)))
 
 
 def after_evidence(probability: FloatArray, evidence: FloatArray) -> FloatArray:
