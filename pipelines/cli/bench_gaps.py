@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 
 def gaps(
     data: Annotated[
-        Path | None, typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them.")
+        Path | None,
+        typer.Option("--data", help="Folder with nuscenes/, kitti/ and others that --sets names."),
     ] = None,
     sets: Annotated[
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti and simulated, with commas.  [default: all that can be]",
+            help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
