@@ -31,8 +31,8 @@ def gaps(
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections; argoverse2 (in "
-            "av2/), eth_ucy, where the visible annotations are the detections.  [default: all that have a detector's]",
+            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections; argoverse2, "
+            "eth_ucy, where the visible annotations are the detections.  [default: the first five]",
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
