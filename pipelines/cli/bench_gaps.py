@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 def gaps(
     data: Annotated[
         Path | None,
-        typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them, av2/ and eth_ucy/."),
+        typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them, and others of --sets."),
     ] = None,
     sets: Annotated[
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated, and argoverse2 and eth_ucy, where the visible "
-            "annotations are the detections; with commas.  [default: all that have detections]",
+            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections; argoverse2, "
+            "eth_ucy, where the visible annotations are the detections.  [default: the first five]",
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,

@@ -15,13 +15,14 @@ from pipelines.cli.tables import JsonFile, MarkdownFile, report
 
 def tracking(
     data: Annotated[
-        Path | None, typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them.")
+        Path | None,
+        typer.Option("--data", help="Folder with nuscenes/, kitti/ and others that --sets names."),
     ] = None,
     sets: Annotated[
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti and simulated, with commas.  [default: all that can be]",
+            help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
