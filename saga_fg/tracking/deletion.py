@@ -20,7 +20,7 @@ def delete_tracks(state: TrackerState) -> None:
     (max_coasting,) = state.class_values(table.label, "max_coasting")
     deleted = table.coasting(state.time) > max_coasting
     deleted |= table.out_of_view(state.time) > settings.max_out_of_view
-    deleted &= ~relinkable(state)
+    deleted &= ~(relinkable(state) & (table.hits >= settings.confirming_detections))
     deleted |= ~table.confirmed & (table.existence < settings.existence.delete_below)
     deleted |= untrackable(state)
     state.remove(deleted)
