@@ -274,8 +274,8 @@ class TrackerSettings(Settings):
     )
     confirming_detections: PositiveInt = setting(
         3,
-        "detections that confirm a track initiated by a sensor with `initiation: confirmed`, and from which on a hidden "
-        "track is kept for `association.relink_within`; usual 2 to 5; higher: fewer doubtful tracks",
+        "detections that confirm a track initiated by a sensor with `initiation: confirmed`, and from which on a "
+        "hidden track is kept for `association.relink_within`; usual 2 to 5; higher: fewer doubtful tracks",
     )
     unconfirmed_score_factor: Fraction = setting(
         0.0, "factor on the score of tracks that wait for confirmation; 0: do not report them"
