@@ -19,8 +19,8 @@ INTRODUCTION = """\
 
 `saga-fg config` prints the five settings one changes first as YAML with comments, `saga-fg config --full` all of them.
 `--for nuscenes`, `kitti`, `ngsim` or `simulated` prints the defaults shipped for that kind of data; `--smoothing`,
-`--slam`, `--simulator` and `--limits` print what `saga-fg smooth`, `slam`, `simulate` and `serve` take. A file given with
-`--config` holds only what it changes:
+`--slam`, `--simulator` and `--limits` print what `saga-fg smooth`, `slam`, `simulate` and `serve` take. A file given
+with `--config` holds only what it changes:
 
 ```yaml
 tracker:
