@@ -259,7 +259,7 @@ def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     rows = {(f.life, f.contender): f for f in gap_figures([kept, shipped], "kf")}
     assert rows["kept", "kf"].kept.estimate == 1.0
     assert rows["shipped", "kf"].lost == 1.0
-    assert [each.right for each in link_figures([kept, shipped])] == [1, 0]
+    assert [each.right for each in link_figures([kept, shipped])] == [1, 1]  # the second one is re-linked
 
 
 def test_recordings_are_dealt() -> None:
