@@ -36,7 +36,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
         (table.accepted | (settings.unconfirmed_score_factor > 0))
         & (table.confirmed | (table.existence >= settings.existence.report_above))
         & (coasting <= settings.report_coasting)
-        & (table.out_of_view(state.time) <= settings.max_out_of_view)
+        & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
         & table.ready
     )
     table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
