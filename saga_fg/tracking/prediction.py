@@ -64,6 +64,7 @@ def node_table(state: TrackerState) -> NodeTable:
     """
     table, box, now = state.table, state.table.box, state.reported_kinematics()
     velocity, P = now.velocity, now.P_velocity
+    moves = 1 - table.stationarity.probability if state.settings.stationarity.prior > 0 else 0.0
     tracks = NodeTable(
         table.id,
         table.label,
@@ -73,7 +74,8 @@ def node_table(state: TrackerState) -> NodeTable:
         np.where(np.isfinite(box.yaw), box.yaw, np.arctan2(velocity[:, 1], velocity[:, 0])),
         np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
         (P[:, 0, 0] + P[:, 1, 1]) / 2,
-        table.has_moved.copy(),
+        np.where(table.has_moved, 1.0, moves),
         unseen=table.coasting(state.time),
+        existence=table.existence.copy(),
     )
     return state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)
