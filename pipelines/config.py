@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from data_tools.files.error_messages import unknown_name
 from pipelines.configuration import load_settings, read_settings
@@ -29,6 +29,7 @@ from saga_fg.tracking import (
 from saga_fg.types.by_class import DEFAULT, class_settings
 
 Method = Literal["saga", "kf", "centerpoint"]
+METHODS: tuple[Method, ...] = get_args(Method)
 Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]
 
 OTHER_FILES = {"smoothing": "saga-fg smooth", "tracking": "saga-fg smooth", "slam": "saga-fg slam"}

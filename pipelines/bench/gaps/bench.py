@@ -1,0 +1,159 @@
+"""The benchmark of gaps: every contender tracks every recording, with all detections and with some taken away."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.bench.gaps.contenders import LIVES, Life, with_life
+from pipelines.bench.gaps.gap import Gap, made_gaps, real_gaps
+from pipelines.bench.gaps.judging import GapOutcome, JudgedRun, Links
+from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.recordings import recording_set
+from pipelines.bench.variants import Variant
+from pipelines.config import Method, TrackConfig
+from pipelines.tracking import Progress, track_scene
+from saga_fg.types.frame import Frame
+
+
+@dataclass(frozen=True)
+class GapBenchSettings:
+    """Passes over each recording with made gaps, the lives that are compared, seed of the choice of gaps."""
+
+    passes: int = 4
+    lives: tuple[Life, ...] = LIVES
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method with its configuration."""
+
+    name: str
+    method: Method
+    config: TrackConfig
+
+    @classmethod
+    def of(cls, variant: Variant, base: TrackConfig) -> Contender:
+        return cls(variant.name, variant.method, variant.config(base))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A contender's outcomes in the gaps of one recording, and its links in the run without made gaps."""
+
+    recording: str
+    contender: str
+    life: Life
+    gaps: tuple[Gap, ...]
+    label: tuple[str, ...]
+    outcomes: tuple[GapOutcome, ...]
+    links: Links
+
+
+@dataclass(frozen=True)
+class RecordingSource:
+    """Where recordings come from: a set of `pipelines.bench.recordings` by name. Picklable."""
+
+    name: str
+    data: Path | None = None
+    scenes: int = 10
+
+    def labelled(self, recording: str, base: TrackConfig) -> LabelledScene:
+        """Read a recording."""
+        dataset = recording_set(self.name, self.data, self.scenes).dataset
+        return LabelledScene.of(dataset.scene(recording), base.sensors)
+
+
+@dataclass(frozen=True)
+class _Job:
+    source: RecordingSource
+    recording: str
+    contender: Contender
+    settings: GapBenchSettings
+
+
+def bench_gaps(
+    source: RecordingSource,
+    recordings: Sequence[str],
+    contenders: Sequence[Contender],
+    settings: GapBenchSettings | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> list[Run]:
+    """All runs on some recordings of a set. workers: processes; 1: this one."""
+    settings = settings or GapBenchSettings()
+    jobs = [_Job(source, name, contender, settings) for name in recordings for contender in contenders]
+    runs: list[Run] = []
+    for done, (job, found) in enumerate(zip(jobs, _performed(jobs, workers), strict=True)):
+        runs += found
+        if progress is not None:
+            progress(f"{source.name} {job.recording} {job.contender.name}", done + 1, len(jobs))
+    return runs
+
+
+def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
+    if workers == 1:
+        yield from map(_perform, jobs)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:  # a fork would copy locks of threads
+        yield from pool.map(_perform, jobs)
+
+
+def _perform(job: _Job) -> list[Run]:
+    key = (job.source, job.recording, job.settings)
+    labelled, gaps = _prepared(*key, _Base(job.contender.config))
+    return [run_of(labelled, gaps, job.contender, life) for life in job.settings.lives]
+
+
+class _Base:
+    """A configuration that is no part of a key: sensors place detections alike for all contenders."""
+
+    def __init__(self, config: TrackConfig) -> None:
+        self.config = config
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Base)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=1)
+def _prepared(
+    source: RecordingSource, recording: str, settings: GapBenchSettings, base: _Base
+) -> tuple[LabelledScene, list[Gap]]:
+    labelled = source.labelled(recording, base.config)
+    return labelled, [*real_gaps(labelled), *made_gaps(labelled, settings.passes, settings.seed)]
+
+
+def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> Run:
+    """Track with all detections, then without those of each pass, and judge."""
+    config, scene = with_life(contender.config, life), labelled.scene
+    outcomes: dict[int, GapOutcome] = {}
+    links = Links()
+    for number in sorted({0, *(gap.run for gap in gaps)}):
+        mine = {k: gap for k, gap in enumerate(gaps) if gap.run == number}
+        frames = labelled.scene.frames if number == 0 else hidden(labelled, list(mine.values()))
+        tracks = track_scene(replace(scene, frames=frames), config.new_tracker(contender.method)).tracks
+        judged = JudgedRun(labelled, tracks, extrapolated=contender.method == "centerpoint")
+        outcomes |= {k: judged.outcome(gap) for k, gap in mine.items()}
+        if number == 0:
+            links = judged.links()
+    label = tuple(str(labelled.label[gap.row]) for gap in gaps)
+    ordered = tuple(outcomes[k] for k in range(len(gaps)))
+    return Run(scene.name, contender.name, life, tuple(gaps), label, ordered, links)
+
+
+def hidden(labelled: LabelledScene, gaps: Sequence[Gap]) -> list[Frame]:
+    """The frames without the detections of some gaps."""
+    time = labelled.scene.timestamps
+    start = np.array([time[gap.start] for gap in gaps])
+    stop = np.array([time[gap.stop] for gap in gaps])
+    return labelled.frames_without(np.array([gap.row for gap in gaps]), start, stop)

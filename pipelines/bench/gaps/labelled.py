@@ -1,0 +1,87 @@
+"""The labelled objects of a recording over its moments, and which detections are of which object.
+
+A detection is of the nearest labelled object, of its class, if that is within `REACH`. So a duplicate beside the
+neighbour of a hidden object is the neighbour's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.model.sensor import Sensor, sensor_model
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Frame
+
+REACH = 2.0  # m, from an object to its detections
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """N objects at the K moments of a scene, NaN where they are not labelled.
+
+    id, label (N,); position (K, N, 2), m, world; detected (K, N) whether some detection is of the object
+    owner     for each frame, the object (D,) that each detection is of, whatever its class; -1: none
+    """
+
+    scene: Scene
+    id: StrArray
+    label: StrArray
+    position: FloatArray
+    detected: BoolArray
+    owner: tuple[IntArray, ...]
+
+    @classmethod
+    def of(cls, scene: Scene, sensors: Mapping[str, Sensor]) -> LabelledScene:
+        """Raises `InputError` for a scene without ground truth or detections."""
+        if scene.ground_truth is None or not scene.frames:
+            missing = "detections" if scene.ground_truth is not None else "ground truth"
+            raise InputError(f"scene {scene.name}: expected {missing} to find gaps in, there are none")
+        truth = scene.ground_truth
+        names = np.unique(np.concatenate([moment.id for moment in truth]))
+        rows = [np.searchsorted(names, moment.id) for moment in truth]
+        position = np.full((len(truth), len(names), 2), np.nan)
+        label = np.full(len(names), "", dtype="U64")
+        detected = np.zeros((len(truth), len(names)), dtype=np.bool_)
+        for k, (moment, at) in enumerate(zip(truth, rows, strict=True)):
+            position[k, at], label[at] = moment.boxes.position[:, :2], moment.boxes.label
+        owners = []
+        for frame in scene.frames:
+            k = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
+            boxes = sensor_model(sensors, frame.sensor).in_world(frame).boxes
+            distance = _distances(boxes, truth[k], frame.timestamp - float(scene.timestamps[k]))
+            owners.append(_nearest(distance, rows[k]))
+            distance[boxes.label[:, None] != truth[k].boxes.label] = np.inf
+            same = _nearest(distance, rows[k])
+            detected[k, same[same >= 0]] = True
+        return cls(scene, names, label, position, detected, tuple(owners))
+
+    def frames_without(self, row: IntArray, start: FloatArray, stop: FloatArray) -> list[Frame]:
+        """The frames without the detections of objects `row` (W,) after `start` and before `stop` (W,), s."""
+        kept = []
+        for frame, owner in zip(self.scene.frames, self.owner, strict=True):
+            hidden = row[(start < frame.timestamp - 1e-6) & (frame.timestamp + 1e-6 < stop)]
+            gone = np.isin(owner, hidden)
+            kept.append(replace(frame, detections=frame.detections.select(~gone)) if gone.any() else frame)
+        return kept
+
+
+def _distances(boxes: Boxes, truth: Annotations, elapsed: float) -> FloatArray:
+    """(D, M), m, from detections to labelled objects, moved on by `elapsed` s."""
+    there = truth.boxes.position[:, :2] + np.nan_to_num(truth.boxes.velocity) * elapsed
+    offset = boxes.position[:, None, :2] - there
+    return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
+
+
+def _nearest(distance: FloatArray, rows: IntArray) -> IntArray:
+    """(D,) the object of `rows` (M,) that is nearest to each detection, -1 where none is within reach."""
+    if distance.shape[1] == 0:
+        return np.full(len(distance), -1, dtype=np.int64)
+    nearest = distance.argmin(axis=1)
+    within = distance[np.arange(len(distance)), nearest] <= REACH
+    return np.where(within, rows[nearest], -1)
