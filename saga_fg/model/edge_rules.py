@@ -216,6 +216,31 @@ class Repulsion(Settings):
         return closest._replace(rate=np.full(len(closest.rate), self.rate))
 
 
+def traffic_rules() -> tuple[Following, Neighbours]:
+    """The default rules: a hidden vehicle follows a leader that moves, and people walk in groups."""
+    hidden = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
+    leader = Following(
+        SharedVelocity(),
+        rate=1.5,
+        max_gap=60.0,
+        gap_scale=18.0,
+        lateral_scale=1.2,
+        leaders="moving",
+        information_gain=hidden,
+    )
+    group = Neighbours(
+        classes=("pedestrian",),
+        rate=1.0,
+        distance_scale=1.5,
+        max_distance=4.5,
+        heading_scale=3.0,
+        speed_scale=1.0,
+        min_speed=0.2,
+        information_gain=hidden,
+    )
+    return leader, group
+
+
 def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
     """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
     return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))

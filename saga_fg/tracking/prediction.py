@@ -60,7 +60,7 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
 def node_table(state: TrackerState) -> NodeTable:
     """The present estimates as edge rules see them: the tracks, the vehicle, the nodes of the map.
 
-    The direction of motion stands in for a heading that is not known.
+    The direction of motion stands in for a heading that is not known. A confirmed track exists, hidden or not.
     """
     table, box, now = state.table, state.table.box, state.reported_kinematics()
     velocity, P = now.velocity, now.P_velocity
@@ -76,6 +76,6 @@ def node_table(state: TrackerState) -> NodeTable:
         (P[:, 0, 0] + P[:, 1, 1]) / 2,
         np.where(table.has_moved, 1.0, moves),
         unseen=table.coasting(state.time),
-        existence=table.existence.copy(),
+        existence=np.where(table.confirmed, 1.0, table.existence),
     )
     return state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)
