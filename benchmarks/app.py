@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from benchmarks.gaps import gaps
 from benchmarks.joint import joint
 from benchmarks.metrics import metrics
-from benchmarks.occlusion import occlusion
 from benchmarks.scaling import scaling
 from benchmarks.smoothing import smoothing
 from benchmarks.streaming import streaming
@@ -14,7 +12,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (gaps, joint, metrics, occlusion, scaling, smoothing, streaming, synthetic):
+for command in (joint, metrics, scaling, smoothing, streaming, synthetic):
     app.command()(command)
 
 

@@ -42,6 +42,8 @@ def main() -> None:
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     write_heterogeneous_picture(HERE)
     write_running_graph_pictures(HERE)
+    gap = "bench gaps --sets simulated --scenes 2 --passes 2 --contenders saga,kf --life kept --picture"
+    subprocess.run(["saga-fg", *gap.split(), HERE / "gap.png"], check=True, capture_output=True)
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")

@@ -30,7 +30,7 @@ from saga_fg.types.by_class import DEFAULT, class_settings
 
 Method = Literal["saga", "kf", "centerpoint"]
 METHODS: tuple[Method, ...] = get_args(Method)
-Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "file"]
+Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "traffic", "file"]
 
 OTHER_FILES = {"smoothing": "saga-fg smooth", "tracking": "saga-fg smooth", "slam": "saga-fg slam"}
 """Sections that only the files of other commands have."""

@@ -78,6 +78,8 @@ def scene_digests(scene: Scene) -> dict[str, str]:
     moments = hashlib.sha256(repr((scene.name, scene.tokens)).encode())
     for array in (scene.timestamps, scene.world_T_ego):
         moments.update(np.ascontiguousarray(array).tobytes())
+    maps = {id(frame.road_map): frame.road_map for frame in scene.frames}  # most bring the same
+    moments.update(repr(list(maps.values())).encode())
     digests = {"moments": moments.hexdigest()}
     for sensor in scene.sensors:
         frames = hashlib.sha256()

@@ -22,6 +22,8 @@ BUILT_IN = {
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
     "argoverse2": "data_tools.datasets.argoverse2:ArgoverseSource",
     "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
+    "ngsim": "data_tools.simulator.recorded_source:NgsimSource",
+    "openacc": "data_tools.simulator.recorded_source:OpenAccSource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
     "simulated": "data_tools.simulator.source:SimulatedSource",
 }

@@ -142,6 +142,10 @@ class DatasetSource(ABC):
     def open(self, truth: bool = False) -> AbstractContextManager[Dataset]:
         """The chosen recordings, for the length of a block; with ground truth if there is some and it is wanted."""
 
+    def ground_truth(self) -> AbstractContextManager[Dataset]:
+        """The chosen recordings with ground truth of all objects, to learn from it; there may be no frames."""
+        return self.open(truth=True)
+
     def restricted(self, scenes: Collection[str]) -> Self:
         """Recordings of these scenes alone; a dataset may open more than these."""
         return self

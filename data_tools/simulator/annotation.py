@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_tools.simulator.sensed_world import SensedWorld
 from data_tools.simulator.sensors import in_view, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
-from data_tools.simulator.world import World
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.types.dataset import Annotations
 
 
 def annotate(
-    world: World, time: FloatArray, world_T_ego: FloatArray, settings: SimulatorSettings
+    world: SensedWorld, time: FloatArray, world_T_ego: FloatArray, settings: SimulatorSettings
 ) -> tuple[Annotations, ...]:
     """Ground truth at the keyframes `time` (K,), s, with the poses of the vehicle (K, 4, 4)."""
     boxes_at, present = zip(*(world.objects.at(t) for t in time), strict=True)

@@ -8,9 +8,10 @@ import numpy as np
 
 from data_tools.simulator.annotation import annotate
 from data_tools.simulator.lights import detect_lights
+from data_tools.simulator.sensed_world import SensedWorld
 from data_tools.simulator.sensors import detect, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
-from data_tools.simulator.world import World, build_world
+from data_tools.simulator.world import build_world
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
@@ -62,9 +63,11 @@ class SimulatedTraffic:
         return simulate_scene(self._settings, self._seeds[name], name)
 
 
-def scene_from_world(world: World, settings: SimulatorSettings, seed: int, name: str = "") -> Scene:
-    """Simulate the sensors in a world built with the same settings and seed."""
-    date = EPOCH + 60.0 * (seed % 100_000) - world.start
+def scene_from_world(
+    world: SensedWorld, settings: SimulatorSettings, seed: int, name: str = "", epoch: float | None = None
+) -> Scene:
+    """Simulate the sensors in a world built with the same settings and seed; `epoch`: time of its start, s."""
+    date = (EPOCH + 60.0 * (seed % 100_000) if epoch is None else epoch) - world.start
     frames = []
     for sensor_name, sensor in settings.sensors.items():
         rng = np.random.default_rng([seed, zlib.crc32(sensor_name.encode())])  # independent of the other sensors

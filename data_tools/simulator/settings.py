@@ -7,7 +7,17 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from saga_fg.errors import InputError
-from saga_fg.settings import Finite, Fraction, NonNegative, Positive, Range, Settings, setting, settings_group
+from saga_fg.settings import (
+    Finite,
+    Fraction,
+    NonNegative,
+    Positive,
+    PositiveOrInf,
+    Range,
+    Settings,
+    setting,
+    settings_group,
+)
 
 PositiveSpan = Annotated[tuple[float, float], Range(0, above=True, ascending=True)]
 NonNegativeSpan = Annotated[tuple[float, float], Range(0, ascending=True)]
@@ -245,13 +255,15 @@ class SimulatorSettings(Settings):
     keyframe_rate: Positive = setting(10.0, "rate of ground truth and of track output, 1/s")
     step: Positive = setting(0.05, "integration step, s")
     warm_up: NonNegative = setting(15.0, "time simulated before the scene starts, s")
-    annotation_range: Positive = setting(60.0, "distance from the ego vehicle within which objects are annotated, m")
+    annotation_range: PositiveOrInf = setting(
+        60.0, "distance from the ego vehicle within which objects are annotated, m"
+    )
     visible_share: Fraction = setting(
         0.25, "least share of an object that a sensor must see for it to count as visible"
     )
     shortest_view: NonNegative = setting(1.0, "shortest view that counts as visible, s")
-    memory: NonNegative = setting(
-        4.0, "duration for which a hidden object stays annotated after it was last visible, s"
+    memory: Annotated[float, Range(0, infinite=True)] = setting(
+        4.0, "duration for which a hidden object stays annotated after it was last visible, s; .inf: all are annotated"
     )
     road: RoadSettings = settings_group(RoadSettings, "the road")
     drivers: DriverSettings = settings_group(DriverSettings, "drivers")

@@ -14,6 +14,8 @@ import numpy as np
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.types.boxes import Boxes
 
+AT_SAMPLE = 1e-6  # share of a step within which a time is that of a sample
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrajectories:
@@ -41,7 +43,7 @@ class SimulatedTrajectories:
         return len(self.id)
 
     def at(self, time: float) -> tuple[Boxes, BoolArray]:
-        """All N boxes at `time`, on the ground z = 0, and a mask (N,) of those that exist."""
+        """All N boxes at `time`, on the ground z = 0, and a mask (N,) of those that exist at both samples around it."""
         step = self.time[1] - self.time[0]
         k = int(np.clip(np.floor((time - self.time[0]) / step), 0, len(self.time) - 2))
         u = (time - self.time[k]) / step
@@ -56,7 +58,8 @@ class SimulatedTrajectories:
             (1 - u) * self.yaw[k] + u * self.yaw[k + 1],
             (1 - u) * v0 + u * v1,
         )
-        return boxes, self.present[k] & self.present[k + 1]
+        before, after = self.present[k] | (u > 1 - AT_SAMPLE), self.present[k + 1] | (u < AT_SAMPLE)
+        return boxes, before & after
 
     def select(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> SimulatedTrajectories:
         """The objects of some rows."""

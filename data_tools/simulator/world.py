@@ -9,9 +9,9 @@ import numpy as np
 from data_tools.simulator.cyclists import simulate_cyclists
 from data_tools.simulator.fleet import CAR
 from data_tools.simulator.lights import Signal, sample_map, signals_of
-from data_tools.simulator.occlusion import visible_share
 from data_tools.simulator.pedestrians import simulate_pedestrians
 from data_tools.simulator.scene_layout import SceneLayout, sample_layout
+from data_tools.simulator.sensed_world import objects_seen_from
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.surroundings import sample_cones, sample_surroundings
 from data_tools.simulator.traffic import Traffic, TrafficHistory, record_traffic
@@ -64,11 +64,9 @@ class World:
 
         Returns all N objects, a mask (N,) of those within `reach`, m, and the visible share of each of these.
         """
-        boxes, present = self.objects.at(time)
-        near = present & (np.linalg.norm(boxes.position[:, :2] - point[:2], axis=1) <= reach)
         away = np.linalg.norm(self.occluders.position[:, :2] - point[:2], axis=1)
-        around = Boxes.concatenate([boxes.select(near), self.occluders.select(away <= reach + OCCLUDER_MARGIN)])
-        return boxes, near, visible_share(point, around, np.arange(int(near.sum())))
+        around = self.occluders.select(away <= reach + OCCLUDER_MARGIN)
+        return objects_seen_from(self.objects, around, point, time, reach)
 
 
 def build_world(settings: SimulatorSettings, seed: int) -> World:

@@ -11,8 +11,11 @@ from typing import Protocol
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
 from data_tools.datasets.kitti.evaluation import CLASSES, kitti_hota, kitti_label_errors
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.ngsim.windows import NgsimWindows
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.evaluation import nuscenes_hota, nuscenes_label_errors
+from data_tools.datasets.openacc import OpenAccPlatoons
+from data_tools.datasets.recorded_traffic import TrafficRecordings
 from data_tools.evaluation.hota import HotaRow
 from data_tools.evaluation.placed_detections import placed_detections
 from data_tools.metrics import (
@@ -26,6 +29,8 @@ from data_tools.metrics import (
     scene_metrics,
 )
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from data_tools.simulator.recorded_source import SensedRecordings
+from data_tools.simulator.recorded_world import MAST, VEHICLE
 from pipelines.config import Family
 from pipelines.tracking import TrackedScene
 from saga_fg.errors import InputError
@@ -150,33 +155,51 @@ class SimulatedSet:
 
     def score(self, runs: Runs) -> Score:
         """Compare with the truth at every moment."""
-        metrics, errors = [], []
-        for run in runs.values():
-            truth = run.scene.ground_truth
-            assert truth is not None
-            metrics.append(scene_metrics(truth, run.tracks))
-            labels = SceneBoxes.of_annotations(truth, hidden=False)
-            errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
+        return _score_at_every_moment(runs)
 
-        def figures_of(rows: Sequence[int]) -> dict[str, float]:
-            m = SceneMetrics.pool(metrics[row] for row in rows)
-            return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
 
-        return Score(figures_of, tuple(errors))
+class TrafficSet:
+    """Recorded traffic with made detections, judged as simulated traffic is."""
+
+    family: Family = "traffic"
+
+    def __init__(self, name: str, recordings: TrafficRecordings, viewpoint: str) -> None:
+        self.name, self.dataset = name, SensedRecordings(recordings, viewpoint, None, seed=0)
+
+    def score(self, runs: Runs) -> Score:
+        """Compare with the truth at every moment."""
+        return _score_at_every_moment(runs)
+
+
+def _score_at_every_moment(runs: Runs) -> Score:
+    metrics, errors = [], []
+    for run in runs.values():
+        truth = run.scene.ground_truth
+        assert truth is not None
+        metrics.append(scene_metrics(truth, run.tracks))
+        labels = SceneBoxes.of_annotations(truth, hidden=False)
+        errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
+
+    def figures_of(rows: Sequence[int]) -> dict[str, float]:
+        m = SceneMetrics.pool(metrics[row] for row in rows)
+        return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
+
+    return Score(figures_of, tuple(errors))
 
 
 def recording_set(name: str, data: Path | None, scenes: int) -> RecordingSet:
-    """A set by name; `data` holds nuscenes/ and kitti/ with their detections, `scenes` simulated ones are made.
+    """A set by name; `data` holds a folder for each kind of recordings, `scenes` simulated ones are made.
 
     Raises `InputError` for an unknown name or missing recordings.
     """
     if name == "simulated":
         return SimulatedSet(scenes)
-    if name not in SETS:
-        raise InputError(f"unknown set {name!r}: expected some of {', '.join(SETS)}, simulated")
+    build = (SETS | TRAFFIC_SETS).get(name)
+    if build is None:
+        raise InputError(f"unknown set {name!r}: expected some of {', '.join((*SETS, *TRAFFIC_SETS))}, simulated")
     if data is None:
-        raise InputError(f"set {name}: expected --data DIR with nuscenes/ and kitti/")
-    return SETS[name](data)
+        raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
+    return build(data)
 
 
 def _nuscenes(name: str, split: str, sensor: str, file: str) -> Callable[[Path], RecordingSet]:
@@ -193,3 +216,8 @@ SETS: dict[str, Callable[[Path], RecordingSet]] = {
     "camera": _nuscenes("camera", "camera", "camera", "fastbev_camera.json"),
     "kitti": lambda data: KittiSet("kitti", data / "kitti", data / "kitti" / "detections" / "pointrcnn"),
 }
+TRAFFIC_SETS: dict[str, Callable[[Path], RecordingSet]] = {
+    "ngsim": lambda data: TrafficSet("ngsim", NgsimWindows(data / "ngsim"), MAST),
+    "openacc": lambda data: TrafficSet("openacc", OpenAccPlatoons(data / "openacc"), VEHICLE),
+}
+"""Sets that are taken only where they are asked for."""

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.evaluation.hota import HotaRow
-from data_tools.metrics import ErrorSample, Interval, LabelErrors, paired_bootstrap
-from pipelines.bench.coasting import coasting_errors
+from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.recordings import RecordingSet, Score
-from pipelines.bench.variants import METHODS, Variant, variants
+from pipelines.bench.variants import Variant, variants
 from pipelines.config import TrackConfig
 from pipelines.learning import learn_interactions
 from pipelines.observers import StageClock
@@ -44,13 +43,11 @@ class TrackingBenchSettings:
     contenders  whether to track by graph matching and by interactions learned on other scenes of the set, and to judge
                 by HOTA
     draws       sets of scenes drawn for the intervals of figures averaged over recall; 0: no intervals of these
-    coasting    whether to measure the coasting error
     """
 
     components: bool = True
     contenders: bool = False
     draws: int = 200
-    coasting: bool = True
     seed: int = 0
 
 
@@ -70,16 +67,12 @@ class VariantResult:
 
 @dataclass(frozen=True, eq=False)
 class SetResult:
-    """All variants on one set, and what the graph changes: saga less kf (relative for errors), by figure.
-
-    coasting  the coasting error of saga and kf, if it was measured
-    """
+    """All variants on one set, and what the graph changes: saga less kf (relative for errors), by figure."""
 
     name: str
     scenes: tuple[str, ...]
     variants: Mapping[str, VariantResult]
     differences: Mapping[str, Interval]
-    coasting: Mapping[str, ErrorSample]
 
     def ratio(self, variant: str) -> float:
         """Time a frame over that of `centerpoint`."""
@@ -125,9 +118,8 @@ def bench_set(
         compared += (LEARNED,)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
-    coasting: list[dict[str, ErrorSample]] = []
     scenes = recordings.dataset.scenes
-    for number, name in enumerate(scenes):
+    for name in scenes:
         scene = recordings.dataset.scene(name)
         for done, variant in enumerate(compared):
             clock = clocks[variant.name]
@@ -137,8 +129,6 @@ def bench_set(
             seconds[variant.name] += timed.seconds
             if progress is not None:
                 progress(f"{recordings.name} {name}", done + 1, len(compared))
-        if settings.coasting:
-            coasting.append(coasting_errors(scene, base, METHODS[:2], settings.seed + number))
     results = {}
     for variant in compared:
         tracked = runs.pop(variant.name)
@@ -148,9 +138,8 @@ def bench_set(
         spent = per_frame * seconds[variant.name]
         judged = {f"HOTA {row.label}": row.figures.hota for row in _in_space(score)} if settings.contenders else {}
         results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages)
-    differences = graph_differences(results[SAGA].score, results[KF].score, coasting, settings)
-    carried = {name: ErrorSample.pool(scene[name] for scene in coasting) for name in (SAGA, KF)} if coasting else {}
-    return SetResult(recordings.name, scenes, results, differences, carried)
+    differences = graph_differences(results[SAGA].score, results[KF].score, settings)
+    return SetResult(recordings.name, scenes, results, differences)
 
 
 def _in_space(score: Score) -> list[HotaRow]:
@@ -175,9 +164,7 @@ def learn_by_folds(dataset: Dataset, progress: Progress | None = None) -> dict[s
     return learned
 
 
-def graph_differences(
-    saga: Score, kf: Score, coasting: Sequence[Mapping[str, ErrorSample]], settings: TrackingBenchSettings
-) -> dict[str, Interval]:
+def graph_differences(saga: Score, kf: Score, settings: TrackingBenchSettings) -> dict[str, Interval]:
     """Saga against kf: headline figures as differences, RMSEs as relative changes. Needs two scenes; else empty."""
     if len(saga.errors) < 2:
         return {}
@@ -187,9 +174,6 @@ def graph_differences(
     for name in ("position", "velocity", "heading"):
         a, b = ([errors.sample(name).square_sums for errors in score.errors] for score in (saga, kf))
         result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
-    if coasting:
-        a, b = ([scene[name].square_sums for scene in coasting] for name in (SAGA, KF))
-        result["coasting RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
     return result
 
 

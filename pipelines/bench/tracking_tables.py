@@ -32,7 +32,6 @@ def figures(result: SetResult) -> dict[str, Any]:
             name: {"difference": interval, "verdict": verdict(name, interval)}
             for name, interval in result.differences.items()
         },
-        "coasting_rmse": {name: sample.rmse for name, sample in result.coasting.items()},
         "calibration": {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()},
     }
 

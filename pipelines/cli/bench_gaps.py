@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,23 +12,27 @@ from data_tools.datasets.source import names
 from data_tools.files.error_messages import unknown_name
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.tables import JsonFile, MarkdownFile, report
+from pipelines.cli.tables import JsonFile, MarkdownFile, PictureFile, report, writable
+from pipelines.cli.tracking_options import InteractionsOption, with_interactions
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.bench.gaps.bench import Contender, Run
+    from pipelines.bench.gaps.sources import RecordingSource
     from pipelines.config import TrackConfig
 
 
 def gaps(
     data: Annotated[
-        Path | None, typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them.")
+        Path | None,
+        typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them, and others of --sets."),
     ] = None,
     sets: Annotated[
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti and simulated, with commas.  [default: all that can be]",
+            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections; argoverse2, "
+            "eth_ucy, where the visible annotations are the detections.  [default: the first five]",
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
@@ -36,7 +40,8 @@ def gaps(
         str | None,
         typer.Option(
             "--contenders",
-            help="Of saga, kf, turn, stationary, stationary + turn and centerpoint, with commas.  [default: all]",
+            help="Of saga, kf, constant velocity, turn, stationary, stationary + turn and centerpoint, with commas.  "
+            "[default: all that differ]",
         ),
     ] = None,
     against: Annotated[str, typer.Option("--against", help="The contender that all others are compared with.")] = "kf",
@@ -48,6 +53,7 @@ def gaps(
             metavar="NAME[:METHOD]=FILE",
         ),
     ] = None,
+    interactions: InteractionsOption = None,
     train: Annotated[
         str | None,
         typer.Option("--train", help="Fit noise and edges to these recordings, with commas: two contenders more."),
@@ -56,6 +62,12 @@ def gaps(
         str | None,
         typer.Option("--test", help="Judge these recordings alone, with commas.  [default: all but --train]"),
     ] = None,
+    folds: Annotated[
+        int | None, typer.Option("--folds", min=2, help="Judge each fold of recordings after a fit to the others.")
+    ] = None,
+    labels: Annotated[
+        bool, typer.Option("--labels", help="Take the visible annotations for detections, in all sets.")
+    ] = False,
     passes: Annotated[
         int, typer.Option("--passes", min=0, help="Runs over each recording with made gaps; 0: real gaps alone.")
     ] = 4,
@@ -66,6 +78,17 @@ def gaps(
     by_class: Annotated[bool, typer.Option("--by-class", help="Rows for classes of objects as well.")] = False,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 1,
     config: Config = None,
+    plot: PictureFile = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture",
+            help="Draw the gap in which the first contender does better than that of --against by most, in the first "
+            "set, to this PNG file.",
+            metavar="FILE",
+            callback=writable,
+        ),
+    ] = None,
     json_file: JsonFile = None,
     markdown: MarkdownFile = None,
     verbose: Verbose = False,
@@ -81,57 +104,82 @@ def gaps(
       saga-fg bench gaps --sets simulated --scenes 4
       saga-fg bench gaps --data data --sets megvii,kitti --workers 2 --json gaps.json
       saga-fg bench gaps --data data --sets kitti --contenders saga,kf --contender trial=trial.yaml
-      saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007
+      saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
+      saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
-    from pipelines.bench.gaps.bench import GapBenchSettings, RecordingSource, bench_gaps
+    from pipelines.bench.gaps.bench import GapBenchSettings
     from pipelines.bench.gaps.contenders import LIVES
-    from pipelines.bench.gaps.fitted import fitted_contenders
+    from pipelines.bench.gaps.fitted import bench_splits, splits_of
+    from pipelines.bench.gaps.picture import write_telling_picture
+    from pipelines.bench.gaps.plot import write_plot
+    from pipelines.bench.gaps.sources import RecordingSource, set_names
     from pipelines.bench.gaps.tables import figures, tables
-    from pipelines.bench.recordings import SETS, recording_set
     from pipelines.config import load_config
 
-    everything = (*SETS, "simulated") if data is not None else ("simulated",)
-    chosen = names("--sets", sets) if sets else everything
-    recordings = {name: recording_set(name, data, scenes) for name in chosen}
-    taught = names("--train", train) if train else ()
-    judged = names("--test", test) if test else ()
-    all_scenes = tuple(scene for each in recordings.values() for scene in each.dataset.scenes)
-    for option, scene in (*(("--train", each) for each in taught), *(("--test", each) for each in judged)):
-        if scene not in all_scenes:
-            raise InputError(f"{option}: {unknown_name('recording', scene, all_scenes)}")
-    if set(taught) & set(judged):
-        raise InputError("--train, --test: expected recordings that are in one of them only")
+    sources = [
+        RecordingSource(name, data, scenes, labels) for name in (names("--sets", sets) if sets else set_names(data))
+    ]
+    taught, judged = (names(option, value) if value else () for option, value in (("--train", train), ("--test", test)))
+    recordings = {source.name: _recordings(source) for source in sources}
+    _check_names(recordings, taught, judged)
+    if taught and folds is not None:
+        raise InputError("--folds: goes without --train")
+    splits = {name: splits_of(found, taught, judged, folds) for name, found in recordings.items()}
     settings = GapBenchSettings(passes, LIVES if life == "both" else (life,))
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
-        for name, each in recordings.items():
-            base = load_config(each.family, config)
-            compared = _contenders(contenders, own or [], base)
-            teaching = [scene for scene in each.dataset.scenes if scene in taught]
-            if teaching:
-                compared += fitted_contenders(each.dataset, teaching, base, progress)
-            if against not in (known := tuple(c.name for c in compared)):
+        for source in sources:
+            base = load_config(source.family, config)
+            compared = _contenders(contenders, own or [], interactions, base)
+            if against not in (known := tuple(each.name for each in compared)):
                 raise InputError(f"--against: {unknown_name('contender', against, known)}")
-            testing = [s for s in each.dataset.scenes if (s in judged if judged else s not in taught)]
-            if testing:
-                source = RecordingSource(name, data, scenes)
-                runs[name] = bench_gaps(source, testing, compared, settings, workers, progress)
+            if splits[source.name]:
+                found = bench_splits(source, splits[source.name], compared, base, settings, workers, progress)
+                runs[source.name] = found
     shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class)]
     report(shown, {name: figures(found, against) for name, found in runs.items()}, json_file, markdown)
+    if plot is not None:
+        write_plot(plot, runs, against)
+    if picture is not None and runs:
+        source = next(each for each in sources if each.name in runs)
+        compared = _contenders(contenders, own or [], interactions, load_config(source.family, config))
+        better = next((each for each in compared if each.name != against), compared[0])
+        pair = [next(each for each in compared if each.name == against), better]
+        write_telling_picture(picture, source, runs[source.name], pair)
 
 
-def _contenders(chosen: str | None, own: Sequence[str], base: TrackConfig) -> list[Contender]:
+def _recordings(source: RecordingSource) -> tuple[str, ...]:
+    with source.opened() as dataset:
+        return dataset.scenes
+
+
+def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str], judged: Sequence[str]) -> None:
+    """Raise `InputError` for recordings that no set has, and for those that would be fitted to and judged."""
+    known = tuple(name for each in recordings.values() for name in each)
+    for option, wanted in (("--train", taught), ("--test", judged)):
+        for name in wanted:
+            if name not in known:
+                raise InputError(f"{option}: {unknown_name('recording', name, known)}")
+    if set(taught) & set(judged):
+        raise InputError("--train, --test: expected recordings that are in one of them only")
+
+
+def _contenders(
+    chosen: str | None, own: Sequence[str], interactions: Path | None, base: TrackConfig
+) -> list[Contender]:
     """Those that are compared. Raises `InputError` for an unknown one and a wrong file."""
     from pipelines.bench.gaps.bench import Contender
     from pipelines.bench.gaps.contenders import CONTENDERS
     from pipelines.config import METHODS
     from pipelines.configuration import load_settings
 
-    found = []
+    found: list[Contender] = []
     for name in names("--contenders", chosen) if chosen else CONTENDERS:
         if name not in CONTENDERS:
             raise InputError(f"--contenders: {unknown_name('contender', name, tuple(CONTENDERS))}")
-        found.append(Contender.of(CONTENDERS[name], base))
+        contender = Contender.of(CONTENDERS[name], base)
+        if chosen or not any(contender.same_as(other) for other in found):
+            found.append(contender)
     for text in own:
         title, _, path = text.partition("=")
         name, _, method = title.partition(":")
@@ -139,6 +187,8 @@ def _contenders(chosen: str | None, own: Sequence[str], base: TrackConfig) -> li
             raise InputError(f"--contender {text}: expected NAME=FILE or NAME:METHOD=FILE, of {', '.join(METHODS)}")
         settings = load_settings(type(base), Path(path), base)
         found.append(Contender(name, next((m for m in METHODS if m == method), "saga"), settings))
+    if interactions is not None:
+        found.append(Contender(f"saga, {interactions.stem}", "saga", with_interactions(base, "saga", interactions)))
     if len({each.name for each in found}) < len(found):
         raise InputError("--contender: expected names that differ from all others")
     return found

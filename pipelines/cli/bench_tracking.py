@@ -15,13 +15,14 @@ from pipelines.cli.tables import JsonFile, MarkdownFile, report
 
 def tracking(
     data: Annotated[
-        Path | None, typer.Option("--data", help="Folder with nuscenes/ and kitti/, detections among them.")
+        Path | None,
+        typer.Option("--data", help="Folder with nuscenes/, kitti/ and others that --sets names."),
     ] = None,
     sets: Annotated[
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti and simulated, with commas.  [default: all that can be]",
+            help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
@@ -33,7 +34,6 @@ def tracking(
             "(needs the extra [eval])."
         ),
     ] = False,
-    coasting: Annotated[bool, typer.Option(help="Measure the coasting error as well.")] = True,
     draws: Annotated[int, typer.Option("--draws", min=0, help="Drawn sets of scenes for intervals; 0: none.")] = 200,
     config: Config = None,
     json_file: JsonFile = None,
@@ -48,8 +48,8 @@ def tracking(
     Examples:
       saga-fg bench tracking --sets simulated --scenes 4 --draws 0
       saga-fg bench tracking --data data --json figures.json --markdown tables.md
-      saga-fg bench tracking --data data --sets kitti --no-components --no-coasting
-      saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components --no-coasting
+      saga-fg bench tracking --data data --sets kitti --no-components
+      saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components
     """
     from pipelines.bench.recordings import SETS, recording_set
     from pipelines.bench.tracking import TrackingBenchSettings, bench_set
@@ -58,7 +58,7 @@ def tracking(
 
     everything = (*SETS, "simulated") if data is not None else ("simulated",)
     chosen = [recording_set(name, data, scenes) for name in (names("--sets", sets) if sets else everything)]
-    settings = TrackingBenchSettings(components, contenders, draws, coasting)
+    settings = TrackingBenchSettings(components, contenders, draws)
     results = []
     with progress_bar(unit="variants") as progress:
         for recordings in chosen:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from data_tools.figures import FigureTable
 
 
-def _writable(path: Path | None) -> Path | None:
+def writable(path: Path | None) -> Path | None:
     """Refuse a file that cannot be written before the work begins."""
     if path is not None:
         from data_tools.files.atomic_files import check_writable
@@ -25,11 +25,15 @@ def _writable(path: Path | None) -> Path | None:
 
 JsonFile = Annotated[
     Path | None,
-    typer.Option("--json", help="Write the figures to this file too.", metavar="FILE", callback=_writable),
+    typer.Option("--json", help="Write the figures to this file too.", metavar="FILE", callback=writable),
 ]
 MarkdownFile = Annotated[
     Path | None,
-    typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE", callback=_writable),
+    typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE", callback=writable),
+]
+PictureFile = Annotated[
+    Path | None,
+    typer.Option("--plot", help="Draw the figures to this PNG file too.", metavar="FILE", callback=writable),
 ]
 
 

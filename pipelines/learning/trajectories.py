@@ -13,9 +13,10 @@ def trajectories(source: DatasetSource, with_truth: bool) -> dict[str, Trajector
 
     Raises `InputError` for what cannot be read.
     """
-    with source.open(truth=with_truth) as dataset:
-        if with_truth:
+    if with_truth:
+        with source.ground_truth() as dataset:
             return {name: Trajectories.of_truth(dataset.scene(name)) for name in dataset.scenes}
+    with source.open() as dataset:
         config = load_config(source.family)
         runs = (track_scene(dataset.scene(name), config.new_tracker("kf")) for name in dataset.scenes)
         return {run.scene.name: Trajectories.of_tracks(run.tracks) for run in runs}

@@ -22,7 +22,9 @@ from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
 from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.ngsim.windows import NgsimWindows
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
+from data_tools.datasets.openacc import OpenAccPlatoons
 from data_tools.datasets.plaza import read_plaza
 from data_tools.datasets.victoria_park import read_victoria_park
 from data_tools.lidar import read_scan
@@ -34,6 +36,7 @@ from pipelines.report.run_record import read_run_record
 from pipelines.serving import StreamTracker
 from saga_fg.types.dataset import Scene
 from tests.data_tools.kitti_example import write_sequence
+from tests.data_tools.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.nuscenes_example import box, results, write_results, write_tables
 
 PIECES = [
@@ -144,6 +147,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "Victoria Park": one("park.txt", PARK, read_victoria_park),
         "Plaza": Target(plaza, lambda: read_plaza(plaza[0])),
         "ETH and UCY": one("eth/obsmat.txt", OBSMAT, lambda path: EthUcy(folder).scene("eth")),
+        **_traffic(folder),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
@@ -223,6 +227,25 @@ def _argoverse(root: Path) -> dict[str, Target]:
     for path, columns in zip(files, (rows | size | named, rows), strict=True):
         feather.write_feather(pyarrow.table(columns), path)
     return {"Argoverse": Target(files, lambda: ArgoverseLogs(root).scene("log"))}
+
+
+def _traffic(folder: Path) -> dict[str, Target]:
+    """Windows with their maps, not compressed, and platoons where pyarrow is installed."""
+    (folder / "ngsim").mkdir()
+    windows, maps = folder / "ngsim" / "windows.csv", folder / "ngsim" / "maps.json"
+    windows.write_text("\n".join([HEADER, *rows(steps=3)]))
+    maps.write_text(json.dumps({"A": crossing()}))
+    found = {"NGSIM": Target((windows, maps), lambda: NgsimWindows(folder / "ngsim").recording("A"))}
+    if importlib.util.find_spec("pyarrow") is None:
+        return found
+    import pyarrow
+    from pyarrow import parquet
+
+    text = {"setting": ["a", "a"], "run": ["b", "b"]}
+    numbers = {name: [1.0, 1.1] for name in ("speed", "east", "north", "gap_to_next")}
+    path = folder / "platoons.parquet"
+    parquet.write_table(pyarrow.table(text | {"t": [0.1, 0.2], "veh": [1, 1]} | numbers), path)
+    return {**found, "OpenACC": Target((path,), lambda: OpenAccPlatoons(folder).recording("a-b"))}
 
 
 def _read_nuscenes(root: Path) -> list[Scene]:

@@ -12,16 +12,23 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.simulator import SimulatorSettings, simulate_scene
-from pipelines.bench.gaps.bench import Contender, GapBenchSettings, RecordingSource, bench_gaps, hidden, run_of
+from pipelines.bench.gaps import fitted
+from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps, hidden, run_of
 from pipelines.bench.gaps.contenders import CONTENDERS, KEPT_ALIVE, LIFE, with_life
+from pipelines.bench.gaps.fitted import Split, splits_of
 from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
+from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
 from pipelines.bench.variants import changed
 from pipelines.cli import app
 from pipelines.config import Family, load_config
 from saga_fg import Annotations, Boxes, Detections, Frame, InputError, Scene, Tracks
+from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.turning import CoordinatedTurn
 
 SHORT = replace(SimulatorSettings(), duration=12.0, warm_up=5.0)
 TIMES = 0.5 * np.arange(16)
@@ -159,6 +166,23 @@ def test_a_tracker_that_reports_nothing_unseen_is_extrapolated() -> None:
     assert JudgedRun(drawn, found).outcome(gap).error == CAP
 
 
+def test_the_picture_shows_the_gap_that_tells_most() -> None:
+    drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
+    gaps, base = real_gaps(drawn), load_config("file")
+    pair = [Contender.of(CONTENDERS[name], base) for name in ("centerpoint", "kf")]
+    worse, better = ([run_of(drawn, gaps, each, life)] for each, life in zip(pair, ("shipped", "kept"), strict=True))
+    assert telling_gap(better, worse) == ("drawn", gaps[0])
+    shown = [drawn_gap(drawn, gaps, gaps[0], each, "kept") for each in pair]
+    assert [each.holders[4] for each in shown] == [each.holders[9] for each in shown] != [None, None]
+    figure = gap_picture(drawn, gaps[0], shown)
+    assert [ax.get_title(loc="left").split(",")[0] for ax in figure.axes] == [
+        "centerpoint: identity kept",
+        "kf: identity kept",
+    ]
+    with pytest.raises(InputError, match="--picture: expected recordings with gaps"):
+        telling_gap([], [])
+
+
 def test_made_gaps_hide_one_object_among_others() -> None:
     config = load_config("simulated")
     traffic = LabelledScene.of(simulate_scene(SHORT, seed=4), config.sensors)
@@ -203,6 +227,19 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family)
         assert with_life(config, "shipped") is config
 
 
+def test_classical_contenders_differ_in_motion_alone() -> None:
+    base = load_config("kitti")
+    turn = CONTENDERS["stationary + turn"].config(base).tracker
+    assert isinstance(turn.classes["default"].motion, CoordinatedTurn)
+    assert isinstance(turn.classes["pedestrian"].motion, ConstantVelocity)
+    assert turn.stationarity.prior == 0.5
+    alone = CONTENDERS["constant velocity"].config(base).tracker
+    assert alone.stationarity.prior == 0
+    assert alone.classes["default"].max_coasting == base.tracker.classes["default"].max_coasting
+    assert Contender.of(CONTENDERS["kf"], base).same_as(Contender("classical", "kf", base))
+    assert not Contender.of(CONTENDERS["saga"], base).same_as(Contender("classical", "kf", base))
+
+
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
     kf = Contender.of(CONTENDERS["kf"], load_config("file"))
@@ -212,9 +249,53 @@ def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     assert kept.outcomes[0].kept
     assert shipped.outcomes[0].lost
     rows = {(f.life, f.contender): f for f in gap_figures([kept, shipped], "kf")}
-    assert rows["kept", "kf"].kept == 1.0
+    assert rows["kept", "kf"].kept.estimate == 1.0
     assert rows["shipped", "kf"].lost == 1.0
     assert [each.right for each in link_figures([kept, shipped])] == [1, 0]
+
+
+def test_recordings_are_dealt() -> None:
+    five = ("a", "b", "c", "d", "e")
+    assert splits_of(five) == [Split((), five)]
+    assert splits_of(five, train=("a", "x")) == [Split(("a",), ("b", "c", "d", "e"))]
+    assert splits_of(five, train=("a",), test=("b",)) == [Split(("a",), ("b",))]
+    assert splits_of(five, test=("x",)) == []
+    assert splits_of(five, folds=2) == [Split(("b", "d"), ("a", "c", "e")), Split(("a", "c", "e"), ("b", "d"))]
+    with pytest.raises(InputError, match="--folds 6: expected at most the number of recordings, 5"):
+        splits_of(five, folds=6)
+
+
+def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
+    config = load_config("simulated")
+    fitted = config.with_acceleration_noise({"default": 0.5, "truck": 0.25})
+    classes = fitted.tracker.classes
+    assert classes["truck"].motion.acceleration_noise == 0.25
+    assert classes["default"].motion.acceleration_noise == 0.5
+    assert classes["pedestrian"] == config.tracker.classes["pedestrian"]
+    assert classes["truck"].max_distance == classes["default"].max_distance
+    assert fitted.tracker.edges == config.tracker.edges
+
+
+def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learning finds no interactions here: then saga is kf."""
+    taught_by = []
+
+    def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
+        taught_by.append(origin)
+        return LearnedInteractions(learned_from=origin)
+
+    monkeypatch.setattr(fitted, "learn_interactions", learn)
+    base = load_config("simulated")
+    kf = Contender.of(CONTENDERS["kf"], base)
+    source = RecordingSource("simulated", scenes=2, labels=True)
+    splits, settings = splits_of(("scene-0001", "scene-0002"), folds=2), GapBenchSettings(0, ("kept",))
+    runs = fitted.bench_splits(source, splits, [kf], base, settings)
+    assert taught_by == ["recordings scene-0002", "recordings scene-0001"]
+    names = ["kf", "kf, fitted noise", "saga, learned edges"]
+    assert [(run.recording, run.contender) for run in runs] == [
+        (s, n) for s in ("scene-0001", "scene-0002") for n in names
+    ]
+    assert runs[0].outcomes == runs[2].outcomes
 
 
 def test_scenes_without_truth_or_detections_are_refused() -> None:
@@ -237,7 +318,7 @@ def test_contenders_are_judged_on_the_same_gaps() -> None:
         assert (ours.contender, theirs.contender) == ("saga", "kf")
         assert (ours.gaps, ours.group, ours.length) == (theirs.gaps, theirs.group, theirs.length)
         if ours.error_change is not None and ours.places:
-            assert ours.error_change.estimate == pytest.approx(ours.error / theirs.error - 1)
+            assert ours.error_change.estimate == pytest.approx(ours.error.estimate / theirs.error.estimate - 1)
 
 
 def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
@@ -245,9 +326,11 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     own.write_text("tracker: {explained_noise: 0.5}\n")
     arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--life", "shipped"]
     arguments += ["--contenders", "kf", "--contender", f"own:saga={own}", "--json", str(out)]
+    arguments += ["--plot", str(tmp_path / "gaps.png")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "real gaps of 1 to 6 s" in result.output
+    assert (tmp_path / "gaps.png").read_bytes().startswith(b"\x89PNG")
     figures = json.loads(out.read_text())["simulated"]
     assert figures["recordings"] == ["scene-0001"]
     assert {row["contender"] for row in figures["gaps"]} == {"kf", "own"}

@@ -1,4 +1,4 @@
-"""The tracking benchmark: variants by named settings, hidden objects, intervals, and the commands from end to end."""
+"""The tracking benchmark: variants by named settings, intervals, and the commands from end to end."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.metrics import ErrorSample, Interval, LabelErrors
-from data_tools.simulator import SimulatorSettings, simulate_scene
+from data_tools.metrics import Interval, LabelErrors
+from data_tools.simulator import SimulatorSettings
 from pipelines.bench import tracking
-from pipelines.bench.coasting import HIDDEN, NEVER_GIVEN_UP, coasting_errors, kept_alive
 from pipelines.bench.recordings import NuScenesSet, Score, SimulatedSet
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
 from pipelines.bench.variants import COMPONENTS, METHODS, changed, variants
@@ -33,8 +32,6 @@ def test_every_component_is_a_setting_of_every_kind_of_data(family: Family) -> N
     base = load_config(family)
     for variant in COMPONENTS:
         variant.config(base)
-    for name, value in NEVER_GIVEN_UP.items():
-        changed(base, name, value)
     names = [variant.name for variant in variants(base)]
     assert len(set(names)) == len(names)
     assert names[:3] == ["saga", "kf", "centerpoint"]
@@ -56,15 +53,6 @@ def test_settings_are_changed_by_their_dotted_names() -> None:
             changed(base, name, 0.0)
 
 
-def test_hidden_objects_are_coasted_and_nothing_else_is_judged() -> None:
-    scene = simulate_scene(replace(SHORT, duration=4.5), seed=3)
-    errors = coasting_errors(scene, load_config("simulated"), METHODS[:2], seed=0)
-    assert set(errors) == {"saga", "kf"}
-    assert len(errors["kf"]) == len(errors["saga"]) > HIDDEN * 10  # moments of at least one object
-    assert 0.0 < errors["kf"].median < errors["kf"].values.max() <= 10.0
-    assert kept_alive(load_config("simulated")).tracker.report_coasting >= HIDDEN
-
-
 def label_errors(velocity: float) -> LabelErrors:
     n = 5
     column = np.full(n, 1.0)
@@ -79,20 +67,19 @@ def test_differences_and_their_verdicts() -> None:
     better = tuple(label_errors(0.5 * v) for v in (1.0, 2.0, 3.0))
     saga = Score(lambda rows: {"MOTA": 0.5 + 0.01 * sum(rows), "IDS": 2.0 * len(rows)}, better)
     kf = Score(lambda rows: {"MOTA": 0.4 + 0.01 * sum(rows), "IDS": 1.0 * len(rows)}, errors)
-    coasting = [{"saga": ErrorSample(np.array([1.0])), "kf": ErrorSample(np.array([1.0]))}] * 3
-    differences = graph_differences(saga, kf, coasting, TrackingBenchSettings(draws=20))
+    differences = graph_differences(saga, kf, TrackingBenchSettings(draws=20))
     assert differences["MOTA"].estimate == pytest.approx(0.1)
     assert differences["velocity RMSE"].estimate == pytest.approx(-0.5)
     found = {name: verdict(name, each) for name, each in differences.items()}
     assert found["MOTA"] == found["velocity RMSE"] == "better"
     assert found["IDS"] == "worse"
-    assert found["coasting RMSE"] == found["position RMSE"] == "no difference"
+    assert found["position RMSE"] == "no difference"
     assert verdict("AMOTP", Interval(-0.1, -0.2, -0.05, 0.95)) == "better"
-    assert graph_differences(replace(saga, errors=errors[:1]), kf, [], TrackingBenchSettings()) == {}
+    assert graph_differences(replace(saga, errors=errors[:1]), kf, TrackingBenchSettings()) == {}
 
 
 def test_a_set_is_tracked_by_every_variant() -> None:
-    settings = TrackingBenchSettings(draws=5, coasting=False)
+    settings = TrackingBenchSettings(draws=5)
     result = bench_set(SimulatedSet(2, settings=replace(SHORT, duration=1.0)), load_config("simulated"), settings)
     assert result.ratio("centerpoint") == 1.0
     assert {"saga", "kf", "centerpoint", "without following"} <= set(result.variants)
@@ -119,7 +106,7 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
         second: f"{first} {third}",
         third: second,
     }
-    settings = TrackingBenchSettings(components=False, contenders=True, draws=0, coasting=False)
+    settings = TrackingBenchSettings(components=False, contenders=True, draws=0)
     result = bench_set(recordings, load_config("simulated"), settings)
     assert list(result.variants) == ["saga", "kf", "centerpoint", "graph matching", "learned interactions"]
     assert result.variants["learned interactions"].figures == pytest.approx(result.variants["kf"].figures, nan_ok=True)
@@ -168,7 +155,6 @@ def test_the_commands_on_recordings_in_the_nuscenes_layout(tmp_path: Path) -> No
     assert figures["variants"]["centerpoint"]["ratio_to_centerpoint"] == 1.0
     assert figures["variants"]["saga"]["figures"]["AMOTA"] > 0.2
     assert figures["saga_against_kf"]["AMOTA"]["verdict"] in ("better", "worse", "no difference")
-    assert figures["coasting_rmse"]["kf"] > 0
 
 
 def test_mistakes_are_one_line() -> None:

@@ -19,7 +19,7 @@ from pipelines.smoothing import SmoothConfig, load_smooth_config
 runner = CliRunner()
 
 
-@pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
+@pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "traffic", "file"])
 def test_shipped_settings_survive_the_round_trip(family: Family) -> None:
     config = load_smooth_config(family)
     assert read_settings(SmoothConfig, write_settings(config)) == config

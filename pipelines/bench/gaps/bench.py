@@ -7,7 +7,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from pipelines.bench.gaps.contenders import LIVES, Life, with_life
 from pipelines.bench.gaps.gap import Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import GapOutcome, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
-from pipelines.bench.recordings import recording_set
+from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.variants import Variant
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
@@ -41,7 +40,12 @@ class Contender:
 
     @classmethod
     def of(cls, variant: Variant, base: TrackConfig) -> Contender:
+        """A variant of a configuration."""
         return cls(variant.name, variant.method, variant.config(base))
+
+    def same_as(self, other: Contender) -> bool:
+        """Whether the other does the same under another name."""
+        return (self.method, self.config) == (other.method, other.config)
 
 
 @dataclass(frozen=True)
@@ -55,20 +59,6 @@ class Run:
     label: tuple[str, ...]
     outcomes: tuple[GapOutcome, ...]
     links: Links
-
-
-@dataclass(frozen=True)
-class RecordingSource:
-    """Where recordings come from: a set of `pipelines.bench.recordings` by name. Picklable."""
-
-    name: str
-    data: Path | None = None
-    scenes: int = 10
-
-    def labelled(self, recording: str, base: TrackConfig) -> LabelledScene:
-        """Read a recording."""
-        dataset = recording_set(self.name, self.data, self.scenes).dataset
-        return LabelledScene.of(dataset.scene(recording), base.sensors)
 
 
 @dataclass(frozen=True)
@@ -129,7 +119,7 @@ class _Base:
 def _prepared(
     source: RecordingSource, recording: str, settings: GapBenchSettings, base: _Base
 ) -> tuple[LabelledScene, list[Gap]]:
-    labelled = source.labelled(recording, base.config)
+    labelled = LabelledScene.of(source.scene(recording), base.config.sensors)
     return labelled, [*real_gaps(labelled), *made_gaps(labelled, settings.passes, settings.seed)]
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from math import inf
 from typing import Any, Literal
 
 from pipelines.bench.gaps.gap import LONGEST
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
+from saga_fg.model.motion import ConstantVelocity
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.by_class import class_settings
 
 Life = Literal["kept", "shipped"]
 LIVES: tuple[Life, ...] = ("kept", "shipped")
@@ -24,34 +25,43 @@ KEPT_ALIVE: Mapping[str, Any] = {
     "tracker.existence.report_above": 0.0,
     "greedy.max_coasting": LIFE,
 }
-STATIONARY = {"tracker.stationarity.prior": 0.5}
 TURNING = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle", "cyclist", "default")
+"""Classes of vehicles."""
 
 
-def _turning(classes: Mapping[str, ClassSettings]) -> Mapping[str, ClassSettings]:
-    """Vehicles that turn at a nearly constant rate, with the noise of their acceleration as it is."""
-    found = dict(classes)
-    for label in classes:
-        own = class_settings(classes, ClassSettings, label)
-        if label in TURNING:
-            noise = getattr(own.motion, "acceleration_noise", CoordinatedTurn().acceleration_noise)
-            found[label] = changed(own, "motion", CoordinatedTurn(acceleration_noise=noise))
-    return found
+def _moving(turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, ClassSettings]]:
+    """All classes at constant velocity, or vehicles at a constant turn rate; their acceleration noise stays."""
+
+    def change(classes: Mapping[str, ClassSettings]) -> Mapping[str, ClassSettings]:
+        found = dict(classes)
+        for label, own in classes.items():
+            noise = getattr(own.motion, "acceleration_noise", None)
+            if noise is not None:
+                turns = turn and label in TURNING
+                motion = CoordinatedTurn(noise) if turns else ConstantVelocity(noise)
+                found[label] = replace(own, motion=motion)
+        return found
+
+    return change
 
 
-TURN = {"tracker.classes": _turning}
+def _classical(name: str, stationary: bool, turn: bool) -> Variant:
+    prior = {"tracker.stationarity.prior": 0.5 if stationary else 0.0}
+    return Variant(name, "kf", prior | {"tracker.classes": _moving(turn)})
+
+
 CONTENDERS = {
     variant.name: variant
     for variant in (
         Variant("saga"),
         Variant("kf", "kf"),
-        Variant("turn", "kf", {"tracker.stationarity.prior": 0.0, **TURN}),
-        Variant("stationary", "kf", STATIONARY),
-        Variant("stationary + turn", "kf", STATIONARY | TURN),
+        _classical("constant velocity", stationary=False, turn=False),
+        _classical("turn", stationary=False, turn=True),
+        _classical("stationary", stationary=True, turn=False),
+        _classical("stationary + turn", stationary=True, turn=True),
         Variant("centerpoint", "centerpoint"),
     )
 }
-REFERENCE = "kf"
 
 
 def with_life(config: TrackConfig, life: Life) -> TrackConfig:

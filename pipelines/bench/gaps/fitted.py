@@ -3,26 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-from pipelines.bench.gaps.bench import Contender
+from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
+from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
 from pipelines.learning import learn_interactions
 from pipelines.tracking import Progress
+from saga_fg.errors import InputError
 from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
-from saga_fg.types.dataset import Dataset
+from saga_fg.types.dataset import Scene
+
+
+@dataclass(frozen=True)
+class Split:
+    """Recordings to fit to, and others to judge on."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+def splits_of(
+    recordings: Sequence[str], train: Sequence[str] = (), test: Sequence[str] = (), folds: int | None = None
+) -> list[Split]:
+    """How the recordings of a set are used, of which `train` and `test` may name others as well.
+
+    test   those that are judged; all but `train` if it is empty
+    folds  deal the judged recordings into so many, each judged after a fit to the others
+
+    Raises `InputError` for more folds than recordings.
+    """
+    judged = [name for name in recordings if (name in test if test else name not in train)]
+    if folds is None:
+        return [Split(tuple(name for name in recordings if name in train), tuple(judged))] if judged else []
+    if folds > len(judged):
+        raise InputError(f"--folds {folds}: expected at most the number of recordings, {len(judged)}")
+    dealt = [tuple(judged[k::folds]) for k in range(folds)]
+    return [Split(tuple(name for name in judged if name not in fold), fold) for fold in dealt]
+
+
+def bench_splits(
+    source: RecordingSource,
+    splits: Sequence[Split],
+    contenders: Sequence[Contender],
+    base: TrackConfig,
+    settings: GapBenchSettings,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> list[Run]:
+    """All runs on the recordings that are judged; where there are others to fit to, with fitted contenders."""
+    runs: list[Run] = []
+    for split in splits:
+        teaching = [source.scene(name) for name in split.train]
+        fitted = fitted_contenders(teaching, base, progress) if teaching else []
+        runs += bench_gaps(source, split.test, [*contenders, *fitted], settings, workers, progress)
+    return runs
 
 
 def fitted_contenders(
-    dataset: Dataset, recordings: Sequence[str], base: TrackConfig, progress: Progress | None = None
+    teaching: Sequence[Scene], base: TrackConfig, progress: Progress | None = None
 ) -> list[Contender]:
     """kf with the process noise, and saga with the edges, learned from some annotated recordings.
 
     Raises `InputError` where there is nothing to learn from.
     """
-    scenes = [dataset.scene(name) for name in recordings]
-    noise = fit_acceleration_noise_by_class(measured_trajectories(iter(scenes), base.sensors))
-    truths = {scene.name: Trajectories.of_truth(scene) for scene in scenes}
-    learned = learn_interactions(truths, f"recordings {', '.join(recordings)}", progress=progress)
+    noise = fit_acceleration_noise_by_class(measured_trajectories(iter(teaching), base.sensors))
+    truths = {scene.name: Trajectories.of_truth(scene) for scene in teaching}
+    learned = learn_interactions(truths, f"recordings {', '.join(truths)}", progress=progress)
     return [
         Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise)),
         Contender("saga, learned edges", "saga", base.with_interactions(learned)),

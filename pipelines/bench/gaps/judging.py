@@ -94,6 +94,11 @@ class JudgedRun:
         mean = float(known.mean()) if len(known) else float("nan")
         return GapOutcome(True, after == before, lost, mean, {h: e for h, e in at.items() if np.isfinite(e)})
 
+    def holders(self, gap: Gap) -> list[int | None]:
+        """The detected track of the object of a gap at each moment, None where there is none."""
+        name = str(self._labelled.id[gap.row])
+        return [found.get(name) for found in self._track_of]
+
     def links(self) -> Links:
         """Judge all tracks that were detected again."""
         time = self._labelled.scene.timestamps

@@ -27,6 +27,7 @@ class LabelledScene:
 
     id, label (N,); position (K, N, 2), m, world; detected (K, N) whether some detection is of the object
     owner     for each frame, the object (D,) that each detection is of, whatever its class; -1: none
+    place     for each frame, where its detections are (D, 2), m, world
     """
 
     scene: Scene
@@ -35,6 +36,7 @@ class LabelledScene:
     position: FloatArray
     detected: BoolArray
     owner: tuple[IntArray, ...]
+    place: tuple[FloatArray, ...]
 
     @classmethod
     def of(cls, scene: Scene, sensors: Mapping[str, Sensor]) -> LabelledScene:
@@ -50,16 +52,17 @@ class LabelledScene:
         detected = np.zeros((len(truth), len(names)), dtype=np.bool_)
         for k, (moment, at) in enumerate(zip(truth, rows, strict=True)):
             position[k, at], label[at] = moment.boxes.position[:, :2], moment.boxes.label
-        owners = []
+        owners, places = [], []
         for frame in scene.frames:
             k = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
             boxes = sensor_model(sensors, frame.sensor).in_world(frame).boxes
             distance = _distances(boxes, truth[k], frame.timestamp - float(scene.timestamps[k]))
             owners.append(_nearest(distance, rows[k]))
+            places.append(boxes.position[:, :2])
             distance[boxes.label[:, None] != truth[k].boxes.label] = np.inf
             same = _nearest(distance, rows[k])
             detected[k, same[same >= 0]] = True
-        return cls(scene, names, label, position, detected, tuple(owners))
+        return cls(scene, names, label, position, detected, tuple(owners), tuple(places))
 
     def frames_without(self, row: IntArray, start: FloatArray, stop: FloatArray) -> list[Frame]:
         """The frames without the detections of objects `row` (W,) after `start` and before `stop` (W,), s."""

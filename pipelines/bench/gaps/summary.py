@@ -45,11 +45,11 @@ class GapFigure:
     length: float | None
     contender: str
     gaps: int
-    kept: float
+    kept: Interval
     kept_change: Interval | None
     lost: float
     places: int
-    error: float
+    error: Interval
     error_change: Interval | None
     median: float
 
@@ -154,11 +154,11 @@ def _figure(runs: Sequence[Run], base: Sequence[Run], life: Life, group: _Group)
         group.length,
         runs[0].contender,
         sum(map(len, kept)),
-        _mean(np.concatenate(kept)),
+        _interval(kept),
         changes[0],
         _mean(np.concatenate(lost)),
         len(every),
-        _mean(every),
+        _interval(errors),
         changes[1],
         float(np.median(every)) if len(every) else float("nan"),
     )
@@ -188,6 +188,12 @@ def _compared(ours: Sequence[FloatArray], theirs: Sequence[FloatArray], compare:
             a.append((mine[both].sum(), both.sum()))
             b.append((other[both].sum(), both.sum()))
     return paired_bootstrap(np.array(a), np.array(b), ratio_of_sums, compare) if a else None
+
+
+def _interval(values: Sequence[FloatArray]) -> Interval:
+    """The mean of the known values, NaN where there are none."""
+    found = _compared(values, values, lambda ours, _theirs: ours)
+    return Interval(float("nan"), float("nan"), float("nan"), 0.95) if found is None else found
 
 
 def _mean(values: FloatArray) -> float:

@@ -73,7 +73,7 @@ def _gaps(figures: Sequence[GapFigure], title: str, reference: str) -> FigureTab
             f.group + length,
             f.contender,
             str(f.gaps),
-            cell(100 * f.kept, 1),
+            cell(100 * f.kept.estimate, 1),
             _points(f.kept_change),
         )
         row += (cell(100 * f.lost, 1), *_error(f))
@@ -84,7 +84,7 @@ def _gaps(figures: Sequence[GapFigure], title: str, reference: str) -> FigureTab
 
 def _error(f: GapFigure) -> tuple[str, ...]:
     change = "-" if f.error_change is None else percent(f.error_change)
-    return str(f.places), cell(f.error), change, cell(f.median)
+    return str(f.places), cell(f.error.estimate), change, cell(f.median)
 
 
 def _points(change: Interval | None) -> str:

@@ -26,6 +26,7 @@ SIZES = {
     "detections, NDJSON": 1,
     "detections, NumPy": 1,
     "ETH and UCY": 2,
+    "NGSIM": 3,
     "pose graph, plane": 2,
     "pose graph, space": 2,
     "poses, KITTI": 2,
@@ -48,7 +49,7 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 
 def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
     read: dict[str, Any] = {name: target.read() for name, target in valid.items()}
-    assert len(read.pop("Argoverse", "ab")) == 2  # needs pyarrow
+    assert len(read.pop("Argoverse", "ab")) == len(read.pop("OpenACC", "ab")) == 2  # need pyarrow
     assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES
     assert [len(scene) for scene in read["nuScenes"]] == [3, 2]
     assert len(read["tracks"].id) == len(read["labels"].tracks.id) == 2

@@ -1,0 +1,191 @@
+"""Recorded traffic seen by simulated sensors from a chosen viewpoint.
+
+    mast        6 m above the middle of the traffic; vehicles hide those behind them
+    above       100 m above the vehicles, with them: nothing is hidden, and noise does not grow with the distance
+    vehicle     on the roof of one of the vehicles, that which is there longest and nearest to the middle
+    X,Y,Z       a place in the world, m
+    the id of a vehicle
+
+A vehicle that carries the sensors is not among the objects, and the scene lasts as long as it is there. Noise, misses,
+clutter, occlusion and annotation are the simulator's. Where the colours of lights are known they are reported as by the
+signal controller, without errors: in the first frame, each second, and when one changes.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic
+from data_tools.files.error_messages import unknown_name
+from data_tools.simulator.lights import HEIGHT, Signal
+from data_tools.simulator.scene import scene_from_world
+from data_tools.simulator.sensed_world import objects_seen_from
+from data_tools.simulator.settings import SensorSettings, SimulatorSettings, lidar
+from data_tools.simulator.trajectories import SimulatedTrajectories
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import MAX_POSITION, Boxes
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.road_map import RoadMap
+
+MAST, ABOVE, VEHICLE = "mast", "above", "vehicle"
+MAST_HEIGHT, ABOVE_HEIGHT = 6.0, 100.0  # m
+ABOVE_RANGE = 300.0  # m
+REPORT_INTERVAL = 1.0  # s between reports of the lights
+
+
+def default_sensors() -> SimulatorSettings:
+    """A LiDAR, and ground truth of all objects, seen or not."""
+    return SimulatorSettings(sensors={"lidar": lidar()}, annotation_range=np.inf, memory=np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedWorld:
+    """Recorded objects and, over the moments (K,), the pose of what carries the sensors (K, 3): x, y, yaw."""
+
+    objects: SimulatedTrajectories
+    ego: FloatArray
+    road_map: RoadMap | None
+    signals: tuple[Signal, ...] = ()
+    start: float = 0.0
+    _seen: dict[tuple[float, ...], tuple[Boxes, BoolArray, FloatArray]] = field(default_factory=dict)
+
+    def ego_pose(self, time: float) -> FloatArray:
+        """world_T_ego (4, 4) at `time`."""
+        x, y, yaw = (float(np.interp(time, self.objects.time, column)) for column in self.ego.T)
+        return yaw_transform(x, y, 0.0, yaw)
+
+    def visible_from(self, point: FloatArray, time: float, reach: float) -> tuple[Boxes, BoolArray, FloatArray]:
+        """Objects as seen from a point, see `objects_seen_from`; frames and annotations ask for the same."""
+        key = (*point.tolist(), round(time, 6), reach)
+        if key not in self._seen:
+            self._seen[key] = objects_seen_from(self.objects, Boxes.empty(), point, time, reach)
+        return self._seen[key]
+
+
+def sensed_scene(traffic: RecordedTraffic, viewpoint: str, settings: SimulatorSettings | None, seed: int) -> Scene:
+    """Detections of recorded traffic, and ground truth. `settings`: their sensors and what is annotated.
+
+    Raises `InputError` for a viewpoint that is none of the above.
+    """
+    settings = settings or default_sensors()
+    row = _carrier(traffic, viewpoint)
+    if row is None:
+        ego, sensors = _stationary(traffic, viewpoint, settings.sensors)
+    else:
+        there = np.flatnonzero(traffic.present[:, row])
+        traffic = traffic.moments(slice(int(there[0]), int(there[-1]) + 1))
+        ego, sensors = np.column_stack([traffic.position[:, row], traffic.yaw[:, row]]), settings.sensors
+        traffic = traffic.without(row)
+    settings = replace(
+        settings,
+        sensors=sensors,
+        duration=PERIOD * (len(traffic) - 1) + 1e-6,
+        keyframe_rate=1 / PERIOD,
+    )
+    number = int(np.random.SeedSequence([seed, zlib.crc32(traffic.name.encode())]).generate_state(1)[0])
+    world = RecordedWorld(_objects(traffic), ego, traffic.road_map)
+    scene = scene_from_world(world, settings, number, traffic.name, epoch=0.0)
+    return replace(scene, frames=_with_colours(scene.frames, traffic)) if traffic.colours else scene
+
+
+def true_scene(traffic: RecordedTraffic) -> Scene:
+    """Ground truth alone: all vehicles, all visible."""
+    objects, truth = _objects(traffic), []
+    for time in traffic.time.tolist():
+        boxes, present = objects.at(time)
+        truth.append(Annotations(traffic.id[present], boxes.select(present), np.ones(int(present.sum()), dtype=bool)))
+    poses = np.tile(np.eye(4), (len(traffic), 1, 1))
+    return Scene(traffic.name, np.round(traffic.time, 6), poses, ("",) * len(traffic), (), truth)
+
+
+def _objects(traffic: RecordedTraffic) -> SimulatedTrajectories:
+    return SimulatedTrajectories(
+        *(traffic.id, traffic.label, traffic.size, traffic.time),
+        *(traffic.position, traffic.velocity, traffic.yaw, traffic.present),
+    )
+
+
+def _carrier(traffic: RecordedTraffic, viewpoint: str) -> int | None:
+    """Row of the vehicle that carries the sensors, None where none does."""
+    if viewpoint in (MAST, ABOVE) or "," in viewpoint:
+        return None
+    count = traffic.present.sum(axis=0)
+    if viewpoint == VEHICLE:
+        away = np.hypot(*(traffic.position.mean(axis=0) - _middle(traffic)).T)
+        row = int(np.lexsort((away, -count))[0])
+    else:
+        names = tuple(traffic.id.tolist())
+        if viewpoint not in names:
+            known = (MAST, ABOVE, VEHICLE, "X,Y,Z", *names)
+            raise InputError(f"--viewpoint: {traffic.name}: {unknown_name('viewpoint', viewpoint, known)}")
+        row = names.index(viewpoint)
+    if count[row] < 2:
+        raise InputError(f"--viewpoint {viewpoint}: {traffic.name}: expected a vehicle that is there for some time")
+    return row
+
+
+def _stationary(
+    traffic: RecordedTraffic, viewpoint: str, sensors: Mapping[str, SensorSettings]
+) -> tuple[FloatArray, dict[str, SensorSettings]]:
+    """Poses (K, 3) without a vehicle, and the sensors at the height of the viewpoint."""
+    if viewpoint == ABOVE:
+        far = {
+            name: replace(
+                sensor,
+                position=(0.0, 0.0, ABOVE_HEIGHT),
+                max_range=ABOVE_RANGE,
+                reach=10 * ABOVE_RANGE,
+                range_noise=(sensor.range_noise[0], 0.0),
+                bearing_noise=(sensor.bearing_noise[0], 0.0),
+            )
+            for name, sensor in sensors.items()
+        }
+        return np.column_stack([traffic.position.mean(axis=1), np.zeros(len(traffic))]), far
+    x, y, z = (*_middle(traffic), MAST_HEIGHT) if viewpoint == MAST else _place(viewpoint)
+    return np.tile([x, y, 0.0], (len(traffic), 1)), {
+        name: replace(sensor, position=(0.0, 0.0, float(z))) for name, sensor in sensors.items()
+    }
+
+
+def _middle(traffic: RecordedTraffic) -> FloatArray:
+    """(2,) m, of all recorded positions."""
+    return np.asarray(np.median(traffic.position[traffic.present], axis=0))
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+        if not (np.abs([x, y, z]) <= MAX_POSITION).all() or z < 0:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"--viewpoint: expected X,Y,Z of finite numbers, m, Z not below 0, got {text!r:.60}") from None
+    return x, y, z
+
+
+def _with_colours(frames: Sequence[Frame], traffic: RecordedTraffic) -> Sequence[Frame]:
+    """The frames with reports of the lights among the detections of some."""
+    if traffic.road_map is None:
+        return frames
+    lights = {light.name: light.position for light in traffic.road_map.lights}
+    names = [name for name in traffic.colours if name in lights]
+    result: list[Frame] = []
+    last_time, last_shown = -np.inf, [""] * len(names)
+    for frame in frames:
+        moment = min(int(frame.timestamp / PERIOD + 1e-6), len(traffic) - 1)
+        shown = [str(traffic.colours[name][moment]) for name in names]
+        if frame.timestamp - last_time >= REPORT_INTERVAL - 1e-6 or shown != last_shown:
+            last_time, last_shown = frame.timestamp, shown
+            lit = [k for k, colour in enumerate(shown) if colour]
+            labels = [f"traffic_light_{shown[k]}" for k in lit]
+            places = np.array([(*lights[names[k]], HEIGHT) for k in lit]).reshape(-1, 3)
+            reports = Detections(Boxes.of(labels, places), np.ones(len(lit)))
+            frame = replace(frame, detections=Detections.concatenate([frame.detections, reports]))
+        result.append(frame)
+    return result

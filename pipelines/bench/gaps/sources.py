@@ -1,0 +1,69 @@
+"""Recordings for the benchmark of gaps: sets with a detector's results, and data sets that have annotations alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from data_tools.datasets.annotated import detected
+from data_tools.datasets.registry import dataset_source
+from pipelines.bench.recordings import SETS, RecordingSet, recording_set
+from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset, Scene
+
+ANNOTATED = {"argoverse2": "av2", "eth_ucy": "eth_ucy"}
+"""Data sets whose detections are their visible annotations, and their folders in that of --data."""
+
+
+@dataclass(frozen=True)
+class RecordingSource:
+    """A set by name. Picklable.
+
+    data    folder of all recordings; scenes: number of simulated ones
+    labels  whether the visible annotations take the place of the detector's results
+    """
+
+    name: str
+    data: Path | None = None
+    scenes: int = 10
+    labels: bool = False
+
+    @contextmanager
+    def opened(self) -> Iterator[Dataset]:
+        """The recordings, with ground truth. Raises `InputError` for an unknown set or missing recordings."""
+        if self.name not in ANNOTATED:
+            yield _set(self.name, self.data, self.scenes).dataset
+            return
+        if self.data is None:
+            raise InputError(f"set {self.name}: expected --data DIR with {ANNOTATED[self.name]}/")
+        options: dict[str, Any] = {"dataroot": str(self.data / ANNOTATED[self.name])}
+        with dataset_source(self.name)(**options).open(truth=True) as dataset:
+            yield dataset
+
+    @property
+    def family(self) -> str | Path:
+        """The kind of settings that fit."""
+        if self.name in ANNOTATED:
+            return dataset_source(self.name).family
+        return _set(self.name, self.data, self.scenes).family
+
+    def scene(self, recording: str) -> Scene:
+        """Read a recording."""
+        with self.opened() as dataset:
+            scene = dataset.scene(recording)
+        return replace(scene, frames=detected(scene)) if self.labels else scene
+
+
+@lru_cache(maxsize=4)
+def _set(name: str, data: Path | None, scenes: int) -> RecordingSet:
+    """Files of detections are read once."""
+    return recording_set(name, data, scenes)
+
+
+def set_names(data: Path | None) -> tuple[str, ...]:
+    """The sets that can be had by default."""
+    return (*SETS, "simulated") if data is not None else ("simulated",)
