@@ -225,6 +225,7 @@ def traffic_rules() -> tuple[Following, Neighbours]:
         max_gap=60.0,
         gap_scale=18.0,
         lateral_scale=1.2,
+        min_separation=0.8,
         leaders="moving",
         information_gain=hidden,
     )
