@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from benchmarks.fusion import fusion
 from benchmarks.joint import joint
 from benchmarks.metrics import metrics
 from benchmarks.scaling import scaling
@@ -12,7 +13,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (joint, metrics, scaling, smoothing, streaming, synthetic):
+for command in (fusion, joint, metrics, scaling, smoothing, streaming, synthetic):
     app.command()(command)
 
 

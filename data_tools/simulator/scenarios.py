@@ -5,6 +5,7 @@ red-light    a queue before a traffic light; frames have a map, the camera repor
 road-works   cones close the right lane and move its traffic into the adjacent lane; the map does not have the cones
 towing       many trucks, most of them with a trailer
 cycling      cyclists beside slow traffic
+two-sensors  a LiDAR with few points on far and small objects, and with outages; cameras that see far ahead
 """
 
 from __future__ import annotations
@@ -16,15 +17,19 @@ from typing import Literal, get_args
 from data_tools.simulator.settings import (
     CyclistSettings,
     LightSettings,
+    PedestrianSettings,
     RoadSettings,
     RoadworkSettings,
     SimulatorSettings,
+    SurroundingSettings,
     TrafficSettings,
     camera,
+    far_camera,
     lidar,
+    sparse_lidar,
 )
 
-ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "cycling"]
+ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "cycling", "two-sensors"]
 SCENARIOS: tuple[ScenarioName, ...] = get_args(ScenarioName)
 
 
@@ -44,6 +49,15 @@ _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
     ),
     "towing": SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8)),
     "cycling": SimulatorSettings(cyclists=CyclistSettings(count=(5, 9))),
+    "two-sensors": SimulatorSettings(
+        keyframe_rate=2.0,
+        annotation_range=100.0,
+        road=RoadSettings(lanes=(1, 3), oncoming_lanes=(1, 2)),
+        traffic=TrafficSettings(platoon_size=(1, 4), platoon_gap=(20.0, 80.0)),  # light, with views far ahead
+        surroundings=SurroundingSettings(parking_probability=0.15),
+        pedestrians=PedestrianSettings(groups=(6, 12)),
+        sensors={"sparse_lidar": sparse_lidar(), "far_camera": far_camera()},
+    ),
 }
 
 

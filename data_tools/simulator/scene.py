@@ -9,7 +9,7 @@ import numpy as np
 from data_tools.simulator.annotation import annotate
 from data_tools.simulator.lights import detect_lights
 from data_tools.simulator.sensed_world import SensedWorld
-from data_tools.simulator.sensors import detect, sensor_position
+from data_tools.simulator.sensors import detect, outside_outages, range_drifts, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import build_world
 from saga_fg.errors import InputError
@@ -71,10 +71,14 @@ def scene_from_world(
     frames = []
     for sensor_name, sensor in settings.sensors.items():
         rng = np.random.default_rng([seed, zlib.crc32(sensor_name.encode())])  # independent of the other sensors
-        for time in world.start + _times(settings.duration, sensor.rate, sensor.offset):
+        own = np.random.default_rng([seed, zlib.crc32(sensor_name.encode()), 1])  # the detections' noise stays
+        times = world.start + _times(settings.duration, sensor.rate, sensor.offset)
+        times = outside_outages(sensor, times, own)
+        drifts = range_drifts(sensor, times, len(world.objects), own)
+        for time, drift in zip(times.tolist(), drifts, strict=True):
             pose = world.ego_pose(time)
             boxes, near, share = world.visible_from(sensor_position(sensor, pose), time, sensor.max_range)
-            detections = detect(sensor, pose, boxes.select(near), share, rng)
+            detections = detect(sensor, pose, boxes.select(near), share, rng, drift[near])
             lights = detect_lights(sensor, pose, world.signals, time, settings.lights, rng)
             if len(lights):
                 detections = Detections.concatenate([detections, lights])

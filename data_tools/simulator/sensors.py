@@ -1,15 +1,16 @@
 """Sensor and detector model: detections of boxes with noise, misses, false detections and scores.
 
 Noise is Gaussian along the line of sight and across it, with standard deviations base + slope * range, and
-independent from frame to frame. A radar adds the range rate: the velocity over ground along the line of sight; that of
-false detections is around 0, as of a static object. Classes are confused independently from frame to frame. The logit
-of a score is, for a true detection,
+independent from frame to frame. A camera's range may also drift, by a relative error for each object. A radar adds the
+range rate: the velocity over ground along the line of sight; that of false detections is around 0, as of a static
+object. Classes are confused independently from frame to frame. The logit of a score is, for a true detection,
 
     true_logit + 2 (visible share - 1) - range / 40 m + noise,          for a false one    clutter_logit + noise.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -39,25 +40,69 @@ def in_view(sensor: SensorSettings, world_T_ego: FloatArray, points: FloatArray)
     return np.asarray(near & (np.abs(bearing) <= sensor.field_of_view / 2))
 
 
-def detection_probability(sensor: SensorSettings, distance: FloatArray, share: FloatArray) -> FloatArray:
-    """Detection probability (N,) of objects at `distance` (N,), m, of which a `share` (N,) is visible."""
+def detection_probability(sensor: SensorSettings, origin: FloatArray, boxes: Boxes, share: FloatArray) -> FloatArray:
+    """Detection probability (N,) of `boxes` seen from `origin` (3,), of which a `share` (N,) is visible."""
     ramp = np.clip((share - sensor.hidden_share) / (sensor.clear_share - sensor.hidden_share), 0.0, 1.0)
+    if sensor.resolution is not None:
+        n = points_on(sensor.resolution, origin, boxes, share)
+        return np.asarray(sensor.detection_probability * ramp * n**2 / (n**2 + sensor.enough_points**2))
+    distance = np.linalg.norm((boxes.position - origin)[:, :2], axis=1)
     return np.asarray(sensor.detection_probability * ramp / (1 + np.exp((distance - sensor.reach) / sensor.fading)))
 
 
+def points_on(resolution: tuple[float, float], origin: FloatArray, boxes: Boxes, share: FloatArray) -> FloatArray:
+    """Number (N,) of points or pixels on the visible share (N,) of the silhouettes of boxes seen from `origin` (3,)."""
+    offset = (boxes.position - origin)[:, :2]
+    aspect = boxes.yaw - np.arctan2(offset[:, 1], offset[:, 0])
+    width = np.abs(boxes.size[:, 0] * np.sin(aspect)) + np.abs(boxes.size[:, 1] * np.cos(aspect))
+    solid_angle = width * boxes.size[:, 2] / np.maximum((offset**2).sum(axis=1), 1.0)
+    return np.asarray(share * solid_angle / (resolution[0] * resolution[1]))
+
+
+def range_drifts(sensor: SensorSettings, time: FloatArray, objects: int, rng: np.random.Generator) -> FloatArray:
+    """Relative errors (K, N) of the range of N objects at `time` (K,), s: a Gauss-Markov process for each."""
+    drift = sensor.range_drift * rng.standard_normal((len(time), objects))
+    kept = np.exp(-np.diff(time) / sensor.drift_time)
+    for k, share in enumerate(kept, start=1):
+        drift[k] = share * drift[k - 1] + math.sqrt(1 - share**2) * drift[k]
+    return drift
+
+
+def outside_outages(sensor: SensorSettings, time: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """The times of the frames that come, of all at `time` (K,), s."""
+    if sensor.outage_interval == math.inf or len(time) == 0:
+        return time
+    working, end = np.ones(len(time), dtype=np.bool_), time[0]
+    while end <= time[-1]:
+        begin = end + rng.exponential(sensor.outage_interval)
+        end = begin + rng.uniform(*sensor.outage_duration)
+        working &= (time < begin) | (time >= end)
+    return time[working]
+
+
 def detect(
-    sensor: SensorSettings, world_T_ego: FloatArray, boxes: Boxes, share: FloatArray, rng: np.random.Generator
+    sensor: SensorSettings,
+    world_T_ego: FloatArray,
+    boxes: Boxes,
+    share: FloatArray,
+    rng: np.random.Generator,
+    drift: FloatArray | None = None,
 ) -> Detections:
-    """Detections of `boxes`, of which a `share` (N,) is visible, and false detections; in world coordinates."""
+    """Detections of `boxes`, of which a `share` (N,) is visible, and false detections; in world coordinates.
+
+    drift (N,): relative errors of the range, see `range_drifts`; None: no drift
+    """
     origin = sensor_position(sensor, world_T_ego)
     offset = (boxes.position - origin)[:, :2]
     distance = np.linalg.norm(offset, axis=1)
-    chance = detection_probability(sensor, distance, share) * in_view(sensor, world_T_ego, boxes.position)
+    chance = detection_probability(sensor, origin, boxes, share) * in_view(sensor, world_T_ego, boxes.position)
     seen = np.flatnonzero(rng.random(len(boxes)) < chance)
     n = len(seen)
     error, line_of_sight = position_errors(sensor, offset[seen], distance[seen], rng)
     position = boxes.position[seen].copy()
     position[:, :2] += error
+    if drift is not None:
+        position[:, :2] += drift[seen, None] * offset[seen]
     position[:, 2] += sensor.height_noise * rng.standard_normal(n)
     velocity = np.full((n, 2), np.nan)
     if sensor.velocity_noise is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from saga_fg.errors import InputError
@@ -147,7 +147,8 @@ class SensorSettings(Settings):
     """One sensor with its detector. Noise is independent between frames and between the range and bearing axes.
 
     The probability of detection is detection_probability * ramp(visible share) / (1 + exp((range - reach) / fading)),
-    the ramp rising from 0 at `hidden_share` to 1 at `clear_share`.
+    the ramp rising from 0 at `hidden_share` to 1 at `clear_share`. With a `resolution` the last factor is
+    n^2 / (n^2 + enough_points^2), n the points or pixels on the visible part of the object.
     """
 
     rate: Positive = setting(10.0, "frames per second, 1/s")
@@ -184,6 +185,17 @@ class SensorSettings(Settings):
     clear_share: Finite = setting(0.35, "visible share from which occlusion has no effect")
     reach: Positive = setting(60.0, "range at which the probability of detection has halved, m")
     fading: Positive = setting(6.0, "width of the fall of the probability of detection around `reach`, m")
+    resolution: Annotated[tuple[float, float], Range(0, above=True)] | None = setting(
+        None,
+        "horizontal and vertical angle between points or pixels, rad; null: an object's size does not matter",
+    )
+    enough_points: Positive = setting(5.0, "points or pixels on an object that halve the probability of detection")
+    range_drift: NonNegative = setting(
+        0.0, "standard deviation of a relative error of the range that changes slowly, as of a camera; 0: none"
+    )
+    drift_time: Positive = setting(2.0, "correlation time of the range drift, s")
+    outage_interval: PositiveOrInf = setting(math.inf, "mean time from one outage of the sensor to the next, s")
+    outage_duration: PositiveSpan = setting((1.0, 3.0), "duration of an outage, in which no frame comes, s")
     clutter_rate: NonNegative = setting(2.0, "mean number of false detections a frame")
     true_logit: Finite = setting(2.0, "mean logit of the score of a fully visible object at close range")
     clutter_logit: Finite = setting(-1.5, "mean logit of the score of a false detection")
@@ -223,6 +235,30 @@ def camera() -> SensorSettings:
         true_logit=1.2,
         clutter_logit=-1.2,
         logit_noise=1.0,
+    )
+
+
+def sparse_lidar() -> SensorSettings:
+    """A LiDAR of 32 beams: few points on far and on small objects, and outages by spray and lost packets."""
+    return SensorSettings(
+        max_range=70.0,
+        resolution=(0.0058, 0.0232),
+        enough_points=5.0,
+        outage_interval=10.0,
+        outage_duration=(1.0, 3.0),
+    )
+
+
+def far_camera() -> SensorSettings:
+    """Front cameras of 1600 pixels each 70 degrees: far and small objects, at ranges that drift by some per cent."""
+    return replace(
+        camera(),
+        max_range=100.0,
+        resolution=(8e-4, 8e-4),
+        enough_points=250.0,
+        range_noise=(0.2, 0.02),
+        range_drift=0.02,
+        true_logit=1.8,
     )
 
 

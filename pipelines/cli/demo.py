@@ -26,7 +26,7 @@ def demo(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
     scenario: Annotated[
         Scenario,
-        typer.Option("--scenario", help="What the scenes are about; all but traffic by the heterogeneous settings."),
+        typer.Option("--scenario", help="What the scenes are about; those with a map by the heterogeneous settings."),
     ] = "traffic",
     config: Config = None,
     verbose: Verbose = False,
@@ -47,7 +47,8 @@ def demo(
     from pipelines.demo.comparison import comparison_table
 
     with progress_bar() as progress:
-        settings = load_config("simulated" if scenario == "traffic" else "heterogeneous", config)
+        family = "simulated" if scenario in ("traffic", "two-sensors") else "heterogeneous"
+        settings = load_config(family, config)
         result = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
     title = f"{counted(scenes, 'simulated scene')}, seed {seed}"
     show_tables([comparison_table(result.comparison, title)])

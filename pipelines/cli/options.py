@@ -14,7 +14,7 @@ from saga_fg.errors import InputError
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more on stderr.", callback=set_up_logging, show_default=False)
 ]
-Scenario = Literal["traffic", "red-light", "road-works", "towing", "cycling"]
+Scenario = Literal["traffic", "red-light", "road-works", "towing", "cycling", "two-sensors"]
 
 Config = Annotated[
     Path | None, typer.Option("--config", help="YAML file over the defaults; see `saga-fg config`.", metavar="FILE")

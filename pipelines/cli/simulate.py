@@ -11,6 +11,9 @@ from pipelines.cli.console import working
 from pipelines.cli.options import Scenario, Verbose
 from pipelines.cli.summary import counted
 
+MAPLESS: tuple[Scenario, ...] = ("traffic", "two-sensors")
+"""Scenarios without lights and lanes as objects, which the nuScenes layout has no place for."""
+
 
 def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
@@ -18,7 +21,9 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
     scenario: Annotated[
         Scenario,
-        typer.Option("--scenario", help="What the scenes are about; all but traffic are written as tables."),
+        typer.Option(
+            "--scenario", help="What the scenes are about; all but traffic and two-sensors are written as tables."
+        ),
     ] = "traffic",
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE")
@@ -51,11 +56,11 @@ def simulate(
     made = f"{output}: {counted(scenes, 'scene')} of {settings.duration:g} s, seed {seed}"
     traffic = SimulatedTraffic(settings, scenes, seed)
     with working(f"simulating {counted(scenes, 'scene')}"):
-        if scenario == "traffic":
+        if scenario in MAPLESS:
             write_nuscenes(output, traffic)
         else:
             write_simulated_tables(output, traffic)
-    if scenario != "traffic":
+    if scenario not in MAPLESS:
         typer.echo(f"{made}; in each folder detections.csv, truth.csv, settings.yaml")
         return
     detections = ", ".join(str(output / "detections" / f"{name}.json") for name in settings.sensors)

@@ -128,7 +128,7 @@ def count_labels(
         **source_counts(np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])),
         dropped=dropped_boxes(evidence, objects, wanted),
         objects=len(objects.lifespans),
-        dropped_objects=sum(map(len, objects.dropped)),
+        dropped_objects=len(objects.dropped),
         joined=objects.joined,
     )
 
@@ -140,11 +140,8 @@ def source_counts(source: StrArray) -> dict[str, int]:
 
 def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> int:
     """Number of boxes of dropped objects at the times `wanted` (M,), s."""
-    at = np.searchsorted(evidence.times, wanted)
-    return sum(
-        int((np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)).sum())
-        for gone in objects.dropped
-    )
+    at, gone = np.searchsorted(evidence.times, wanted), objects.dropped
+    return int((np.searchsorted(at, gone.last, side="right") - np.searchsorted(at, gone.first)).sum())
 
 
 def _is_stationary(objects: SmoothedObjects) -> BoolArray:

@@ -1,18 +1,21 @@
 """The passes over a recording, online and smoothing; each uses the results of the one before.
 
 0. the tracker, frame by frame: which detections its tracks rest on;
-1. tracklets without edges, reaching beyond both ends; those with next to no evidence are dropped;
+1. tracklets without edges, reaching beyond both ends; weak ones, with little evidence, are put aside;
 2. the others with the edges that follow from pass 1: ends and beginnings that meet become one object;
-3. the stitched objects, with edges: free detections are assigned, objects with too little evidence dropped, and
-   stationary ones recognised;
+3. the stitched objects, with edges: free detections and those of weak tracklets are assigned; what no object takes of a
+   weak tracklet is an object of its own; objects without a trace of evidence are dropped, stationary ones recognised;
 4. the remaining ones, from first to last detection, with edges, robust losses, stationary states held, and factors of
-   users' own: the final states.
+   users' own: the final states. Those that came from far away reach back by `backward_time`.
+
+A weak tracklet never takes a detection from a strong object, but it is not dropped either: in a crowd many true objects
+are weak. Its low score puts it at the end of the ranking.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,7 +48,7 @@ from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 
-TRACKLET_SHARE = 0.5  # share of an object's least score that a tracklet needs to become part of one
+WEAK_SCORE = 0.05  # of a tracklet, below which it is not stitched and takes no detections from others
 MAX_FREE_DISTANCE = 3.0  # between a state and a free detection assigned to it, m
 UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
 
@@ -88,14 +91,14 @@ def track_evidence(
 class SmoothedObjects:
     """Result of the passes.
 
-    lifespans      the objects kept
+    lifespans  of the objects kept, from first to last detection
     object_of  (N,) the object of each detection, -1 for none or one that was dropped
-    track_of   (N,) the online track of each detection, -1 for none or one that did not take part
-    states     of the objects at all moments of their lifespans
+    track_of   (N,) the online track of each detection, -1 for none or a weak one that lost it to another object
+    states     of the objects at all moments of their lifespans, and before them of those that came from far away
     score      (n,) of the lifespans
     stationary the states in which an object is stationary
     joined     number of tracklets stitched to another
-    dropped    the lifespans of the tracklets and objects dropped
+    dropped    the lifespans of the objects dropped
     """
 
     lifespans: Lifespans
@@ -105,7 +108,7 @@ class SmoothedObjects:
     score: FloatArray
     stationary: StationaryStates
     joined: int
-    dropped: tuple[Lifespans, Lifespans]
+    dropped: Lifespans
 
 
 def smooth_objects(
@@ -122,16 +125,15 @@ def smooth_objects(
     label, moment = evidence.boxes.label, evidence.moment
     everything = lifespans_of(track_of, label, moment)
     ahead = max(settings.extension, settings.stitching.max_gap)
-    states = passes.alone(everything, track_of, ahead)
-    score = evidence_scores(evidence, track_of, everything, states.within(everything), settings.prior_opportunity_time)
-    weak = everything.select(score < TRACKLET_SHARE * settings.min_score)
-    tracklets = everything.select(score >= TRACKLET_SHARE * settings.min_score)
-    track_of = np.where(np.isin(track_of, tracklets.id), track_of, -1)
-    states = passes.coupled(tracklets, track_of, ahead, states.select(np.isin(states.id, tracklets.id)))
+    alone = passes.alone(everything, track_of, ahead)
+    score = evidence_scores(evidence, track_of, everything, alone.within(everything), settings.prior_opportunity_time)
+    tracklets = everything.select(score >= WEAK_SCORE)
+    strong = np.isin(track_of, tracklets.id)
+    object_of = np.where(strong, track_of, -1)
+    is_strong = np.isin(alone.id, tracklets.id)
+    states = passes.coupled(tracklets, object_of, ahead, alone.select(is_strong))
     first = stitch_tracklets(tracklets, states, passes.velocity_prior(tracklets), evidence, settings.stitching)
-    object_of = track_of.copy()
-    tracked = np.flatnonzero(track_of >= 0)
-    object_of[tracked] = first[tracklets.rows_of(track_of[tracked])]
+    object_of[strong] = first[tracklets.rows_of(track_of[strong])]
 
     joined = lifespans_of(object_of, label, moment)
     states = passes.alone(joined, object_of, settings.extension)
@@ -139,13 +141,17 @@ def smooth_objects(
     object_of = assign_free_detections(
         evidence, object_of, joined, states, settings.association_gate, MAX_FREE_DISTANCE
     )
+    track_of = np.where(strong | (object_of < 0), track_of, -1)
+    object_of = np.where(object_of < 0, track_of, object_of)
+    states = states.merged(alone.select(~is_strong))
     lifespans = lifespans_of(object_of, label, moment)
     within = states.within(lifespans)
     score = evidence_scores(evidence, object_of, lifespans, within, settings.prior_opportunity_time)
     kept = score >= settings.min_score
     object_of = np.where(np.isin(object_of, lifespans.id[kept]), object_of, -1)
     stationary = stationary_states(within, lifespans, evidence, object_of, settings.stationary, settings.classes)
-    final = passes.final(lifespans.select(kept), object_of, states, stationary)
+    longer = passes.reaching_back(lifespans.select(kept), object_of, score[kept])
+    final = passes.final(longer, object_of, states, stationary)
     return SmoothedObjects(
         lifespans.select(kept),
         object_of,
@@ -154,7 +160,7 @@ def smooth_objects(
         score[kept],
         stationary,
         len(tracklets) - len(joined),
-        (weak, lifespans.select(~kept)),
+        lifespans.select(~kept),
     )
 
 
@@ -196,6 +202,16 @@ class _Passes:
         edges = self._edges(longer, object_of, states)
         prior, classes = self.velocity_prior(longer), self.settings.classes
         return smooth_states(self.evidence, object_of, longer, prior, classes, edges)
+
+    def reaching_back(self, lifespans: Lifespans, object_of: IntArray, score: FloatArray) -> Lifespans:
+        """Extend objects of a score (n,) above low quality to before their first detection, if that is far away."""
+        rows = np.flatnonzero(object_of >= 0)[::-1]
+        distance = np.full(len(lifespans), np.nan)
+        distance[lifespans.rows_of(object_of[rows])] = self.evidence.distance[rows]  # the earliest is written last
+        settings = self.settings
+        far = (distance > settings.backward_distance) & (score >= settings.quality.medium_score)
+        back = lifespans.reaching(self.evidence.times, settings.backward_time, 0.0)
+        return replace(lifespans, first=np.where(far, back.first, lifespans.first))
 
     def final(
         self, lifespans: Lifespans, object_of: IntArray, states: StateTable, stationary: StationaryStates

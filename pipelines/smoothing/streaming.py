@@ -194,7 +194,8 @@ class _Run:
                 seen = evidence.boxes.size[mine]
                 self._summaries.add_detections(names[id_], evidence.probability[mine], seen, weight[mine])
         frames = tuple(frame for frame in evidence.frames if inside[frame.moment])
-        count = opportunities(replace(evidence, frames=frames), objects.lifespans, chunk.labelled.states)
+        states = chunk.labelled.states.within(objects.lifespans)
+        count = opportunities(replace(evidence, frames=frames), objects.lifespans, states)
         for id_, looked in zip(objects.lifespans.id.tolist(), count.tolist(), strict=True):
             if id_ in names:
                 self._summaries.add_opportunities(names[id_], looked)
@@ -221,11 +222,11 @@ class _Run:
                     path, votes = float(headings.path[rows].sum()), float(headings.votes[rows].sum())
                     self._summaries.add_headings(names[id_], signs[id_], float(headings.yaw[rows[-1]]), path, votes)
             self._spool.add(wanted, at, labelled, names, signs)
-        begun = [(at[:1] <= gone.first) & (gone.first <= at[-1:]) for gone in objects.dropped]
+        begun = (at[:1] <= objects.dropped.first) & (objects.dropped.first <= at[-1:])
         new = LabelCounts(
             **source_counts(labelled.columns.source[emitted]),
             dropped=dropped_boxes(evidence, objects, wanted),
-            dropped_objects=sum(int(each.sum()) for each in begun),
+            dropped_objects=int(begun.sum()),
         )
         self._sums.counts = LabelCounts.sum([self._sums.counts, new])
 

@@ -127,6 +127,16 @@ class SmoothingSettings(Settings):
         "time by which the search for detections of an object reaches before its first and after its last "
         "one, s; 0: no search; higher: longer tracks",
     )
+    backward_time: NonNegative = setting(
+        0.0,
+        "time by which boxes reach back before the first detection of an object that came from far away, s; usual 0 "
+        "to 1; higher: more boxes of objects too far to be detected, right and wrong",
+    )
+    backward_distance: NonNegative = setting(
+        50.0,
+        "an object came from far away if its first detection is further from the vehicle than this, m; set it a bit "
+        "below the range of the detector; higher: fewer objects reach back",
+    )
     prior_opportunity_time: NonNegative = setting(
         1.0, "missed opportunities that each object starts with, as a time, s; higher: short tracks score less"
     )

@@ -71,6 +71,11 @@ class StateTable(Columns):
         order = np.lexsort((ids, moment))
         return cls(moment[order], ids[order], mean[order], P[order])
 
+    def merged(self, other: Self) -> Self:
+        """With the states of other objects."""
+        both = self.append(other)
+        return both.select(np.lexsort((both.id, both.moment)))
+
     def within(self, lifespans: Lifespans) -> Self:
         """The states of some objects from their first to their last moment."""
         row = np.minimum(lifespans.rows_of(self.id), max(len(lifespans) - 1, 0))

@@ -42,7 +42,7 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     missed[t] = False
     now, sensor = state.kinematics(), measurements.sensor
     visible = sensor.sees(now.position + state.origin, measurements.world_T_ego)
-    table.last_in_view[visible] = state.time
+    table.last_in_view[table.sensors.look(measurements.name, visible)] = state.time
     p_detect = np.where(visible, sensor.detection_chance(table.label), 0.0)
     if settings.occlusion_weight > 0 and measurements.viewpoint is not None and missed.any():
         boxes = state.boxes(now.position, now.velocity)

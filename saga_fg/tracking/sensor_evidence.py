@@ -36,6 +36,7 @@ class SensorEvidence(Columns):
     time           (n, S) of it, s, -inf if there was none
     hits           (n, S) frames in which the sensor detected the track
     opportunities  (n, S) frames in which the sensor could have detected it
+    in_view        (n, S) whether it was in the field of view in the sensor's latest frame
     sensors        names (S,), of the whole table
     """
 
@@ -44,6 +45,7 @@ class SensorEvidence(Columns):
     time: FloatArray
     hits: IntArray
     opportunities: IntArray
+    in_view: BoolArray
     sensors: tuple[str, ...]
 
     @classmethod
@@ -52,14 +54,15 @@ class SensorEvidence(Columns):
         shape = (tracks, len(sensors))
         counts = np.zeros(shape, dtype=np.int64)
         unseen = np.full(shape, -np.inf)
-        return cls(np.zeros(shape), np.zeros(shape, dtype=bool), unseen, counts, counts.copy(), tuple(sensors))
+        no = np.zeros(shape, dtype=bool)
+        return cls(np.zeros(shape), no, unseen, counts, counts.copy(), no.copy(), tuple(sensors))
 
     def initiated(self, sensor: str, probability: FloatArray, now: float) -> Self:
         """Return the evidence of new tracks, each from a detection by the sensor with this probability (k,)."""
         at = self._column(sensor)
         new = self.empty(len(probability), self.sensors)
         new.logit[:, at], new.time[:, at] = _logit(probability) - PRIOR_LOGIT, now
-        new.detected[:, at], new.hits[:, at], new.opportunities[:, at] = True, 1, 1
+        new.detected[:, at], new.hits[:, at], new.opportunities[:, at], new.in_view[:, at] = True, 1, 1, True
         return new
 
     def update(
@@ -76,6 +79,15 @@ class SensorEvidence(Columns):
         self.detected[missed, at], self.detected[seen, at] = False, True
         self.time[missed, at] = self.time[seen, at] = now
         self.hits[seen, at] += 1
+
+    def look(self, sensor: str, visible: BoolArray) -> BoolArray:
+        """Note which tracks (n,) a frame of the sensor has in view; return those in view of some sensor's latest frame.
+
+        A sensor that falls silent keeps its field of view, so that an outage of one sensor ends no track.
+        """
+        at = self._column(sensor)
+        self.in_view[:, at] = visible
+        return np.asarray(self.in_view.any(axis=1))
 
     def probability(self, now: float, memory: float) -> FloatArray:
         """P (n,) by the evidence of the last `memory` s, NaN for tracks that no sensor has detected since."""
@@ -108,7 +120,7 @@ class SensorEvidence(Columns):
             if len(kept) >= MANY_SENSORS:  # forget those that have detected none of the present tracks
                 kept = np.flatnonzero(self.hits.any(axis=0))
             new = self.empty(len(self.logit), [sensor])
-            for name in ("logit", "detected", "time", "hits", "opportunities"):
+            for name in ("logit", "detected", "time", "hits", "opportunities", "in_view"):
                 setattr(self, name, np.concatenate([getattr(self, name)[:, kept], getattr(new, name)], axis=1))
             self.sensors = (*(self.sensors[k] for k in kept.tolist()), sensor)
         return self.sensors.index(sensor)

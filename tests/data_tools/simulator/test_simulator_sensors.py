@@ -8,8 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_tools.simulator.sensors import detect, detection_probability, in_view
-from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
+from data_tools.simulator.sensors import (
+    detect,
+    detection_probability,
+    in_view,
+    outside_outages,
+    points_on,
+    range_drifts,
+    sensor_position,
+)
+from data_tools.simulator.settings import SensorSettings, camera, far_camera, lidar, radar, sparse_lidar
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
@@ -74,7 +82,8 @@ def test_the_rate_of_misses(share: float, distance: float) -> None:
     count = sum(map(len, detections(sensor, boxes, share)))
     ramp = min(max((share - 0.15) / 0.2, 0.0), 1.0)
     p = 0.97 * ramp / (1 + math.exp((distance - 60.0) / 6.0))
-    assert detection_probability(sensor, np.array([distance]), np.array([share]))[0] == pytest.approx(p)
+    one = boxes.select([0])
+    assert detection_probability(sensor, sensor_position(sensor, POSE), one, np.array([share]))[0] == pytest.approx(p)
     assert within(count / 10_000, p, math.sqrt(p * (1 - p) / 10_000) + 1e-12)
 
 
@@ -141,3 +150,41 @@ def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() ->
     assert all(np.isnan(d.boxes.size).all() and np.isnan(d.boxes.yaw).all() for d in found)
     false = detections(replace(sensor, clutter_rate=5.0), Boxes.empty())
     assert np.abs(np.concatenate([d.range_rate for d in false])).max() < 6 * noise
+
+
+def test_points_on_an_object_fall_with_the_square_of_the_distance() -> None:
+    boxes = Boxes.of(
+        ["car"] * 2, [[20.0, 0.0, 0.8], [40.0, 0.0, 0.8]], np.tile([4.5, 1.8, 1.6], (2, 1)), [0.0, np.pi / 2]
+    )
+    n = points_on((0.01, 0.02), np.zeros(3), boxes, np.array([1.0, 0.5]))
+    assert n == pytest.approx([1.8 * 1.6 / 20**2 / 2e-4, 0.5 * 4.5 * 1.6 / 40**2 / 2e-4])  # from behind, from the side
+
+
+def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points() -> None:
+    boxes = Boxes.of(
+        ["pedestrian", "truck"], [[55.0, 0.0, 0.9], [55.0, 0.0, 1.8]], [[0.65, 0.65, 1.72], [8.0, 2.5, 3.4]], [0.0, 0.0]
+    )
+    person, truck = detection_probability(sparse_lidar(), np.zeros(3), boxes, np.ones(2))
+    assert person < 0.25 < 0.9 < truck
+    assert detection_probability(far_camera(), np.zeros(3), boxes, np.ones(2))[0] > 0.7
+
+
+def test_range_drifts_are_of_their_deviation_and_last_for_their_time() -> None:
+    time = np.arange(0, 40, 0.1)
+    drift = range_drifts(replace(camera(), range_drift=0.03, drift_time=2.0), time, 2000, np.random.default_rng(0))
+    assert drift.std(axis=1) == pytest.approx(np.full(len(time), 0.03), rel=0.1)
+    later = [np.corrcoef(drift[0], drift[k])[0, 1] for k in (20, 300)]
+    assert later == pytest.approx([math.exp(-1), 0.0], abs=0.09)
+    assert not range_drifts(camera(), time, 3, np.random.default_rng(0)).any()
+
+
+def test_no_frame_comes_in_an_outage() -> None:
+    time = np.arange(0, 5000, 0.1)
+    left = outside_outages(
+        replace(lidar(), outage_interval=10.0, outage_duration=(1.0, 3.0)), time, np.random.default_rng(0)
+    )
+    assert np.isin(left, time).all()
+    assert len(left) / len(time) == pytest.approx(10 / 12, abs=0.03)
+    gaps = np.diff(left)
+    assert ((gaps < 0.11) | ((gaps > 0.95) & (gaps < 3.2))).mean() > 0.998  # two outages may follow at once
+    assert outside_outages(lidar(), time, np.random.default_rng(0)) is time

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from saga_fg import Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import FieldOfView
+from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.sensor_evidence import PRIOR_LOGIT, SensorEvidence
+from tests.saga_fg.traffic_frames import frame, run
 
 NONE = np.empty(0, dtype=np.int64)
 
@@ -101,3 +105,24 @@ def test_what_others_have_just_seen():
     updated(evidence, "camera", 1.0, [1], [0.6], n=2)
     assert evidence.detected_by_others("lidar", 1.0, 0.2).tolist() == [False, True]
     assert evidence.detected_by_others("camera", 1.0, 0.2).tolist() == [False, False]
+
+
+def test_a_sensor_that_falls_silent_keeps_its_field_of_view():
+    evidence = initiated([0.6, 0.6])
+    assert evidence.look("camera", np.array([True, False])).tolist() == [True, True]
+    assert evidence.look("camera", np.array([False, False])).tolist() == [
+        True,
+        True,
+    ]  # of the LiDAR
+    assert evidence.look("lidar", np.array([True, False])).tolist() == [True, False]
+
+
+def test_a_car_behind_outlives_an_outage_of_the_lidar_while_the_camera_looks_ahead():
+    ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
+    classes = {"default": ClassSettings(max_coasting=3.0)}
+    tracker = Tracker(TrackerSettings(classes, report_coasting=3.0, max_out_of_view=0.5), {"camera": ahead})
+    pose = {"world_T_ego": np.eye(4)}
+    for k in range(5):
+        tracker.step(frame(k / 10, [(-20.0, 0.0)], **pose))
+    outage = run(tracker, [frame(0.5 + k / 10, [], "camera", **pose) for k in range(20)])
+    assert [len(tracks) for tracks in outage] == [1] * 20
