@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pipelines.bench.gaps.gap import LONGEST
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
-from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.tracking import ClassSettings
 
@@ -27,6 +27,8 @@ KEPT_ALIVE: Mapping[str, Any] = {
 }
 TURNING = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle", "cyclist", "default")
 """Classes of vehicles."""
+CLASSICAL_NOISE = 1.5
+"""Spectral density of the acceleration, m^2/s^3, of classes configured with a fading acceleration instead."""
 
 
 def _moving(turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, ClassSettings]]:
@@ -35,11 +37,12 @@ def _moving(turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, 
     def change(classes: Mapping[str, ClassSettings]) -> Mapping[str, ClassSettings]:
         found = dict(classes)
         for label, own in classes.items():
-            noise = getattr(own.motion, "acceleration_noise", None)
+            fading = isinstance(own.motion, ConstantAcceleration)
+            noise = getattr(own.motion, "acceleration_noise", CLASSICAL_NOISE if fading else None)
             if noise is not None:
                 turns = turn and label in TURNING
                 motion = CoordinatedTurn(noise) if turns else ConstantVelocity(noise)
-                found[label] = replace(own, motion=motion)
+                found[label] = replace(own, motion=motion, turn_time=0.0)
         return found
 
     return change
