@@ -102,6 +102,41 @@ def test_of_two_certain_nodes_neither_learns():
     assert Neighbours(information_gain=EdgeInformation(0.0)).pairs(nodes).rate.tolist() == [0.0, 0.0]
 
 
+# who exists
+
+
+def test_clutter_pulls_at_nobody():
+    nodes = table([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]], 0.0)
+    unsure = replace(nodes, existence=np.array([1.0, 0.25, 0.0]))
+    full, weighted = (build_graph(each, [Neighbours()]).edges[0] for each in (nodes, unsure))
+    of = {(i, j): rate for i, j, rate in zip(full.target, full.source, full.rate, strict=True)}
+    assert 2 not in weighted.source
+    for i, j, rate in zip(weighted.target, weighted.source, weighted.rate, strict=True):
+        assert rate == pytest.approx(of[i, j] * unsure.existence[j])
+
+
+def test_the_nearest_leader_that_exists_leads():
+    nodes = table(*straight(4, gap=8.0))  # 3 behind 2 behind 1 behind 0
+    rule = Following(gap_scale=np.inf)
+    r = np.array([0.9, 0.6, 0.2, 1.0])
+    graph = build_graph(replace(nodes, existence=r), [rule])
+    rates = edges(Pairs(graph.edges[0].target, graph.edges[0].source, graph.edges[0].rate))
+    assert rates[3] == pytest.approx({2: rule.rate * 0.2, 1: rule.rate * 0.8 * 0.6, 0: rule.rate * 0.8 * 0.4 * 0.9})
+    assert rates[1] == pytest.approx({0: rule.rate * 0.9})
+    assert sum(rates[3].values()) == pytest.approx(rule.rate * (1 - 0.1 * 0.4 * 0.8))
+
+
+@given(seeds)
+def test_certain_nodes_have_the_edges_of_nodes_of_which_no_existence_is_known(seed):
+    nodes = random_traffic(np.random.default_rng(seed))
+    rules = [Following(), Neighbours()]
+    plain, certain = build_graph(nodes, rules), build_graph(replace(nodes, existence=np.ones(len(nodes))), rules)
+    for one, other in zip(plain.edges, certain.edges, strict=True):
+        assert np.array_equal(one.target, other.target)
+        assert np.array_equal(one.source, other.source)
+        assert one.rate == pytest.approx(other.rate)
+
+
 # following
 
 
