@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph, traffic_rules
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
@@ -135,6 +135,24 @@ def test_certain_nodes_have_the_edges_of_nodes_of_which_no_existence_is_known(se
         assert np.array_equal(one.target, other.target)
         assert np.array_equal(one.source, other.source)
         assert one.rate == pytest.approx(other.rate)
+
+
+def test_a_target_that_perhaps_moves_follows_at_the_expected_rate():
+    nodes = table(*straight(2))
+    full = Following(leaders="moving").pairs(nodes).rate[0]
+    for target, source in ((0.4, 1.0), (1.0, 0.3), (0.5, 0.5)):
+        known = replace(nodes, has_moved=np.array([source, target]))
+        assert Following(leaders="moving").pairs(known).rate[0] == pytest.approx(full * target * source)
+        assert Following(parked=True).pairs(known).rate[0] == pytest.approx(full)
+
+
+def test_by_default_a_hidden_vehicle_follows_and_a_duplicate_leads_nobody():
+    rule, _ = traffic_rules()
+    apart, on_top = table(*straight(2)), table(*straight(2, gap=2.5))
+    assert leaders(rule.pairs(apart)) == {1: 0}
+    assert len(rule.pairs(on_top).target) == 0
+    seen, hidden = (rule.pairs(replace(apart, unseen=np.array([0.0, t]))).rate[0] for t in (0.0, 1.0))
+    assert hidden > 1.5 * seen
 
 
 # following
