@@ -52,6 +52,21 @@ def test_nuscenes_results_list_every_sample_of_the_split(simulated: Path, tmp_pa
     assert not results.meta.use_camera
 
 
+def test_edges_that_act_on_no_class_of_the_data_are_told_once(
+    simulated: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = tmp_path / "robots.yaml"
+    config.write_text("tracker: {edges: [{kind: following, classes: [robot]}]}\n")
+    for method, warnings in (("saga", 1), ("kf", 0)):
+        caplog.clear()
+        result = saga_fg(
+            *arguments(simulated, tmp_path / "t.json"), "--split", "all", "--config", config, "--method", method
+        )
+        assert result.exit_code == 0, result.output
+        told = [record.getMessage() for record in caplog.records if "tracker.edges act on robot" in record.getMessage()]
+        assert len(told) == warnings
+
+
 def test_two_sensors_and_chosen_scenes(simulated: Path, tmp_path: Path) -> None:
     output = tmp_path / "tracks.json"
     camera = f"camera={simulated / 'detections' / 'camera.json'}"
@@ -124,10 +139,12 @@ def test_tables_of_ones_own(tmp_path: Path, method: str) -> None:
     output = tmp_path / "tracks.csv"
     result = saga_fg("track", "file", table, "--output", output, "--method", method)
     assert result.exit_code == 0, result.output
-    assert result.stdout.startswith(f"{output}: 1 scene, 10 frames, 1 track (1 with a score above 0.5), 10 boxes, ")
+    late = int(method != "centerpoint")  # the others report from the second detection on
+    text = f"{output}: 1 scene, 10 frames, 1 track (1 with a score above 0.5), {10 - late} boxes, "
+    assert result.stdout.startswith(text)
     with output.open() as file:
         read = list(csv.DictReader(file))
-    assert [float(row["timestamp"]) for row in read] == [k / 10 for k in range(10)]
+    assert [float(row["timestamp"]) for row in read] == [k / 10 for k in range(late, 10)]
     assert {row["id"] for row in read} == {"1"}
 
 
