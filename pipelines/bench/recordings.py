@@ -139,7 +139,7 @@ class KittiSet:
 
         def of_cars() -> Sequence[HotaRow]:
             f = kitti_tracking_metrics(pairs, "car", 0.25)
-            return kitti_hota(pairs, {"car": f.threshold}) if f is not None else ()
+            return kitti_hota(pairs, {"car": f.threshold_safe}) if f is not None else ()
 
         return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()), of_cars)
 

@@ -13,9 +13,9 @@ from pipelines.cli.summary import counted
 from pipelines.cli.tables import show_tables
 
 READING = """\
-Compare the RMSE columns and the ID switches. MOTA counts every box farther than 2 m from all objects as a false
-positive, but a hidden object without a box is no miss. kf and saga go on reporting hidden objects, centerpoint does
-not: they have fewer misses but more false positives, so their MOTA is lower."""
+MOTA counts missed objects, false boxes and identity switches. kf and saga go on reporting hidden objects, centerpoint
+does not. A hidden object without a box is no miss, but a box farther than 2 m from all objects is false, so a method
+that predicts hidden objects badly loses MOTA."""
 
 
 def demo(

@@ -62,7 +62,7 @@ def evaluate_kitti(
         by_iou = {iou: figures for iou, figures in found if figures is not None}
         if by_iou:
             tracking[label] = by_iou
-    best = {label: next(iter(by_iou.values())).threshold for label, by_iou in tracking.items()}
+    best = {label: next(iter(by_iou.values())).threshold_safe for label, by_iou in tracking.items()}
     return Evaluation(
         kitti_table("KITTI 3D tracking metrics, in %", tracking),
         {"sequences": tuple(scored), "per_class": tracking},

@@ -15,7 +15,8 @@ any of these runs is never exempt (`class_boxes`) in a later one.
 
 The authors' evaluation averages a track's score anew before each run, so that rounding drops some tracks from the very
 run whose threshold is their score (`track_scores`). One long track can change sAMOTA by many points this way.
-`samota_safe` is sAMOTA with the mean scores computed once: a track whose score equals the threshold is always present.
+With mean scores computed once, a track whose score equals the threshold is always present: `samota_safe`, `mota_safe`
+and `threshold_safe` are sAMOTA, the highest MOTA and its threshold of such runs.
 
 Source: Weng et al., 3D Multi-Object Tracking: A Baseline and New Evaluation Metrics, IROS 2020, section IV.
 """
@@ -48,9 +49,9 @@ class KittiTrackingMetrics:
     """Metrics of one class at one IoU: shares in [0, 1] (MOTA and AMOTA may be negative) and counts.
 
     gt: true boxes that count; mt, ml: shares of trajectories mostly tracked, mostly lost; tp, recall and precision
-    include pairs with true boxes that don't count. samota_safe: sAMOTA without the rounding of the reference evaluation
-    (see the module), the one to compare results by. All but samota, samota_safe, amota, amotp are at the `threshold` on
-    a track's mean score that gives the best MOTA (-inf: all tracks).
+    include pairs with true boxes that don't count. samota, amota, amotp are averages, all others are at the `threshold`
+    on a track's mean score that gives the best MOTA (-inf: all tracks). samota_safe, mota_safe, threshold_safe: without
+    the rounding of the reference evaluation (see the module), those to compare results by.
     """
 
     samota: float
@@ -70,6 +71,8 @@ class KittiTrackingMetrics:
     ids: int
     frag: int
     threshold: float
+    mota_safe: float
+    threshold_safe: float
 
 
 def kitti_tracking_metrics(
@@ -96,7 +99,7 @@ def kitti_tracking_metrics(
     present, safely = scores[:, :-1] >= cuts, mean[:, None] >= cuts
     runs = _runs(true, found, candidates, present, unmatched)
     safe = runs if np.array_equal(present, safely) else _runs(true, found, candidates, safely, unmatched)
-    best = int(np.argmax([0.0, *runs.mota[1:]]))  # the run with all tracks, if no threshold makes MOTA positive
+    best, best_safe = runs.best, safe.best
     final = _runs(true, found, candidates, scores[:, -1:] >= cuts[best], runs.matched)
 
     tp, fn, fp = int(final.tp[0]), int(final.fn[0]), int(final.fp[0])
@@ -118,6 +121,8 @@ def kitti_tracking_metrics(
         ids=int(final.trajectories.switches[0]),
         frag=int(final.trajectories.fragments[0]),
         threshold=float(cuts[best]),
+        mota_safe=float(safe.mota[best_safe]),
+        threshold_safe=float(cuts[best_safe]),
     )
 
 
@@ -144,6 +149,11 @@ class _Runs:
     @property
     def mota(self) -> FloatArray:
         return np.asarray(1.0 - self.errors / self.gt)
+
+    @property
+    def best(self) -> int:
+        """The run with the highest MOTA; the first, with all tracks, if no threshold makes MOTA positive."""
+        return int(np.argmax([0.0, *self.mota[1:]]))
 
     @property
     def motp(self) -> FloatArray:

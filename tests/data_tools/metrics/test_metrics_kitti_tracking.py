@@ -158,7 +158,8 @@ def test_rounding_costs_points_only_in_the_official_value(score, official):
     f = figures(CARS, [(*row, {"score": score}) for row in CARS])
     assert f.samota == pytest.approx(official)
     assert f.samota_safe == pytest.approx(1.0)
-    assert f.mota == f.recall == 1.0
+    assert f.mota == f.mota_safe == f.recall == 1.0
+    assert f.threshold_safe == pytest.approx(score)
 
 
 def test_nothing_found():

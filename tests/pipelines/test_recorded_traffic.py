@@ -1,0 +1,58 @@
+"""Recorded traffic through the command and the benchmarks, on a crossing written by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.datasets.parts import scene_digests
+from data_tools.simulator.recorded_source import NgsimSource
+from pipelines.bench.recordings import recording_set
+from pipelines.cli import app
+from pipelines.config import load_config
+from pipelines.learning import trajectories
+from pipelines.tracking import track_scene
+from tests.data_tools.ngsim_example import crossing, rows, write_ngsim
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    (tmp_path / "ngsim").mkdir()
+    write_ngsim(tmp_path / "ngsim", rows(steps=20), {"A": crossing()})
+    return tmp_path
+
+
+def test_track_and_evaluate(data: Path) -> None:
+    root, tracks = str(data / "ngsim"), str(data / "tracks.csv")
+    run = CliRunner().invoke(app, ["track", "ngsim", "--dataroot", root, "--output", tracks])
+    assert run.exit_code == 0, run.output
+    assert "1 scene, 20 frames" in run.output
+    run = CliRunner().invoke(app, ["evaluate", "ngsim", tracks, "--dataroot", root])
+    assert run.exit_code == 0, run.output
+    assert "MOTA" in run.output
+
+
+def test_trajectories_to_learn_from_have_the_carrier_as_well(data: Path) -> None:
+    found = trajectories(NgsimSource(dataroot=str(data / "ngsim"), viewpoint="1"), with_truth=True)["A"]
+    assert found.id.tolist() == ["1", "2", "3"]
+    assert np.isfinite(found.position[..., 0]).sum(axis=0).tolist() == [20, 20, 15]
+
+
+def test_a_set_of_the_benchmarks_is_scored_at_every_moment(data: Path) -> None:
+    recordings = recording_set("ngsim", data, 1)
+    config = load_config(recordings.family)
+    runs = {name: track_scene(recordings.dataset.scene(name), config.new_tracker("kf")) for name in ("A",)}
+    assert recordings.score(runs).figures["IDS"] == 0
+
+
+def test_what_is_given_of_the_road_is_part_of_the_digest(data: Path) -> None:
+    digests = []
+    for road in ("signals", "map", "none"):
+        source = NgsimSource(dataroot=str(data / "ngsim"), road=road)  # type: ignore[arg-type]
+        with source.open() as dataset:
+            digests.append(scene_digests(dataset.scene("A")))
+    assert len({each["moments"] for each in digests}) == 2
+    assert len({each["lidar"] for each in digests}) == 2
