@@ -12,6 +12,7 @@ from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.stationarity import Stationarity, after_evidence, log_density
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.tracking.turn_rate import TurnRate
 from saga_fg.tracking.update import update_range_rates
 from saga_fg.types.boxes import Boxes
 
@@ -51,6 +52,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         class_belief=state.class_groups.updated(0 * likelihood, likelihood),
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
         stationarity=Stationarity.initiated(kinematics, stationary),
+        turn=TurnRate.initiated(boxes.yaw, yaw_noise),
         sensors=state.table.sensors.initiated(measurements.name, p, time),
     )
     state.table = state.table.append(new)

@@ -121,7 +121,7 @@ class JointTrackState:
         estimator = self._estimator_to_change()
         if self._modes:
             self._anchor_modes()
-            graph = replace(graph, modes=tuple(self._modes.values()))
+            graph = replace(graph, modes=graph.modes + tuple(self._modes.values()))
         estimator.predict(discretise(graph, dt))
         if self._modes:
             scale = [graph.diffusion_scale[graph.rows(table.ids)] for table in self._modes.values()]

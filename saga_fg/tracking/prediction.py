@@ -7,17 +7,21 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from saga_fg.model.edge_rules import build_graph
 from saga_fg.model.interactions import NodeTable
+from saga_fg.model.known_turn import KnownTurns, turns_as_known
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.deletion import untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
 
+LEAST_TURN = 0.01  # rad/s; less is straight on
 MOST_STEPS = 100  # that an interval is predicted in
 
 
@@ -37,13 +41,16 @@ def predict(state: TrackerState, time: float) -> None:
 
 def _predict_step(state: TrackerState, dt: float) -> None:
     """Predict by `dt` s with the edges of the present estimates."""
-    coasting = state.table.last_detected < state.time
+    table = state.table
+    coasting = table.last_detected < state.time
     noise = _predict_stationarity(state, dt)
     explained = state.settings.explained_noise
     state.graph = build_graph(node_table(state), state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
+    state.graph = replace(state.graph, modes=_known_turns(state))
     state.joint.predict(state.graph, dt)
-    state.table.box.turn_with(before, state.kinematics().velocity, coasting)
+    table.turn.predict(dt, state.class_values(table.label, "turn_time")[0])
+    table.box.turn_with(before, state.kinematics().velocity, coasting)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
 
@@ -55,6 +62,21 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
         return None
     stationarity.predict(dt, state.kinematics(), settings)
     return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
+
+
+def _known_turns(state: TrackerState) -> tuple[KnownTurns, ...]:
+    """The turns of moving tracks whose classes turn, by motion and time constant."""
+    table = state.table
+    fading_time, rate = state.class_values(table.label, "turn_time")[0], table.turn.known()
+    turning = (fading_time > 0) & (np.abs(rate) > LEAST_TURN) & (np.hypot(*state.kinematics().velocity.T) > MOVING)
+    found = []
+    for node_type, rows in state.joint.rows_by_type(table.label[turning], moving=True) if turning.any() else []:
+        rows = np.flatnonzero(turning)[rows]
+        if turns_as_known(node_type):
+            for time in np.unique(fading_time[rows]).tolist():
+                same = rows[fading_time[rows] == time]
+                found.append(KnownTurns(node_type, table.id[same], rate[same], time))
+    return tuple(found)
 
 
 def node_table(state: TrackerState) -> NodeTable:

@@ -86,6 +86,10 @@ class ClassSettings(Settings):
     max_coasting: PositiveOrInf = setting(
         1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
     )
+    turn_time: NonNegative = setting(
+        0.0,
+        "time constant with which a turn seen in the headings fades, s; usual 1 to 3, 0: none; higher: longer curves",
+    )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
     )

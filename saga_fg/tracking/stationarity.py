@@ -15,6 +15,8 @@ under it, (1 - s + s * noise) Qc, frozen with the interval as the edges are. The
 
     v_reported = (1 - s) v     P_reported = (1 - s) P_v + s (1 - s) v v^T
 
+and so is the reported position of a track that is not detected: stationary objects stay where they were seen.
+
 Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6: the
 interacting multiple model, here without mixing the stationary state into the moving one, so that the joint filter stays
 a Kalman filter.
@@ -125,11 +127,15 @@ class Stationarity(Columns):
         """(n,) factor on the process noise, expected over both states."""
         return np.asarray(1 - self.probability * (1 - settings.noise_scale))
 
-    def reported(self, moving: Kinematics) -> Kinematics:
-        """The joint filter's state with the velocity that is reported."""
-        s, v = self.probability[:, None], moving.velocity
-        P = (1 - s)[..., None] * moving.P_velocity + (s * (1 - s))[..., None] * v[:, :, None] * v[:, None]
-        return moving._replace(velocity=(1 - s) * v, P_velocity=P)
+    def reported(self, moving: Kinematics, coasting: BoolArray) -> Kinematics:
+        """Mean and covariance over both cases; positions where `coasting` (n,).
+
+        moving: the joint filter's state, which has the detected positions
+        """
+        velocity, P_velocity = _mixed(self.probability, moving.velocity, moving.P_velocity, 0.0, 0.0)
+        unseen = np.where(coasting, self.probability, 0.0)
+        position, P = _mixed(unseen, moving.position, moving.P, self.position, self.P)
+        return Kinematics(position, velocity, P, P_velocity)
 
 
 def _share_of_slow(moving: Kinematics) -> FloatArray:
@@ -137,6 +143,15 @@ def _share_of_slow(moving: Kinematics) -> FloatArray:
     h2 = HALTING_SPEED**2
     distance, log_det = mahalanobis_of_pairs(moving.velocity, moving.P_velocity + h2 * np.eye(2))
     return np.asarray(h2 * np.exp(-0.5 * (distance + log_det)))
+
+
+def _mixed(
+    s: FloatArray, mean: FloatArray, P: FloatArray, other: FloatArray | float, other_P: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Moments of mixtures of N(mean, P) and, with probability s (n,), N(other, other_P)."""
+    s, apart = s[:, None], other - mean
+    spread = (s * (1 - s))[..., None] * apart[:, :, None] * apart[:, None]
+    return mean + s * apart, (1 - s)[..., None] * P + s[..., None] * other_P + spread
 
 
 def after_evidence(probability: FloatArray, evidence: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.stationarity import Stationarity
+from saga_fg.tracking.turn_rate import TurnRate
 from saga_fg.types.boxes import Boxes
 
 
@@ -39,6 +40,7 @@ class TrackTable(Columns):
     class_belief      (n, C) probabilities of the classes that detectors mistake for each other
     box               size, height and heading
     stationarity      probability and place of standing still
+    turn              turn rate
     sensors           latest evidence of each sensor
     """
 
@@ -59,6 +61,7 @@ class TrackTable(Columns):
     class_belief: FloatArray
     box: BoxFilter
     stationarity: Stationarity
+    turn: TurnRate
     sensors: SensorEvidence
 
     @classmethod
@@ -75,6 +78,7 @@ class TrackTable(Columns):
             np.empty((0, classes)),
             BoxFilter.empty(),
             Stationarity.empty(),
+            TurnRate.empty(),
             SensorEvidence.empty(),
         )
 

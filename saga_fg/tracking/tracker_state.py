@@ -122,9 +122,11 @@ class TrackerState:
         return self.joint.kinematics(self.table.id, self.table.label)
 
     def reported_kinematics(self) -> Kinematics:
-        """The estimates of all tracks, with velocities that allow for standing still."""
-        now = self.kinematics()
-        return self.table.stationarity.reported(now) if self.settings.stationarity.prior > 0 else now
+        """The estimates of all tracks, allowing for those that are stationary."""
+        now, table = self.kinematics(), self.table
+        if self.settings.stationarity.prior == 0:
+            return now
+        return table.stationarity.reported(now, table.coasting(self.time) > 0)
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

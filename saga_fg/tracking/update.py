@@ -38,6 +38,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     update_range_rates(state, measurements, d, table.id[t], table.label[t])
     p, z_noise, yaw_noise = measurements.probability[d], measurements.z_noise[d], measurements.yaw_noise[d]
     table.box.update(t, boxes.size[d], p, boxes.position[d, 2], z_noise, boxes.yaw[d], yaw_noise)
+    table.turn.update(t, boxes.yaw[d], yaw_noise)
     if len(table):
         now = state.reported_kinematics()
         speed = np.hypot(*now.velocity.T)

@@ -7,6 +7,7 @@ import scipy.linalg
 
 from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
 from saga_fg.model.discretisation import discretise
+from saga_fg.model.transition import Transition
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 
@@ -20,7 +21,7 @@ class Add(NamedTuple):
 
 
 class Predict(NamedTuple):
-    transition: object
+    transition: Transition
 
     def run(self, estimator):
         estimator.predict(self.transition)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pipelines.bench.gaps.gap import LONGEST
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
-from saga_fg.model.motion import ConstantVelocity, RandomWalk
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.tracking import ClassSettings
 
@@ -27,19 +27,22 @@ KEPT_ALIVE: Mapping[str, Any] = {
 }
 TURNING = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle", "cyclist", "default")
 """Classes of vehicles."""
-USUAL_NOISE = 2.0  # m^2/s^3: acceleration noise of classes whose motion has none
+CLASSICAL_NOISE = 1.5
+"""Spectral density of the acceleration, m^2/s^3, of classes configured with a fading acceleration instead."""
 
 
 def _moving(turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, ClassSettings]]:
-    """Constant velocity, or a constant turn rate of vehicles; classes keep their noise of the acceleration."""
+    """All classes at constant velocity, or vehicles at a constant turn rate; their acceleration noise stays."""
 
     def change(classes: Mapping[str, ClassSettings]) -> Mapping[str, ClassSettings]:
         found = dict(classes)
         for label, own in classes.items():
-            if not isinstance(own.motion, RandomWalk):
-                noise = getattr(own.motion, "acceleration_noise", USUAL_NOISE)
-                motion = CoordinatedTurn(noise) if turn and label in TURNING else ConstantVelocity(noise)
-                found[label] = replace(own, motion=motion)
+            fading = isinstance(own.motion, ConstantAcceleration)
+            noise = getattr(own.motion, "acceleration_noise", CLASSICAL_NOISE if fading else None)
+            if noise is not None:
+                turns = turn and label in TURNING
+                motion = CoordinatedTurn(noise) if turns else ConstantVelocity(noise)
+                found[label] = replace(own, motion=motion, turn_time=0.0)
         return found
 
     return change

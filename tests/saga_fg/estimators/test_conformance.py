@@ -20,6 +20,7 @@ from saga_fg.estimators import BatchSolver, GraphFilter, IncrementalFilter, Join
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.keys import node_key
 from saga_fg.model.discretisation import discretise
+from saga_fg.model.known_turn import KnownTurns
 from saga_fg.model.transition import Blocks
 from tests.saga_fg.estimator_programs import (
     Add,
@@ -119,6 +120,25 @@ def test_random_programs_agree_with_the_textbook(make, seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_long_program_does_not_drift_away(make, seed):
     in_step(random_program(np.random.default_rng(100 + seed), moments=40, kinds=(CAR, TRAM), density=0.15), make())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_nodes_that_turn_agree_with_the_textbook(make, seed):
+    """Turns of known rates, recorded with every interval, of constant velocity and of fading acceleration."""
+    rng = np.random.default_rng(seed)
+    program = random_program(rng, moments=7, kinds=(CAR, TRAM, CONE))
+    in_step([with_turns(rng, operation) for operation in program], make())
+
+
+def with_turns(rng, operation):
+    """A prediction in which some of the moving nodes turn."""
+    if not isinstance(operation, Predict):
+        return operation
+    graph, turns = operation.transition.graph, []
+    for kind in (CAR, TRAM):
+        rows = [k for k, t in enumerate(graph.types) if t is kind and rng.random() < 0.7]
+        turns.append(KnownTurns(kind, graph.nodes[rows], rng.normal(0, 0.4, len(rows)), 1.5))
+    return Predict(discretise(dataclasses.replace(graph, modes=tuple(turns)), operation.transition.dt))
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-6, 1e-3])

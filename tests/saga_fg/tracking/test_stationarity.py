@@ -111,7 +111,13 @@ def test_velocities_of_parked_cars_are_better_and_those_of_moving_ones_as_good()
 
 def test_what_is_reported_is_the_mean_and_the_covariance_of_the_mixture():
     stationarity = Stationarity(np.zeros((1, 2)), np.eye(2)[None], np.array([0.25]))
-    reported = stationarity.reported(kinematics(velocity=(4.0, 0.0), P_velocity=1.0))
+    moving = kinematics(position=(8.0, 0.0), velocity=(4.0, 0.0), P=2.0, P_velocity=1.0)
+    detected, unseen = (stationarity.reported(moving, np.array([coasting])) for coasting in (False, True))
+    assert detected.position[0] == pytest.approx([8.0, 0.0])
+    assert detected.P[0] == pytest.approx(2.0 * np.eye(2))
+    assert unseen.position[0] == pytest.approx([6.0, 0.0])
+    assert unseen.P[0] == pytest.approx(np.diag([0.75 * 2 + 0.25 + 0.25 * 0.75 * 64, 0.75 * 2 + 0.25]))
+    reported = detected
     assert reported.velocity[0] == pytest.approx([3.0, 0.0])
     assert reported.P_velocity[0] == pytest.approx(np.diag([0.75 + 0.25 * 0.75 * 16, 0.75]))
 

@@ -1,5 +1,7 @@
 """The tracker on each estimator: the same tracks; and on the fixed-lag smoother, late frames where they belong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,3 +105,21 @@ def test_late_frames_of_objects_born_since(estimator):
 def test_an_estimator_that_is_none_is_refused():
     with pytest.raises(InputError, match="estimator: expected one of kalman, isam2, fixed-lag, got 'kallman'"):
         TrackerSettings(estimator="kallman")
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS[1:])
+@pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
+def test_every_estimator_takes_the_same_turns(estimator, edges):
+    """Two that turn, one behind the other, of which one is not detected at last; velocity and fading acceleration."""
+    rng, rate, speed = np.random.default_rng(5), 0.3, 8.0
+    classes = {label: replace(of_class, turn_time=1.5) for label, of_class in CLASSES.items()}
+    settings = TrackerSettings(classes, edges=edges)
+    reference, other = (Tracker(replace(settings, estimator=name), SENSORS) for name in ("kalman", estimator))
+    for t in np.arange(0, 4, 0.1):
+        angle = rate * t - np.array([0.0, 0.4])
+        place = speed / rate * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+        z, there = place + 0.1 * rng.normal(size=(2, 2)), slice(2 if t < 3 else 1)
+        seen_now = frame(t, z[there], label=LABEL[there], yaw=angle[there])
+        agree(reference.step(seen_now), other.step(seen_now), 1e-8)
+    assert any(reference.graph.modes), "turns were recorded"
+    assert np.isclose(np.hypot(*reference.tracks(4.5).boxes.velocity[0]), speed, atol=1.0)

@@ -1,0 +1,101 @@
+"""Turn rates from headings, and what they do to tracks that nobody detects."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from saga_fg import ConstantVelocity, Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import NoiseModel
+from saga_fg.tracking import ClassSettings
+from saga_fg.tracking.turn_rate import DEVIATION, TurnRate
+from tests.saga_fg.traffic_frames import frame
+
+DT, RATE, SPEED = 0.1, 0.3, 8.0
+SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.03)})}
+MOTION = ConstantVelocity(1.0)
+TURNS = TrackerSettings(
+    classes={"default": ClassSettings(motion=MOTION, turn_time=2.0, max_coasting=3.0)}, edges=(), report_coasting=3.0
+)
+STRAIGHT = replace(TURNS, classes={"default": replace(TURNS.classes["default"], turn_time=0.0)})
+
+
+def estimated(rates, noise=0.03, seed=0, flipped=0.0):
+    """The filter after headings that turn by `rates` (T,), rad/s."""
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(rates) * DT
+    turn = TurnRate.initiated(np.zeros(1), np.array([noise]))
+    for h in heading:
+        turn.predict(DT, np.array([2.0]))
+        half = np.pi * (rng.random() < flipped)
+        turn.update(np.array([0]), np.array([h + half + noise * rng.normal()]), np.array([noise]))
+    return turn
+
+
+@pytest.mark.parametrize("flipped", [0.0, 0.5])
+def test_the_rate_of_a_turn_is_found_whichever_way_round_the_boxes_are(flipped):
+    turn = estimated(np.full(20, RATE), flipped=flipped)
+    assert turn.rate.item() == pytest.approx(RATE, abs=0.08)
+    assert turn.known().item() == pytest.approx(turn.rate.item(), abs=0.06), "a clear turn is hardly shrunk"
+
+
+def test_noise_is_no_turn():
+    known = [abs(estimated(np.zeros(20), seed=seed).known().item()) for seed in range(30)]
+    assert np.median(known) < 0.005
+    assert max(known) < 0.1
+
+
+def test_a_wild_heading_counts_little():
+    turn = estimated(np.zeros(20))
+    before = turn.rate.item()
+    turn.update(np.array([0]), np.array([1.0]), np.array([0.03]))
+    assert abs(turn.rate.item() - before) < 0.1
+
+
+def test_unseen_a_rate_fades_to_none_and_its_deviation_returns():
+    turn = estimated(np.full(20, RATE))
+    turn.predict(30.0, np.array([2.0]))
+    assert turn.rate.item() == pytest.approx(0.0, abs=1e-5)
+    assert turn.P[0, 1, 1] == pytest.approx(DEVIATION**2)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_two_steps_predict_as_one(share):
+    one, two = (estimated(np.full(20, RATE)) for _ in range(2))
+    one.predict(0.5, np.array([2.0]))
+    two.predict(share * 0.5, np.array([2.0]))
+    two.predict((1 - share) * 0.5, np.array([2.0]))
+    for name in ("heading", "rate", "P"):
+        assert getattr(two, name) == pytest.approx(getattr(one, name), abs=1e-12)
+
+
+def test_without_headings_nothing_is_known():
+    turn = TurnRate.initiated(np.array([np.nan]), np.array([np.pi]))
+    turn.update(np.array([0]), np.array([np.nan]), np.array([np.pi]))
+    assert turn.known().item() == 0.0
+    turn.update(np.array([0]), np.array([0.5]), np.array([0.1]))
+    assert turn.heading.item() == pytest.approx(0.5)
+
+
+def circle(t):
+    """Position and heading at times t on a circle."""
+    return SPEED / RATE * np.array([np.sin(RATE * t), 1 - np.cos(RATE * t)]), RATE * t
+
+
+def coasting_error(settings, gap):
+    """Mean error of the position `gap` s after the last detection of an object that turns."""
+    errors = []
+    for seed in range(8):
+        rng, tracker = np.random.default_rng(seed), Tracker(settings, SENSORS)
+        for k in range(25):
+            p, yaw = circle(k * DT)
+            seen = frame(k * DT, [p + 0.1 * rng.normal(size=2)], yaw=yaw + 0.03 * rng.normal())
+            tracker.step(seen)
+        tracks = tracker.tracks(24 * DT + gap)
+        errors.append(np.hypot(*(tracks.boxes.position[0, :2] - circle(24 * DT + gap)[0])))
+    return np.mean(errors)
+
+
+@pytest.mark.parametrize("gap", [1.0, 2.0])
+def test_turning_objects_are_followed_round_the_bend(gap):
+    assert coasting_error(TURNS, gap) < 0.8 * coasting_error(STRAIGHT, gap)
