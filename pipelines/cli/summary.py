@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,8 @@ import typer
 if TYPE_CHECKING:
     from pipelines.config import TrackConfig
     from pipelines.tracking import TrackedScene
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -25,6 +28,7 @@ class Summary:
     seconds: float = 0.0
     best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    classes: set[str] = field(default_factory=set)
 
     def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
         """Pass runs on and count them."""
@@ -35,6 +39,7 @@ class Summary:
             self.milliseconds[run.scene.name] = run.milliseconds
             self.boxes += sum(len(tracks) for tracks in run.tracks)
             for tracks in run.tracks:
+                self.classes.update(tracks.boxes.label.tolist())
                 for id_, score in zip(tracks.id.tolist(), tracks.score.tolist(), strict=True):
                     track = (run.scene.name, id_)
                     self.best_score[track] = max(score, self.best_score.get(track, score))
@@ -47,6 +52,13 @@ class Summary:
 
         rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
         write_run_record(self.output, RunRecord(method, write_settings(settings, comments=False), rounded))
+
+    def warn_of_idle_edges(self, settings: TrackConfig) -> None:
+        """Warn if there are edge rules, but none acts on a class of the tracks."""
+        acting = {c for rule in settings.tracker.edges for c in getattr(rule, "classes", getattr(rule, "attached", ()))}
+        if acting and self.classes and not acting & self.classes:
+            text = "no edges: tracker.edges act on %s, and the tracks are of %s; objects are tracked one by one"
+            log.warning(text, ", ".join(sorted(acting)), ", ".join(sorted(self.classes)))
 
     def show(self) -> None:
         """Print the line on stdout."""

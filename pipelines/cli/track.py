@@ -51,6 +51,8 @@ def _track(
             runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
             source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in runs))
     summary.write_record(method, settings)
+    if method == "saga":
+        summary.warn_of_idle_edges(settings)
     summary.show()
 
 

@@ -22,7 +22,7 @@ from saga_fg.learning.gaps import GapSample
 from saga_fg.model.edge_features import EdgeFeatures
 from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
-from saga_fg.model.interactions import CarFollowing, SharedCourse
+from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.types.by_class import DEFAULT, class_numbers
@@ -44,18 +44,10 @@ FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
 MOST_GAPS = 500  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
-_SPEED = Following(
-    CarFollowing(time_constant=math.inf),
-    rate=1.0,
-    gap_scale=16.0,
-    lateral_scale=0.8,
-    classes=ROAD_USERS,
-    leaders="moving",
-)
+_LED = Following(SharedVelocity(), rate=1.0, gap_scale=18.0, lateral_scale=1.2, classes=ROAD_USERS, leaders="moving")
 TEMPLATE: tuple[Rule, ...] = (
-    _SPEED,
-    replace(_SPEED, rate=0.2, leaders="stationary"),
-    replace(_SPEED, interaction=SharedCourse(), rate=0.7),
+    _LED,
+    replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.2, leaders="stationary"),
     Neighbours(
         rate=1.0,
         distance_scale=25.0,
@@ -76,8 +68,8 @@ TEMPLATE: tuple[Rule, ...] = (
         classes=("pedestrian",),
     ),
 )
-"""Following a leader, moving or perhaps parked; turning after a moving one; parked objects, which share errors of the
-pose; groups of people."""
+"""Following a moving leader in speed and course; halting behind a stationary one; parked objects, which share errors of
+the pose; groups of people."""
 
 
 @dataclass(frozen=True, eq=False)

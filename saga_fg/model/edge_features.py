@@ -18,7 +18,7 @@ from saga_fg.numerics.arrays import IntArray
 
 
 class EdgeEnds(NamedTuple):
-    """One end of edges: position (..., 2) m, velocity (..., 2) m/s, heading (...) rad, has_moved (...) 1 or 0."""
+    """One end of edges: position (..., 2) m, velocity (..., 2) m/s, heading (...) rad, has_moved (...) from 0 to 1."""
 
     position: Any
     velocity: Any
@@ -27,7 +27,7 @@ class EdgeEnds(NamedTuple):
 
 
 class EdgeFeatures(NamedTuple):
-    """Features of edges (...), see the module; distance m, velocity_difference m/s, speeds m/s, has_moved 1 or 0."""
+    """Features of edges (...), see the module; distance m, velocity_difference m/s, speeds m/s, has_moved 0 to 1."""
 
     ahead: Any
     lateral: Any

@@ -1,7 +1,8 @@
 r"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
 
-    rate_ij = rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
+    rate_ij = r_j * rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
 
+r_j is the probability that the source exists: the rate is the expected one, and clutter pulls at nobody.
 A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the tracker in place of these.
 """
 
@@ -34,6 +35,7 @@ from saga_fg.settings import (
 )
 
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+_LEAST = 1e-9  # probability that a certain object does not exist
 Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
@@ -102,7 +104,7 @@ class Neighbours(Settings):
             able &= np.hypot(*nodes.velocity.T) >= self.min_speed
         else:  # the velocity of a new track is not known well enough
             able &= nodes.velocity_variance < self.speed_scale**2
-            able &= ~nodes.has_moved if nodes.has_moved is not None else False
+            able &= nodes.has_moved == 0 if nodes.has_moved is not None else False
         target, source = close_pairs(nodes.position, able, self.max_distance)
         rate = weighted_by_gain(
             self.strength(features_of(nodes, target, source)), self.information_gain, nodes, target, source
@@ -112,7 +114,10 @@ class Neighbours(Settings):
 
 @dataclass(frozen=True)
 class Following(Settings):
-    """A vehicle is led by the nearest vehicle ahead in its lane, as estimated from headings."""
+    """A vehicle is led by the nearest vehicle ahead in its lane, as estimated from headings.
+
+    Where it is not certain that the nearest exists, the next ones lead with the probability that none before them does.
+    """
 
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
@@ -154,14 +159,13 @@ class Following(Settings):
         """Rates (...), 1/s, of edges with these features, before classes and nearest leaders are considered."""
         lateral = lateral_of_arc(f)
         led = (f.ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
-        if not self.parked:
-            led &= f.target_moved > 0
+        share = np.ones_like(f.ahead) if self.parked else f.target_moved
         if self.leaders != "any":
-            led &= (f.source_moved > 0) == (self.leaders == "moving")
+            share = share * (f.source_moved if self.leaders == "moving" else 1 - f.source_moved)
         exponent = (
             (f.ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (f.turn / self.heading_scale) ** 2
         )
-        return np.where(led & (f.distance <= self.max_gap), self.rate * np.exp(-exponent / 2), 0.0)
+        return np.where(led & (f.distance <= self.max_gap), share * self.rate * np.exp(-exponent / 2), 0.0)
 
     def remoteness(self, f: EdgeFeatures) -> FloatArray:
         """Measure, m, that is least for the leader among all vehicles ahead."""
@@ -177,8 +181,12 @@ class Following(Settings):
         rate = weighted_by_gain(
             np.where(led, self.strength(features), 0.0), self.information_gain, nodes, target, source
         )
-        nearest = _nearest_leader(target, np.where(rate > 0, self.remoteness(features), np.inf), len(nodes))
-        return Pairs(target[nearest], source[nearest], rate[nearest])
+        ahead = np.flatnonzero(rate > 0)
+        target, source, rate = target[ahead], source[ahead], rate[ahead]
+        exists = np.ones(len(ahead)) if nodes.existence is None else nodes.existence[source]
+        leads = rate * _none_before(target, self.remoteness(features)[ahead], exists)
+        kept = np.flatnonzero(leads > 0)
+        return Pairs(target[kept], source[kept], leads[kept])
 
 
 @dataclass(frozen=True)
@@ -208,6 +216,32 @@ class Repulsion(Settings):
         return closest._replace(rate=np.full(len(closest.rate), self.rate))
 
 
+def traffic_rules() -> tuple[Following, Neighbours]:
+    """The default rules: a hidden vehicle follows a leader that moves, and people walk in groups."""
+    hidden = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
+    leader = Following(
+        SharedVelocity(),
+        rate=1.5,
+        max_gap=60.0,
+        gap_scale=18.0,
+        lateral_scale=1.2,
+        min_separation=0.8,
+        leaders="moving",
+        information_gain=hidden,
+    )
+    group = Neighbours(
+        classes=("pedestrian",),
+        rate=1.0,
+        distance_scale=1.5,
+        max_distance=4.5,
+        heading_scale=3.0,
+        speed_scale=1.0,
+        min_speed=0.2,
+        information_gain=hidden,
+    )
+    return leader, group
+
+
 def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
     """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
     return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))
@@ -220,7 +254,9 @@ def build_graph(
     explained_noise: float = 0.0,
     noise_scale: FloatArray | None = None,
 ) -> SceneGraph:
-    """The scene graph of `nodes` with the edges `rules` choose; those weaker than `min_rate` (1/s) are left out.
+    """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
+
+    Edges weaker than `min_rate` (1/s) are left out.
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
     motion that follows a leader is explained. `noise_scale` (n,) are further factors on it.
@@ -236,6 +272,8 @@ def build_graph(
         kind = np.array([first.setdefault(t.components, len(first)) for t in kinds])[kind]
         for rule in rules:
             target, source, rate = _checked_pairs(rule, nodes)
+            if nodes.existence is not None:
+                rate = rate * nodes.existence[source]
             keep = rate >= min_rate
             target, source, rate = target[keep], source[keep], rate[keep]
             pair_kind = kind[target] * len(first) + kind[source]
@@ -287,9 +325,13 @@ def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:
     return Pairs(pairs.target[kept], pairs.source[kept], pairs.rate[kept])
 
 
-def _nearest_leader(target: IntArray, distance: FloatArray, n: int) -> IntArray:
-    """For every target that has a leader at finite distance, the index of the nearest one's pair."""
-    order = np.lexsort((distance, target))
-    first = np.unique(target[order], return_index=True)[1]
-    nearest = order[first]
-    return np.asarray(nearest[np.isfinite(distance[nearest])])
+def _none_before(target: IntArray, remoteness: FloatArray, exists: FloatArray) -> FloatArray:
+    """Probabilities (E,) that no source of the same target with a lower remoteness exists, given those of sources."""
+    order = np.lexsort((remoteness, target))
+    first = np.flatnonzero(np.diff(target[order], prepend=-1))
+    missing = np.log1p(-np.minimum(exists[order], 1 - _LEAST))
+    before = np.cumsum(missing) - missing
+    nearer = np.exp(before - np.repeat(before[first], np.diff(first, append=len(order))))
+    result = np.empty(len(order))
+    result[order] = np.where(nearer > 2 * _LEAST, nearer, 0.0)
+    return result

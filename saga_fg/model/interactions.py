@@ -40,11 +40,11 @@ class NodeTable:
 
     id (n,); label (n,) classes; types n node types; position (n, 2) m; velocity (n, 2) m/s; heading (n,) rad;
     length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2;
-    has_moved (n,) whether a node was ever clearly in motion, which distinguishes parked from waiting cars; None if
+    has_moved (n,) probability that a node was ever in motion, which distinguishes parked from waiting cars; None if
     unknown; closed (n,) the weight in [0, 1] with which a stop line is closed, by the belief on its light, None
     where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
     or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
-    unknown
+    unknown; existence (n,) probability that a node is a real object, None: all are
     """
 
     id: IntArray
@@ -55,11 +55,12 @@ class NodeTable:
     heading: FloatArray
     length: FloatArray
     velocity_variance: FloatArray
-    has_moved: BoolArray | None = None
+    has_moved: FloatArray | BoolArray | None = None
     closed: FloatArray | None = None
     outline: Mapping[int, FloatArray] = field(default_factory=dict)
     width: Mapping[int, float] = field(default_factory=dict)
     unseen: FloatArray | None = None
+    existence: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.id)

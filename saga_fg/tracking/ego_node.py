@@ -94,6 +94,7 @@ class EgoNode:
             return tracks
         label = np.array([self.settings.label])
         now, moved, unseen = joint.kinematics_of(_ID, label), tracks.has_moved, tracks.unseen
+        existence = tracks.existence
         return NodeTable(
             np.concatenate([tracks.id, _ID]),
             np.concatenate([tracks.label, label]),
@@ -105,6 +106,7 @@ class EgoNode:
             np.append(tracks.velocity_variance, np.trace(now.P_velocity[0]) / 2),
             None if moved is None else np.append(moved, self.has_moved),
             unseen=None if unseen is None else np.append(unseen, 0.0),
+            existence=None if existence is None else np.append(existence, 1.0),
         )
 
 

@@ -131,7 +131,7 @@ class MapNodes:
         if m == 0:
             return tracks
         position = joint.kinematics_of(self.id, self.label).position
-        moved = tracks.has_moved
+        moved, existence = tracks.has_moved, tracks.existence
         beliefs = [self.beliefs[light] for light in self.light if light]
         closed = self.settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))
         governed = np.array([bool(light) for light in self.light])
@@ -153,6 +153,7 @@ class MapNodes:
             outline,
             width,
             None if tracks.unseen is None else np.concatenate([tracks.unseen, np.zeros(m)]),
+            None if existence is None else np.concatenate([existence, np.ones(m)]),
         )
 
 

@@ -82,10 +82,11 @@ def _known_turns(state: TrackerState) -> tuple[KnownTurns, ...]:
 def node_table(state: TrackerState) -> NodeTable:
     """The present estimates as edge rules see them: the tracks, the vehicle, the nodes of the map.
 
-    The direction of motion stands in for a heading that is not known.
+    The direction of motion stands in for a heading that is not known. A confirmed track exists, hidden or not.
     """
     table, box, now = state.table, state.table.box, state.reported_kinematics()
     velocity, P = now.velocity, now.P_velocity
+    moves = 1 - table.stationarity.probability if state.settings.stationarity.prior > 0 else 0.0
     tracks = NodeTable(
         table.id,
         table.label,
@@ -95,7 +96,8 @@ def node_table(state: TrackerState) -> NodeTable:
         np.where(np.isfinite(box.yaw), box.yaw, np.arctan2(velocity[:, 1], velocity[:, 0])),
         np.where(np.isfinite(box.size[:, 0]), box.size[:, 0], 0.0),
         (P[:, 0, 0] + P[:, 1, 1]) / 2,
-        table.has_moved.copy(),
+        np.where(table.has_moved, 1.0, moves),
         unseen=table.coasting(state.time),
+        existence=np.where(table.confirmed, 1.0, table.existence),
     )
     return state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)

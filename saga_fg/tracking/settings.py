@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_network import EdgeNetwork
-from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion
+from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
@@ -220,7 +220,7 @@ class TrackerSettings(Settings):
     )
     edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
         settings_group(
-            lambda: (Following(), Neighbours()),
+            traffic_rules,
             "edge rules of the scene graph: who interacts with whom; []: no interactions",
         )
     )

@@ -52,6 +52,21 @@ def test_nuscenes_results_list_every_sample_of_the_split(simulated: Path, tmp_pa
     assert not results.meta.use_camera
 
 
+def test_edges_that_act_on_no_class_of_the_data_are_told_once(
+    simulated: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = tmp_path / "robots.yaml"
+    config.write_text("tracker: {edges: [{kind: following, classes: [robot]}]}\n")
+    for method, warnings in (("saga", 1), ("kf", 0)):
+        caplog.clear()
+        result = saga_fg(
+            *arguments(simulated, tmp_path / "t.json"), "--split", "all", "--config", config, "--method", method
+        )
+        assert result.exit_code == 0, result.output
+        told = [record.getMessage() for record in caplog.records if "tracker.edges act on robot" in record.getMessage()]
+        assert len(told) == warnings
+
+
 def test_two_sensors_and_chosen_scenes(simulated: Path, tmp_path: Path) -> None:
     output = tmp_path / "tracks.json"
     camera = f"camera={simulated / 'detections' / 'camera.json'}"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph, traffic_rules
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
@@ -100,6 +100,59 @@ def test_a_follower_listens_to_its_leader_once_nobody_sees_it():
 def test_of_two_certain_nodes_neither_learns():
     nodes = replace(table([[0.0, 0.0], [3.0, 0.0]], 0.0), velocity_variance=np.zeros(2))
     assert Neighbours(information_gain=EdgeInformation(0.0)).pairs(nodes).rate.tolist() == [0.0, 0.0]
+
+
+# who exists
+
+
+def test_clutter_pulls_at_nobody():
+    nodes = table([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]], 0.0)
+    unsure = replace(nodes, existence=np.array([1.0, 0.25, 0.0]))
+    full, weighted = (build_graph(each, [Neighbours()]).edges[0] for each in (nodes, unsure))
+    of = {(i, j): rate for i, j, rate in zip(full.target, full.source, full.rate, strict=True)}
+    assert 2 not in weighted.source
+    for i, j, rate in zip(weighted.target, weighted.source, weighted.rate, strict=True):
+        assert rate == pytest.approx(of[i, j] * unsure.existence[j])
+
+
+def test_the_nearest_leader_that_exists_leads():
+    nodes = table(*straight(4, gap=8.0))  # 3 behind 2 behind 1 behind 0
+    rule = Following(gap_scale=np.inf)
+    r = np.array([0.9, 0.6, 0.2, 1.0])
+    graph = build_graph(replace(nodes, existence=r), [rule])
+    rates = edges(Pairs(graph.edges[0].target, graph.edges[0].source, graph.edges[0].rate))
+    assert rates[3] == pytest.approx({2: rule.rate * 0.2, 1: rule.rate * 0.8 * 0.6, 0: rule.rate * 0.8 * 0.4 * 0.9})
+    assert rates[1] == pytest.approx({0: rule.rate * 0.9})
+    assert sum(rates[3].values()) == pytest.approx(rule.rate * (1 - 0.1 * 0.4 * 0.8))
+
+
+@given(seeds)
+def test_certain_nodes_have_the_edges_of_nodes_of_which_no_existence_is_known(seed):
+    nodes = random_traffic(np.random.default_rng(seed))
+    rules = [Following(), Neighbours()]
+    plain, certain = build_graph(nodes, rules), build_graph(replace(nodes, existence=np.ones(len(nodes))), rules)
+    for one, other in zip(plain.edges, certain.edges, strict=True):
+        assert np.array_equal(one.target, other.target)
+        assert np.array_equal(one.source, other.source)
+        assert one.rate == pytest.approx(other.rate)
+
+
+def test_a_target_that_perhaps_moves_follows_at_the_expected_rate():
+    nodes = table(*straight(2))
+    full = Following(leaders="moving").pairs(nodes).rate[0]
+    for target, source in ((0.4, 1.0), (1.0, 0.3), (0.5, 0.5)):
+        known = replace(nodes, has_moved=np.array([source, target]))
+        assert Following(leaders="moving").pairs(known).rate[0] == pytest.approx(full * target * source)
+        assert Following(parked=True).pairs(known).rate[0] == pytest.approx(full)
+
+
+def test_by_default_a_hidden_vehicle_follows_and_a_duplicate_leads_nobody():
+    rule, _ = traffic_rules()
+    apart, on_top = table(*straight(2)), table(*straight(2, gap=2.5))
+    assert leaders(rule.pairs(apart)) == {1: 0}
+    assert len(rule.pairs(on_top).target) == 0
+    seen, hidden = (rule.pairs(replace(apart, unseen=np.array([0.0, t]))).rate[0] for t in (0.0, 1.0))
+    assert hidden > 1.5 * seen
 
 
 # following

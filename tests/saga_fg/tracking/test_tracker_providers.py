@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,12 +15,14 @@ import pytest
 from factors import ResidualFactors
 from saga_fg import Frame, InputError, Tracker, TrackerSettings
 from saga_fg.graph import OBJECT, Additions, GraphError, GraphView
+from saga_fg.model.edge_rules import Neighbours
 from saga_fg.tracking import AssociationSettings
 from tests.saga_fg.traffic_frames import frame, run, seen, straight
 
 PLACE = np.array([5e5, -3e5])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
-ISAM2 = TrackerSettings(estimator="isam2")
+SIDE_BY_SIDE = (Neighbours(),)
+ISAM2 = TrackerSettings(estimator="isam2", edges=SIDE_BY_SIDE)
 
 
 class Quiet:
@@ -61,8 +64,8 @@ def same(a: Any, b: Any, tolerance: float) -> None:
 @pytest.mark.parametrize("association", ["hungarian", "graph"])
 def test_a_provider_that_adds_nothing_changes_nothing(association: str) -> None:
     matching = AssociationSettings(method=association)
-    plain = Tracker(TrackerSettings(association=matching))
-    quiet = Tracker(TrackerSettings(association=matching, estimator="isam2"), providers=[Quiet()])
+    plain = Tracker(TrackerSettings(association=matching, edges=SIDE_BY_SIDE))
+    quiet = Tracker(replace(ISAM2, association=matching), providers=[Quiet()])
     for a, b in zip(run(plain, frames()), run(quiet, frames()), strict=True):
         same(a, b, 1e-6)
     assert quiet.graph.edge_count > 0
