@@ -43,7 +43,7 @@ COMPONENTS = (
     Variant("without explained noise", changes={"tracker.explained_noise": 0.0}),
     Variant("without traffic flow", changes={"tracker.traffic_flow_prior.weight": 0.0}),
     Variant("without stationary objects", changes={"tracker.stationarity.prior": 0.0}),
-    Variant("reports at once", changes={"tracker.report_speed_deviation_below": math.inf}),
+    Variant("tracks of one detection rank as others", changes={"tracker.min_hits": 1}),
     Variant("without non-maximum suppression", changes={"tracker.classes.*.nms_distance": 0.0}),
     Variant("without suppression of weak detections", changes={"tracker.classes.*.weak_nms_distance": 0.0}),
     Variant("matching without overlap", changes={"tracker.classes.*.giou_weight": 0.0}),
@@ -55,7 +55,7 @@ COMPONENTS = (
     Variant("tracks that never leave unseen", changes={"tracker.existence.lifetime": math.inf}),
     Variant("scores without hit ratio", changes={"tracker.existence.hit_ratio_weight": 0.0}),
     Variant("coasting tracks scored in full", changes={"tracker.existence.coasting_score_factor": 1.0}),
-    Variant("without unconfirmed tracks", changes={"tracker.unconfirmed_score_factor": 0.0}),
+    Variant("without tentative tracks", changes={"tracker.tentative_score_factor": 0.0}),
     Variant("without output while coasting", changes={"tracker.report_coasting": 0.0}),
     Variant("headings that drift freely", changes={"tracker.classes.*.yaw_drift": 3.0}),
 )

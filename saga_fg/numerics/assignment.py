@@ -17,10 +17,11 @@ from scipy.optimize import linear_sum_assignment
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.chi_square import chi_square_quantile
+from saga_fg.numerics.columns import Columns
 
 
 @dataclass(frozen=True, eq=False)
-class Matching:
+class Matching(Columns):
     """track (k,) and detection (k,): rows that belong together; distance (k,): their d^2."""
 
     track: IntArray

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray, distinct
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
 from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
 from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.numerics.quadratic_matching import QuadraticMatching
@@ -37,6 +37,7 @@ from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.retrodiction import past_cross_covariances, past_positions
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.tracking.unresolved import over_confirmed
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_settings, class_values
 from saga_fg.types.overlap import paired_giou_3d
@@ -80,7 +81,8 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
     groups, likelihood = state.class_groups, measurements.class_likelihood
     evidence = ClassEvidence(groups, table.class_belief, likelihood) if len(groups) else None
-    return match(predicted, P, expected, measurements, state.settings, area, cross, evidence)
+    deferred = over_confirmed(state, predicted)
+    return match(predicted, P, expected, measurements, state.settings, area, cross, evidence, deferred)
 
 
 def match(
@@ -92,6 +94,7 @@ def match(
     clutter_area: float,
     cross: CrossCovariances | None = None,
     evidence: ClassEvidence | None = None,
+    deferred: BoolArray | None = None,
 ) -> Matching:
     """The assignment of a frame.
 
@@ -101,14 +104,27 @@ def match(
     clutter_area  area over which false detections spread, m^2: that of the sensor, else of the settings
     cross         covariances between the positions of tracks, for the method `graph`
     evidence      of classes, where detectors mistake some for each other
+    deferred      (n,) tracks that are matched to what the others leave; None: none
     """
     found = candidates(predicted, P, expected, measurements, settings, clutter_area, evidence)
-    if settings.association.method == "graph" and cross is not None:
+    if deferred is None or not deferred.any():
+        return _chosen(found, settings.association, cross)
+    late = deferred[found.track]
+    first = _chosen(found.select(np.flatnonzero(~late)), settings.association, cross)
+    second = _chosen(
+        found.select(np.flatnonzero(late & ~np.isin(found.detection, first.detection))), settings.association, cross
+    )
+    return first.append(second)
+
+
+def _chosen(found: CandidatePairs, association: AssociationSettings, cross: CrossCovariances | None) -> Matching:
+    """The pairs of least cost, each track and detection in one at most."""
+    if association.method == "graph" and cross is not None:
         pairs = pair_costs(found.track, found.detection, found.innovation, found.S, cross)
-        pairs = pairs._replace(cost=settings.association.pair_weight * pairs.cost)
+        pairs = pairs._replace(cost=association.pair_weight * pairs.cost)
         chosen = QuadraticMatching(found.track, found.detection, found.gain, pairs).solve()
     else:
-        choose = cheapest_first if settings.association.method == "greedy" else least_total
+        choose = cheapest_first if association.method == "greedy" else least_total
         chosen = choose(found.track, found.detection, found.gain)
     return Matching(found.track[chosen], found.detection[chosen], found.d2[chosen])
 

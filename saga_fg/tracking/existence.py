@@ -53,13 +53,13 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     p_miss = np.where(excused, 0.0, p_detect)[missed]
     p = measurements.probability[d]
     table.existence[missed] = after_miss(table.existence[missed], p_miss, elapsed, settings)
-    table.existence[t] = after_hit(table.existence[t], p, settings)
+    resolved = t[table.unresolved[t] == 0]  # a detection of the others may be of the track that they overlap
+    table.existence[resolved] = after_hit(table.existence[resolved], p[table.unresolved[t] == 0], settings)
     table.confirmed |= table.existence >= settings.confirm_above
     table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
     fused = table.sensors.probability(state.time, max(memory, measurements.delay))
     table.score = np.where(np.isfinite(fused), fused, table.score)
     table.hits, table.opportunities = table.sensors.best_hits()
-    table.accepted |= table.sensors.confirmed(state.settings.confirming_detections)
     table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
     table.last_detected[t] = np.maximum(table.last_detected[t], time)
     table.last_in_view[t] = state.time

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.box_filter import BoxFilter
@@ -13,6 +14,7 @@ from saga_fg.tracking.stationarity import Stationarity, after_evidence, log_dens
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.turn_rate import TurnRate
+from saga_fg.tracking.unresolved import unresolved_frames
 from saga_fg.tracking.update import update_range_rates
 from saga_fg.types.boxes import Boxes
 
@@ -28,6 +30,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     k, delay, boxes, p = len(rows), measurements.delay, measurements.boxes.select(rows), measurements.probability[rows]
     ids = np.arange(state.next_id, state.next_id + k, dtype=np.int64)
     state.next_id += k
+    unresolved = unresolved_frames(state, matching, boxes, p, measurements.R[rows, :2, :2])
     kinematics, stationary = initial_kinematics(state, measurements, rows)
     relative = None if measurements.relative is None else measurements.relative.select(rows)
     state.joint.add(ids, boxes.label, kinematics, delay, relative)
@@ -43,12 +46,12 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         position_bias=measurements.position_bias[rows],
         last_detected=np.full(k, time),
         last_in_view=np.full(k, state.time),
-        confirmed=p >= state.settings.existence.confirm_above,
+        confirmed=(p >= state.settings.existence.confirm_above) & (unresolved == 0),
         has_moved=np.zeros(k, dtype=bool),
         opportunities=np.ones(k),
         hits=np.ones(k),
-        accepted=np.full(k, measurements.sensor.initiation == "alone"),
-        ready=np.zeros(k, dtype=bool),
+        required_hits=np.full(k, required_hits(state, measurements.sensor)),
+        unresolved=unresolved,
         class_belief=state.class_groups.updated(0 * likelihood, likelihood),
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
         stationarity=Stationarity.initiated(kinematics, stationary),
@@ -57,6 +60,12 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     )
     state.table = state.table.append(new)
     return rows
+
+
+def required_hits(state: TrackerState, sensor: Sensor) -> float:
+    """Detections of a sensor alone that confirm a track which it has initiated."""
+    settings = state.settings
+    return float(settings.min_hits if sensor.initiation == "alone" else settings.confirming_detections)
 
 
 def initial_kinematics(

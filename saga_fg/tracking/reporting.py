@@ -23,27 +23,21 @@ from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.track import Tracks
 
 
-def mark_ready(state: TrackerState) -> None:
-    """Mark the tracks whose velocity is now known well enough to report them from here on."""
-    state.table.ready |= state.reported_kinematics().speed_deviation <= state.settings.report_speed_deviation_below
-
-
 def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     """The tracks to be reported, as of `timestamp` (s)."""
     table, settings = state.table, state.settings
-    coasting = table.coasting(state.time)
+    coasting, tentative = table.coasting(state.time), table.tentative
     rows = np.flatnonzero(
-        (table.accepted | (settings.unconfirmed_score_factor > 0))
+        (~tentative | (settings.tentative_score_factor > 0))
         & (table.confirmed | (table.existence >= settings.existence.report_above))
         & (coasting <= settings.report_coasting)
-        & table.ready
     )
     table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
     boxes = table.boxes(now.position + state.origin, now.velocity)
     P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.position_bias)
     certainty = state.class_groups.certainty(table.class_belief)
     score = reported_score(table, certainty, coasting > 0, settings.existence)
-    score = np.where(table.accepted, score, settings.unconfirmed_score_factor * score)
+    score = np.where(tentative[rows], settings.tentative_score_factor * score, score)
     return Tracks(timestamp, table.id, boxes, score, P, now.P_velocity, coasting)
 
 

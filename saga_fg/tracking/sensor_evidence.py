@@ -109,8 +109,8 @@ class SensorEvidence(Columns):
         hits, total = (np.take_along_axis(count, best, axis=1)[:, 0] for count in (self.hits, self.opportunities))
         return hits.astype(np.float64), total.astype(np.float64)
 
-    def confirmed(self, detections: int) -> BoolArray:
-        """(n,) which tracks two sensors have detected, or one at least this often."""
+    def confirmed(self, detections: FloatArray) -> BoolArray:
+        """(n,) which tracks two sensors have detected, or one at least this often (n,)."""
         return np.asarray(((self.hits > 0).sum(axis=1) > 1) | (self.hits.sum(axis=1) >= detections))
 
     def _column(self, sensor: str) -> int:

@@ -218,6 +218,13 @@ class TrackerSettings(Settings):
     classes: Mapping[str, ClassSettings] = settings_group(
         lambda: {DEFAULT: ClassSettings()}, "settings by class of object; the entry named default serves all others"
     )
+    min_hits: PositiveInt = setting(
+        1, "report a track from this detection on, before with tentative_score_factor; higher: later, fewer false ones"
+    )
+    tentative_score_factor: Fraction = setting(
+        0.0,
+        "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
+    )
     edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
         settings_group(
             traffic_rules,
@@ -259,9 +266,6 @@ class TrackerSettings(Settings):
     stationarity: StationaritySettings = settings_group(
         StationaritySettings, "estimation of which objects are stationary"
     )
-    report_speed_deviation_below: PositiveOrInf = setting(
-        math.inf, "first report a track when its velocity is known to this standard deviation, m/s; .inf: at once"
-    )
     score_memory: NonNegative = setting(
         0.15,
         "time for which the latest detection of each sensor counts in a track's score, s; usual one frame; "
@@ -269,9 +273,6 @@ class TrackerSettings(Settings):
     )
     confirming_detections: PositiveInt = setting(
         3, "detections that confirm a track initiated by a sensor with `initiation: confirmed`; usual 2 to 5"
-    )
-    unconfirmed_score_factor: Fraction = setting(
-        0.0, "factor on the score of tracks that wait for confirmation; 0: do not report them"
     )
     clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
     max_delay: NonNegative = setting(

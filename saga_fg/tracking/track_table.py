@@ -35,8 +35,8 @@ class TrackTable(Columns):
     has_moved         (n,) whether it was ever clearly in motion
     opportunities     (n,) frames in which its best sensor could have detected it
     hits              (n,) frames in which that sensor detected it
-    accepted          (n,) whether it was initiated by a sensor that is trusted alone, or confirmed since
-    ready             (n,) whether its velocity was ever known well enough to be reported
+    required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
+    unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.unresolved`
     class_belief      (n, C) probabilities of the classes that detectors mistake for each other
     box               size, height and heading
     stationarity      probability and place of standing still
@@ -56,8 +56,8 @@ class TrackTable(Columns):
     has_moved: BoolArray
     opportunities: FloatArray
     hits: FloatArray
-    accepted: BoolArray
-    ready: BoolArray
+    required_hits: FloatArray
+    unresolved: FloatArray
     class_belief: FloatArray
     box: BoxFilter
     stationarity: Stationarity
@@ -73,8 +73,7 @@ class TrackTable(Columns):
             np.empty(0, dtype="<U1"),
             *(number,) * 6,
             *(truth,) * 2,
-            *(number,) * 2,
-            *(truth,) * 2,
+            *(number,) * 4,
             np.empty((0, classes)),
             BoxFilter.empty(),
             Stationarity.empty(),
@@ -85,6 +84,11 @@ class TrackTable(Columns):
     def snapshot(self) -> Self:
         """A copy that shares no array with this table."""
         return self.select(np.arange(len(self)))
+
+    @property
+    def tentative(self) -> BoolArray:
+        """(n,) tracks that may be no object of their own: of too few detections, or unresolved."""
+        return np.asarray((self.unresolved > 0) | ~self.sensors.confirmed(self.required_hits))
 
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""

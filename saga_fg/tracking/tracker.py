@@ -34,9 +34,10 @@ from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.prediction import predict
 from saga_fg.tracking.provider_names import new_provider
-from saga_fg.tracking.reporting import mark_ready, report_tracks
+from saga_fg.tracking.reporting import report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
+from saga_fg.tracking.unresolved import resolve_tracks
 from saga_fg.tracking.update import update_tracks
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.track import Tracks
@@ -150,6 +151,7 @@ class Tracker:
         self._notify("update", state, frame.sensor, measurements, matching)
 
         update_existence(state, measurements, matching, state.time - before)
+        resolve_tracks(state, matching)
         self._notify("existence", state, frame.sensor, measurements, matching)
 
         rows = initiate_tracks(state, measurements, matching)
@@ -162,7 +164,6 @@ class Tracker:
         delete_tracks(state)
         self._notify("delete", state, frame.sensor, measurements, matching)
 
-        mark_ready(state)
         reported = report_tracks(state, state.clock.newest)
         self._notify("report", state, frame.sensor, measurements, matching)
         return reported

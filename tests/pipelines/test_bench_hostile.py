@@ -59,6 +59,7 @@ def test_what_is_lost_does_not_make_up_for_what_is_doubled(
 
 def test_no_message_in_the_name_of_a_good_sensor_takes_its_numbers():
     config, rng = load_config("file"), np.random.default_rng(0)
+    config = replace(config, tracker=replace(config.tracker, min_hits=1))  # so that one message is answered by tracks
     service = StreamTracker[None](lambda: config.new_tracker("kf"))
     for sensor in SENSORS:
         service.handle(encode({"timestamp": EPOCH, "sensor": sensor, "seq": 0, "detections": []}), None)

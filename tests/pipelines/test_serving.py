@@ -176,8 +176,8 @@ def test_reset_begins_anew():
     service = stream()
     before = answers(service, frame(50.0), frame(50.1))
     assert answers(service, b'{"type": "reset"}') == [{"type": "reset"}]
-    after = answers(service, frame(3.0, x=0.0))
-    assert before[-1]["tracks"][0]["id"] == after[0]["tracks"][0]["id"] == 1
+    after = answers(service, frame(3.0, x=0.0), frame(3.1, x=0.8))
+    assert before[-1]["tracks"][0]["id"] == after[-1]["tracks"][0]["id"] == 1
     assert after[0]["timestamp"] == 3.0
 
 

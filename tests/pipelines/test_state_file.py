@@ -97,7 +97,7 @@ def test_a_reset_is_on_the_disk_before_it_is_answered(tmp_path: Path):
     second = stream()
     kept(second, tmp_path / "state.saga")
     assert second.status()["last_seq"] == {"sensor": 1}
-    assert [t["id"] for t in sent(second, 500)[0]["tracks"]] == [1]
+    assert [t["id"] for t in sent(second, 500, 501)[-1]["tracks"]] == [1]
 
 
 def test_a_full_disk_is_told_and_got_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any):

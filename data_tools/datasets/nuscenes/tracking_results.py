@@ -7,7 +7,7 @@ in the global frame. Every sample of a scene is listed, with at most 500 boxes; 
 https://github.com/nutonomy/nuscenes-devkit, python-sdk/nuscenes/eval/tracking/README.md.
 
 A box written here has one field more, which the official evaluation leaves alone: `position_covariance` (xx, xy, yy of
-the horizontal position, m^2).
+the horizontal position, m^2). A velocity that is unknown (`saga_fg.types.track.known_velocities`) is written as 0.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from saga_fg.numerics.arrays import FloatArray, StrArray, upper_triangle
 from saga_fg.numerics.geometry import yaw_quaternion
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
-from saga_fg.types.track import Tracks
+from saga_fg.types.track import Tracks, known_velocities
 
 MAX_BOXES = 500  # per sample, official
 
@@ -98,7 +98,7 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
         boxes.position.round(6).tolist(),
         boxes.size[:, [1, 0, 2]].round(6).tolist(),
         yaw_quaternion(boxes.yaw).round(12).tolist(),
-        np.nan_to_num(boxes.velocity).round(6).tolist(),
+        np.nan_to_num(known_velocities(boxes.velocity, chosen.velocity_covariance)).round(6).tolist(),
         names,
         boxes.label.tolist(),
         chosen.score.tolist(),

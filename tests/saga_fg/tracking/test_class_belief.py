@@ -33,9 +33,8 @@ def frame(time, *found, sensor="lidar"):
 
 
 def tracker(groups=GROUPS, estimator="kalman"):
-    settings = TrackerSettings(
-        {"default": ClassSettings(initial_speed_deviation=1.0)}, class_groups=groups, estimator=estimator
-    )
+    classes = {"default": ClassSettings(initial_speed_deviation=1.0)}
+    settings = TrackerSettings(classes, class_groups=groups, estimator=estimator, tentative_score_factor=1.0)
     return Tracker(settings, SENSORS)
 
 

@@ -22,7 +22,7 @@ def test_a_weak_sensor_alone_needs_repeated_evidence():
 
 
 def test_what_waits_for_confirmation_may_be_reported_with_a_share_of_its_score():
-    tracker = Tracker(independent(confirming_detections=3, unconfirmed_score_factor=0.25), WEAK)
+    tracker = Tracker(independent(confirming_detections=3, tentative_score_factor=0.25), WEAK)
     scores = [t.score.tolist() for t in run(tracker, [frame(t, (10.0, 0.0), "camera", score=0.8) for t in TENTHS[:3]])]
     assert scores == [[pytest.approx(0.2)], [pytest.approx(0.2)], [pytest.approx(0.8)]]
 

@@ -1,7 +1,5 @@
 """Speeds of new tracks from the traffic around them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +8,7 @@ from hypothesis import strategies as st
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.tracking import TrafficFlowSettings
 from saga_fg.tracking.traffic_flow import Passages, TrafficFlowPrior
+from saga_fg.types.track import known_velocities
 from tests.saga_fg.traffic_frames import frame
 
 ON = TrafficFlowSettings(weight=5.0)
@@ -122,10 +121,11 @@ def test_a_car_that_appears_behind_another_starts_at_its_speed_with_less_doubt()
     np.testing.assert_array_equal(on.boxes.position[0], off.boxes.position[0])
 
 
-def test_reports_wait_until_the_velocity_is_known():
-    waiting = TrackerSettings(edges=(), report_speed_deviation_below=1.5)
-    assert behind_a_leader(waiting).id.tolist() == [1]
-    assert behind_a_leader(replace(waiting, report_speed_deviation_below=np.inf)).id.tolist() == [1, 2]
+def test_a_track_is_reported_at_once_with_a_velocity_as_wide_as_it_is():
+    newcomer = behind_a_leader(TrackerSettings(edges=()))
+    assert newcomer.id.tolist() == [1, 2]
+    known = np.isfinite(known_velocities(newcomer.boxes.velocity, newcomer.velocity_covariance))
+    assert known.all(axis=1).tolist() == [True, False]
 
 
 def test_a_snapshot_remembers_the_traffic():
