@@ -12,8 +12,18 @@ from typing import Any
 from data_tools.evaluation.errors import error_json, error_pictures, error_tables
 from data_tools.evaluation.hota import HotaRow, hota, hota_json, hota_table
 from data_tools.evaluation.innovations import innovation_json, innovation_table
+from data_tools.evaluation.track_quality import track_table
 from data_tools.figures import FigureTable, cell
-from data_tools.metrics import LabelErrors, SceneBoxes, SceneMetrics, label_errors, scene_metrics_by_label
+from data_tools.metrics import (
+    LabelErrors,
+    SceneBoxes,
+    SceneMetrics,
+    WholeTracks,
+    label_errors,
+    scene_metrics_by_label,
+    track_summaries,
+    whole_tracks,
+)
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
@@ -32,6 +42,7 @@ class Evaluation:
     tracking     table of the tracking metrics
     programs     the same figures by name, with the names of the scenes
     errors       at labels
+    tracks       as wholes, of all scenes
     hota         empty where it was not asked for
     innovations  squared distances in sigmas by class; empty where they are not known
     draw         makes pictures of the tracking metrics by name
@@ -40,6 +51,7 @@ class Evaluation:
     tracking: FigureTable
     programs: Mapping[str, Any]
     errors: LabelErrors
+    tracks: WholeTracks
     hota: Sequence[HotaRow] = ()
     innovations: Mapping[str, FloatArray] = field(default_factory=dict)
     draw: Callable[[], Mapping[str, Any]] = dict
@@ -50,6 +62,7 @@ class Evaluation:
         return [
             self.tracking,
             *error_tables(self.errors),
+            track_table(self.tracks),
             *innovations,
             *([hota_table(self.hota)] if self.hota else []),
         ]
@@ -59,6 +72,7 @@ class Evaluation:
         return {
             **self.programs,
             **error_json(self.errors),
+            "tracks": track_summaries(self.tracks),
             "innovations": innovation_json(self.innovations),
             "hota": hota_json(self.hota),
         }
@@ -80,7 +94,7 @@ def evaluate_tracks(
     Raises `InputError` for a scene without ground truth, `MissingExtraError` for HOTA without trackeval.
     """
     by_label: dict[str, list[SceneMetrics]] = {}
-    errors, pairs = [], []
+    errors, tracks, pairs = [], [], []
     for scene, found in results:
         if scene.ground_truth is None:
             raise InputError(f"scene {scene.name}: expected ground truth")
@@ -89,6 +103,7 @@ def evaluate_tracks(
         visible = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
         errors.append(label_errors(visible, found, visible.boxes.velocity))
         pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
+        tracks.append(whole_tracks(*pairs[-1]))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
     whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
     return Evaluation(
@@ -98,6 +113,7 @@ def evaluate_tracks(
             "tracking": {name: _figures(metrics) for name, metrics in whole.items()},
         },
         LabelErrors.pool(errors),
+        WholeTracks.concatenate(tracks),
         hota(pairs, dict.fromkeys(pooled, 0.0)) if with_hota else (),
         innovations or {},
     )

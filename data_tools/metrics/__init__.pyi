@@ -35,6 +35,7 @@ from .nuscenes_tracking import (
 )
 from .scene import SceneMetrics, SceneMetricSettings, scene_metrics, scene_metrics_by_label
 from .scene_boxes import SceneBoxes
+from .track_quality import TrackSummary, WholeTracks, track_summaries, whole_tracks
 
 __all__ = [
     "EllipseCoverage",
@@ -55,6 +56,8 @@ __all__ = [
     "SceneBoxes",
     "SceneMetricSettings",
     "SceneMetrics",
+    "TrackSummary",
+    "WholeTracks",
     "calibration",
     "coverage",
     "coverages",
@@ -76,4 +79,6 @@ __all__ = [
     "root_mean_square",
     "scene_metrics",
     "scene_metrics_by_label",
+    "track_summaries",
+    "whole_tracks",
 ]

@@ -8,6 +8,7 @@ A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, Protocol
@@ -175,6 +176,9 @@ class Following(Settings):
         able = of_classes(nodes.label, self.classes)
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
         target, source = close_pairs(seen.position, able, self.max_gap)
+        bend = math.tan(min(3 * self.heading_scale, 1.5) / 2)
+        front = in_front(seen, target, source, 3 * self.lateral_scale, bend)
+        target, source = target[front], source[front]
         features = features_of(seen, target, source)
         near = self.min_separation * (nodes.length[target] + nodes.length[source]) / 2
         led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
@@ -315,6 +319,14 @@ def close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[I
     pairs = cKDTree(position[rows]).query_pairs(radius, output_type="ndarray")
     a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
     return np.concatenate([a, b]), np.concatenate([b, a])
+
+
+def in_front(nodes: NodeTable, target: IntArray, source: IntArray, lateral: float, slope: float) -> IntArray:
+    """Which of the pairs have the source ahead of the target, and off by at most `lateral` m and `slope` m a metre."""
+    c, s, (x, y) = np.cos(nodes.heading), np.sin(nodes.heading), nodes.position.T
+    dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
+    ahead = dx * c + dy * s
+    return np.flatnonzero((ahead > 0) & (np.abs(dy * c - dx * s) <= lateral + slope * ahead))
 
 
 def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:

@@ -41,12 +41,14 @@ def relinked(
     position  (n, 2) of the tracks at the time of the frame, local, m; P (n, 2, 2) their covariances
     """
     rows = initiating(state, measurements, matching)
+    if len(rows) == 0:
+        return matching
     free = relinkable(state)
     free[matching.track] = False
     tracks, label = np.flatnonzero(free), measurements.boxes.label[rows]
-    if len(rows) == 0 or len(tracks) == 0:
-        return matching
     i, j = np.nonzero(state.table.label[tracks][:, None] == label)
+    if len(i) == 0:
+        return matching
     t, d, others = tracks[i], rows[j], (label[:, None] == label).sum(axis=1)[j]
     z, R = measurements.boxes.position[d, :2] - state.origin, measurements.R[d, :2, :2]
     moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R

@@ -87,9 +87,13 @@ def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, surer: BoolArray
     """(n, m) bird's-eye IoU of boxes (n) with others (m) of their class that are `surer` (n, m); 0 elsewhere."""
     result = np.zeros((len(boxes), len(others)))
     row, column = touching_pairs(boxes, others)
+    kept = surer[row, column]
+    row, column = row[kept], column[kept]
+    if len(row) == 0:
+        return result
     (classes, of_box), (their_classes, of_other) = distinct(boxes.label), distinct(others.label)
     same = state.class_groups.same_group(np.array(classes), np.array(their_classes))
-    kept = surer[row, column] & same[of_box[row], of_other[column]]
+    kept = same[of_box[row], of_other[column]]
     row, column = row[kept], column[kept]
     result[row, column] = paired_bev_iou(boxes.select(row), others.select(column))
     return result

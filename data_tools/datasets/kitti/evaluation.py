@@ -22,10 +22,13 @@ from data_tools.metrics import (
     KittiTrackingMetrics,
     KittiTrackingSequence,
     LabelErrors,
+    SceneBoxes,
+    WholeTracks,
     kitti_hota_metrics,
     kitti_tracking_metrics,
     label_errors,
     label_velocities,
+    whole_tracks,
 )
 from saga_fg.numerics.arrays import FloatArray
 
@@ -67,6 +70,12 @@ def evaluate_kitti(
         kitti_table("KITTI 3D tracking metrics, in %", tracking),
         {"sequences": tuple(scored), "per_class": tracking},
         LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
+        WholeTracks.concatenate(
+            [
+                whole_tracks(_of_classes(each.truth, classes), _of_classes(each.found, classes))
+                for each in scored.values()
+            ]
+        ),
         kitti_hota(pairs, best) if with_hota else (),
         innovations or {},
     )
@@ -74,9 +83,13 @@ def evaluate_kitti(
 
 def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str]) -> LabelErrors:
     """The errors at the labels of the classes in one sequence: those that a detection matches, if there are any."""
-    truth = scored.truth.select(np.flatnonzero(np.isin(scored.truth.boxes.label, classes)))
+    truth = _of_classes(scored.truth, classes)
     velocity = label_velocities(truth, scored.scene.timestamps, REACH)
     return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if scored.scene.frames else None)
+
+
+def _of_classes(table: SceneBoxes, classes: Sequence[str]) -> SceneBoxes:
+    return table.select(np.isin(table.boxes.label, classes))
 
 
 def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[str, float]) -> list[HotaRow]:
