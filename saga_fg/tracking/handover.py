@@ -6,10 +6,11 @@ r"""Hand over: a new track proves to be the return of an object that has a track
 
 A return that begins with a weak detection, or far from where it was expected, initiates a track
 (`saga_fg.tracking.relinking`). With each further detection of the new track the question is asked again, with all its
-detections: what they say about the object is its filtered state (' above) divided by its prior. That is a velocity
-of covariance V, a probability p to be stationary, and a position anywhere in the area. Of V counts the peak, so that no
-odd velocity speaks for a re-link. The other symbols are those of `saga_fg.tracking.relinking`: r is the existence of the old track at its
-latest detection, N(m, P) its state, s its probability to be stationary, N(a, D) its place if it is.
+detections: what they say about the object is its filtered state (' above) divided by its prior. That is a velocity of
+covariance V, a probability p to be stationary, and a position anywhere in the area. Of the velocity's prior its peak
+counts, so that no odd velocity speaks for a re-link. The other symbols are those of `saga_fg.tracking.relinking`: r is
+the existence of the old track at its latest detection, N(m, P) its state, s its probability to be stationary, N(a, D)
+its place if it is.
 
 The old track is then updated with the state of the new one, as with a measurement of position and velocity, and the
 new one is marginalised. Only a track that has been detected up to `confirming_detections` times hands over, is
