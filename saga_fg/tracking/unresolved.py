@@ -33,7 +33,7 @@ from saga_fg.types.overlap import paired_bev_iou, touching_pairs
 OVERLAP = 0.05  # bird's-eye IoU above which a new track is unresolved
 MOST_OVERLAP = 0.2  # largest one of two objects
 PRECISE = 0.75  # standard deviation of a position, in widths of its box, up to which overlap tells anything
-FRAMES = 2.0  # frames at the start: a box that is clear of the other three times in all is hardly a second one by chance
+FRAMES = 2.0  # frames at the start: a box clear of the other three times in all is hardly a second one by chance
 ALONE = 2.0  # frames for a miss: an object is missed less often than a second box, so a miss tells more
 MOST_FRAMES = 6.0  # frames at most: who walked off counts after so many, whatever was before
 
