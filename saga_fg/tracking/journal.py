@@ -173,7 +173,7 @@ class Journal:
             out_of_view = float(last.timestamp - last.table.last_in_view[row])
             existence = float(last.table.existence[row])
             if coasting > of_class.max_coasting:
-                reason = f"not detected for longer than {of_class.max_coasting:g} s"
+                reason = f"not detected for longer than {of_class.max_coasting:g} s, nor likely to be found again"
             elif out_of_view > settings.max_out_of_view:
                 reason = f"outside every sensor's view for longer than {settings.max_out_of_view:g} s"
             elif existence < settings.existence.delete_below:

@@ -21,7 +21,7 @@ from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
 
-LEAST_TURN = 0.01  # rad/s; less is straight on
+LEAST_TURN = 0.01  # rad/s; less is straight on: 0.2 m aside in 2 s at 10 m/s, within the noise of a detection
 MOST_STEPS = 100  # that an interval is predicted in
 
 

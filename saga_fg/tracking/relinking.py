@@ -1,7 +1,7 @@
 r"""Re-link: a detection that would initiate a track may be the return of an object that has a track already.
 
     odds_ij = r_i e^(-T_i / lifetime) ( (1 - s_i) N(z_j; m_i, P_i + R_j) + s_i N(z_j; a_i, D_i + R_j) ) / density
-    density = (number of detections of the class that would initiate tracks) / area
+    density = (number of detections of the class, or its group, that would initiate tracks) / area
 
 are the odds that detection j is track i, not detected for T_i s, against its being one of the others, anywhere in the
 area. N(m, P) is the state in the joint filter, so that neighbours that are still detected count; s is the probability
@@ -30,7 +30,7 @@ from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pa
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.tracker_state import TrackerState
 
-NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite
+NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
 
 
 def relinked(
@@ -46,10 +46,10 @@ def relinked(
     free = relinkable(state)
     free[matching.track] = False
     tracks, label = np.flatnonzero(free), measurements.boxes.label[rows]
-    i, j = np.nonzero(state.table.label[tracks][:, None] == label)
+    i, j = np.nonzero(state.class_groups.same_group(state.table.label[tracks], label))
     if len(i) == 0:
         return matching
-    t, d, others = tracks[i], rows[j], (label[:, None] == label).sum(axis=1)[j]
+    t, d, others = tracks[i], rows[j], state.class_groups.same_group(label, label).sum(axis=1)[j]
     z, R = measurements.boxes.position[d, :2] - state.origin, measurements.R[d, :2, :2]
     moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
     still = _log_density(z - state.table.stationarity.position[t], S)

@@ -135,6 +135,11 @@ class AssociationSettings(Settings):
         "well enough to re-link it, s; usual 3 to 10; higher: longer occlusions, more tracks",
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.relink_above == 0:
+            raise InputError("relink_above: expected a probability above 0, since every pair has one of 0 and more")
+
 
 @dataclass(frozen=True)
 class ExistenceSettings(Settings):

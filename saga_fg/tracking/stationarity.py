@@ -35,7 +35,7 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.settings import Fraction, NonNegative, Settings, setting
 from saga_fg.tracking.kinematics import Kinematics
 
-HALTING_SPEED = 1.0  # m/s, scale of the speeds from which an object comes to rest at once
+HALTING_SPEED = 1.0  # m/s, scale of the speeds from which an object comes to rest at once: walking, or the last metre
 _MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
 
 

@@ -1,7 +1,9 @@
 r"""Turn rates of tracks from their measured headings, each estimated by itself beside the joint state.
 
     h' = h + w tau (1 - exp(-dt / tau)),   w' = w exp(-dt / tau) + noise of the stationary deviation sigma
-    heading z = h + v,   v ~ N(0, max(r^2, (z - h)^2 / 4))           outliers beyond 2 r count less
+    heading z = h + v,   v ~ N(0, r^2),   S = max(P_h + r^2, (z - h)^2 / 4)
+
+S is the variance of the innovation z - h; beyond twice its expected deviation a heading is an outlier and counts less.
 
 A heading may be off by half a turn, and is turned to the side of the estimate. Most objects go straight most of the
 time, while w is noise. So what is predicted with is the mean of w under the prior that a share of objects turns:
@@ -22,10 +24,12 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
 
-DEVIATION = 0.15  # stationary standard deviation of a turn rate, rad/s
-TURNING_SHARE, TURNING, STRAIGHT = 0.1, 0.3, 0.01  # share of objects that turn, rad/s: their rates, and those of others
-_LEAST_TIME = 1e-3  # s
-OUTLIER = 2.0  # standard deviations of a heading
+DEVIATION = 0.15  # rad/s, stationary standard deviation of a rate: a bend of 50 m at 7 m/s
+TURNING_SHARE = 0.1  # share of objects that turn: most roads are straight, and most that turn do so briefly
+TURNING = 0.3  # rad/s, deviation of their rates: a crossing is a quarter turn in some 5 s
+STRAIGHT = 0.01  # rad/s, deviation of the others' rates: corrections within the lane
+_LEAST_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
+OUTLIER = 2.0  # standard deviations of an innovation, which 95 % of good headings don't exceed
 
 
 @dataclass(eq=False)
@@ -67,6 +71,7 @@ class TurnRate(Columns):
         rows, yaw, variance = rows[measured], yaw[measured], yaw_noise[measured] ** 2
         new = ~np.isfinite(self.heading[rows])
         self.heading[rows[new]], self.P[rows[new], 0, 0] = yaw[new], variance[new]
+        self.P[rows[new], 0, 1] = self.P[rows[new], 1, 0] = 0.0
         rows, yaw, variance = rows[~new], yaw[~new], variance[~new]
         innovation = wrap_angle(2 * (yaw - self.heading[rows])) / 2
         P = self.P[rows]

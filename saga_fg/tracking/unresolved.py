@@ -3,13 +3,18 @@
 Detectors report one object as two or three boxes, above all in crowds and rows of parked ones. Two objects of a class
 hardly ever overlap: of labelled cars on nuScenes 0.1 % have a bird's-eye IoU above 0.02 with another one, of
 pedestrians 5 % one above 0.05 and 0.1 % one above 0.2. A new track that overlaps a surer one by more than `OVERLAP` is
-therefore unresolved, that is tentative, until the frames that speak for an object of its own outnumber the others:
+therefore unresolved, that is tentative. A number of frames is left until it counts as an object of its own: `FRAMES` at
+its start, at most `MOST_FRAMES`, and resolved at 0. Each frame changes it:
 
-    detected clear of all surer tracks, or beside one that is detected too, overlapping by `MOST_OVERLAP` at most   - 1
-    missed, where the surer track that it overlaps is detected                                                  + ALONE
+    the track                                                         surer tracks that it overlaps   frames left
+    detected, overlap with every surer track at most `OVERLAP`        any                             - 1
+    detected, largest overlap between `OVERLAP` and `MOST_OVERLAP`    one of them is detected         - 1
+    detected, otherwise                                               any                             unchanged
+    missed                                                            one of them is detected         + `ALONE`
+    missed                                                            none is detected                unchanged
 
-It starts with `FRAMES` to go. Meanwhile its detections don't raise its existence, and while it overlaps a confirmed
-track it is matched to what the other tracks leave, so that it can't take their detections.
+Until it is resolved its detections don't raise its existence, and while it overlaps a confirmed track it is matched to
+what the other tracks leave, so that it can't take their detections.
 
 A surer track is one of at least its existence that is not unresolved itself. Boxes of unknown size or heading overlap
 nothing, and where the positions of a sensor are uncertain by most of the box's width, overlap tells nothing.
@@ -28,9 +33,9 @@ from saga_fg.types.overlap import paired_bev_iou, touching_pairs
 OVERLAP = 0.05  # bird's-eye IoU above which a new track is unresolved
 MOST_OVERLAP = 0.2  # largest one of two objects
 PRECISE = 0.75  # standard deviation of a position, in widths of its box, up to which overlap tells anything
-FRAMES = 2.0
-ALONE = 2.0
-MOST_FRAMES = 6.0
+FRAMES = 2.0  # frames at the start: a box clear of the other three times in all is hardly a second one by chance
+ALONE = 2.0  # frames for a miss: an object is missed less often than a second box, so a miss tells more
+MOST_FRAMES = 6.0  # frames at most: who walked off counts after so many, whatever was before
 
 
 def unresolved_frames(

@@ -17,11 +17,11 @@ def saga_fg(*arguments: str | Path) -> Result:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two cars in two scenes; the second one of scene b hides after a second."""
+    """Two cars in two scenes; the second one of scene b hides after a second, for longer than tracks are remembered."""
     folder = tmp_path_factory.mktemp("explain")
     lines = ["scene,timestamp,label,x,y,score"]
     for scene in "ab":
-        for k in range(30):
+        for k in range(80):
             lines.append(f"{scene},{k / 10},car,{k / 2},0.0,0.9")
             if scene == "a" or k < 10:
                 lines.append(f"{scene},{k / 10},car,{k / 2 - 8},0.0,0.9")
@@ -111,7 +111,7 @@ def test_the_running_graph_is_drawn(folder: Path, tmp_path: Path) -> None:
         (("--graph", "--output", "g.png"), "--scene: expected one of those with graphs, a, b"),
         (
             ("--graph", "--output", "g.png", "--scene", "a", "--time", "9"),
-            "expected 0 to 2.90 s after",
+            "expected 0 to 7.90 s after",
         ),
         (("--graph", "--output", "g.png", "--scene", "a", "--track", "9"), "--track 9: expected a track that is there"),
         ((), "expected --track, or --graph"),

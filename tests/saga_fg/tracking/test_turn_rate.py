@@ -77,6 +77,29 @@ def test_without_headings_nothing_is_known():
     assert turn.heading.item() == pytest.approx(0.5)
 
 
+def test_a_first_heading_after_a_while_leaves_a_covariance():
+    turn = TurnRate.initiated(np.array([np.nan]), np.array([np.pi]))
+    turn.predict(1.0, np.array([2.0]))
+    for k in range(20):
+        turn.update(np.array([0]), np.array([RATE * k * DT]), np.array([0.03]))
+        assert np.linalg.eigvalsh(turn.P[0]).min() > 0
+        assert abs(turn.known().item()) < 2 * RATE
+        turn.predict(DT, np.array([2.0]))
+    assert turn.rate.item() == pytest.approx(RATE, abs=0.08)
+
+
+def test_beyond_two_deviations_of_its_innovation_a_heading_counts_less():
+    turn = estimated(np.zeros(20))
+    S = turn.P[0, 0, 0] + 0.03**2
+    gains = []
+    for off in (1.9, 4.0):
+        after = TurnRate(turn.heading.copy(), turn.rate.copy(), turn.P.copy())
+        after.update(np.array([0]), turn.heading + off * np.sqrt(S), np.array([0.03]))
+        gains.append((after.heading - turn.heading).item() / (off * np.sqrt(S)))
+    assert gains[0] == pytest.approx(turn.P[0, 0, 0] / S)
+    assert gains[1] == pytest.approx(gains[0] / 4)
+
+
 def circle(t):
     """Position and heading at times t on a circle."""
     return SPEED / RATE * np.array([np.sin(RATE * t), 1 - np.cos(RATE * t)]), RATE * t

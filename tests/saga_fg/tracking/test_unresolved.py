@@ -5,7 +5,7 @@ import pytest
 
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import AssociationSettings, ClassSettings, unresolved
+from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, unresolved
 from saga_fg.tracking.stationarity import StationaritySettings
 from tests.saga_fg.traffic_frames import NAN, run
 
@@ -104,6 +104,19 @@ def test_a_second_box_is_matched_to_what_the_others_leave():
     tracks = tracker.step(crowd_frame(1.1, [(0.4, 0.0)], 0.7))  # nearer to the second one
     assert tracker.assignment.id.tolist() == [1]
     assert dict(zip(tracks.id.tolist(), tracks.coasting.tolist(), strict=True))[2] == pytest.approx(0.1)
+
+
+def test_a_miss_counts_against_a_track_where_the_surer_one_is_detected():
+    tracker = Tracker(settings(existence=ExistenceSettings(delete_below=0.0)))
+    run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(10)])
+    tracker.step(crowd_frame(1.0, [(0.0, 0.0), (0.7, 0.0)], 0.6))
+    left = []
+    for k, seen in enumerate(([(0.0, 0.0)], [(0.0, 0.0)], [(0.0, 0.0)], [], [(0.0, 0.0), (0.7, 0.0)])):
+        tracker.step(crowd_frame(1.1 + 0.1 * k, seen, 0.6))
+        left.append(tracker._state.table.unresolved.tolist())
+    alone, most = unresolved.ALONE, unresolved.MOST_FRAMES
+    expected = [unresolved.FRAMES + alone, most, most, most, most - 1]
+    assert left == [[0.0, frames] for frames in expected]
 
 
 def test_where_positions_are_rough_overlap_tells_nothing():
