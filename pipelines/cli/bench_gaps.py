@@ -97,7 +97,7 @@ def gaps(
 
     Real gaps: a labelled object has no detection for 1 to 6 s, and then again. Made gaps: the detections of one object
     are taken away for 1, 2, 3 or 5 s, while all others stay. Every contender tracks the same detections. A track that
-    is lost counts with an error of 10 m. Intervals are paired bootstraps over recordings.
+    is not known counts with an error of 10 m. Intervals are paired bootstraps over recordings, of 3 at least.
 
     \b
     Examples:
@@ -112,19 +112,28 @@ def gaps(
     from pipelines.bench.gaps.fitted import bench_splits, splits_of
     from pipelines.bench.gaps.picture import write_telling_picture
     from pipelines.bench.gaps.plot import write_plot
-    from pipelines.bench.gaps.sources import RecordingSource, set_names
+    from pipelines.bench.gaps.sources import KNOWN, RecordingSource, set_names
     from pipelines.bench.gaps.tables import figures, tables
     from pipelines.config import load_config
 
-    sources = [
-        RecordingSource(name, data, scenes, labels) for name in (names("--sets", sets) if sets else set_names(data))
-    ]
+    chosen = names("--sets", sets) if sets else set_names(data)
+    for name in chosen:
+        if name not in KNOWN:
+            raise InputError(f"--sets: {unknown_name('set', name, KNOWN)}")
+    sources = [RecordingSource(name, data, scenes, labels) for name in chosen]
     taught, judged = (names(option, value) if value else () for option, value in (("--train", train), ("--test", test)))
     recordings = {source.name: _recordings(source) for source in sources}
     _check_names(recordings, taught, judged)
     if taught and folds is not None:
         raise InputError("--folds: goes without --train")
     splits = {name: splits_of(found, taught, judged, folds) for name, found in recordings.items()}
+    for name, split in splits.items():
+        if not split and (sets or not any(splits.values())):
+            raise InputError(
+                f"set {name}: expected recordings to judge, {'none is in --test' if judged else 'all are in --train'}"
+            )
+    if plot is not None and passes == 0:
+        raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
     settings = GapBenchSettings(passes, LIVES if life == "both" else (life,))
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
@@ -136,11 +145,13 @@ def gaps(
             if splits[source.name]:
                 found = bench_splits(source, splits[source.name], compared, base, settings, workers, progress)
                 runs[source.name] = found
+    if not any(run.gaps for found in runs.values() for run in found):
+        raise InputError("expected recordings with gaps, there is none: longer ones are needed, or more --passes")
     shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class)]
     report(shown, {name: figures(found, against) for name, found in runs.items()}, json_file, markdown)
     if plot is not None:
         write_plot(plot, runs, against)
-    if picture is not None and runs:
+    if picture is not None:
         source = next(each for each in sources if each.name in runs)
         compared = _contenders(contenders, own or [], interactions, load_config(source.family, config))
         better = next((each for each in compared if each.name != against), compared[0])

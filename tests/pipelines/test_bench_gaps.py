@@ -112,7 +112,7 @@ def test_an_identity_is_kept_where_the_same_track_goes_on() -> None:
     off = [x + (1.5 if k in HIDDEN else 0.0) for k, x in enumerate(straight())]
     judged = JudgedRun(drawn, tracks({"7": off}, {"7": SEEN}))
     outcome = judged.outcome(gap)
-    assert (outcome.held, outcome.kept, outcome.lost) == (True, True, False)
+    assert (outcome.held, outcome.kept, outcome.reported) == (True, True, True)
     assert outcome.error == pytest.approx(1.5)
     assert outcome.at == pytest.approx({1.0: 1.5, 2.0: 1.5})
     assert judged.links() == Links(right=1)
@@ -124,11 +124,11 @@ def test_a_track_that_ends_is_lost_and_costs_the_cap() -> None:
     places = {"7": without(straight(), range(6, 16)), "8": without(straight(), range(9))}
     judged = JudgedRun(drawn, tracks(places, {"7": SEEN, "8": SEEN}))
     outcome = judged.outcome(gap)
-    assert (outcome.held, outcome.kept, outcome.lost) == (True, False, True)
+    assert (outcome.held, outcome.kept, outcome.reported) == (True, False, False)
     assert outcome.error == pytest.approx(3 * CAP / 4), "still there at the first of four moments"
     assert judged.links() == Links()
     nobody = JudgedRun(drawn, tracks({}, {})).outcome(gap)
-    assert (nobody.held, nobody.kept, nobody.lost, nobody.error) == (False, False, True, CAP)
+    assert (nobody.held, nobody.kept, nobody.reported, nobody.error) == (False, False, False, CAP)
 
 
 def test_a_track_that_stays_beside_the_one_that_takes_the_detections_keeps_no_identity() -> None:
@@ -255,10 +255,10 @@ def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     kept, shipped = (run_of(drawn, gaps, kf, life) for life in ("kept", "shipped"))
     assert kept.outcomes[0].error < 0.5
     assert kept.outcomes[0].kept
-    assert shipped.outcomes[0].lost
+    assert not shipped.outcomes[0].reported
     rows = {(f.life, f.contender): f for f in gap_figures([kept, shipped], "kf")}
     assert rows["kept", "kf"].kept.estimate == 1.0
-    assert rows["shipped", "kf"].lost == 1.0
+    assert rows["shipped", "kf"].reported == 0.0
     assert [each.right for each in link_figures([kept, shipped])] == [1, 1]  # the second one is re-linked
 
 
@@ -327,7 +327,7 @@ def test_contenders_are_judged_on_the_same_gaps() -> None:
     for ours, theirs in zip(figures[::2], figures[1::2], strict=True):
         assert (ours.contender, theirs.contender) == ("saga", "kf")
         assert (ours.gaps, ours.group, ours.length) == (theirs.gaps, theirs.group, theirs.length)
-        if ours.error_change is not None and ours.places:
+        if ours.error_change is not None and ours.measured:
             assert ours.error_change.estimate == pytest.approx(ours.error.estimate / theirs.error.estimate - 1)
 
 
@@ -356,6 +356,9 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
         (["--against", "turn", "--contenders", "saga,kf"], "--against: unknown contender"),
         (["--test", "scene-0099"], "--test: unknown recording"),
         (["--train", "scene-0001", "--test", "scene-0001"], "in one of them only"),
+        (["--train", "scene-0001", "--plot", "gaps.png"], "set simulated: expected recordings to judge"),
+        (["--passes", "0", "--plot", "gaps.png"], "--plot: expected --passes of 1 or more"),
+        (["--sets", "foo"], "megvii, centerpoint, camera, kitti, simulated, ngsim, openacc, argoverse2, eth_ucy"),
     ],
 )
 def test_the_command_refuses(arguments: list[str], message: str) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from multiprocessing import get_context
 
@@ -18,6 +18,7 @@ from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.variants import Variant
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
+from saga_fg.model.sensor import Sensor
 from saga_fg.types.frame import Frame
 
 
@@ -96,31 +97,25 @@ def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
         yield from pool.map(_perform, jobs)
 
 
+@dataclass(frozen=True)
+class _Preparation:
+    """What the gaps of a recording depend on; sensors place detections alike for all contenders."""
+
+    source: RecordingSource
+    recording: str
+    settings: GapBenchSettings
+    sensors: Mapping[str, Sensor] = field(compare=False)
+
+
 def _perform(job: _Job) -> list[Run]:
-    key = (job.source, job.recording, job.settings)
-    labelled, gaps = _prepared(*key, _Base(job.contender.config))
+    labelled, gaps = _prepared(_Preparation(job.source, job.recording, job.settings, job.contender.config.sensors))
     return [run_of(labelled, gaps, job.contender, life) for life in job.settings.lives]
 
 
-class _Base:
-    """A configuration that is no part of a key: sensors place detections alike for all contenders."""
-
-    def __init__(self, config: TrackConfig) -> None:
-        self.config = config
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Base)
-
-    def __hash__(self) -> int:
-        return 0
-
-
 @lru_cache(maxsize=1)
-def _prepared(
-    source: RecordingSource, recording: str, settings: GapBenchSettings, base: _Base
-) -> tuple[LabelledScene, list[Gap]]:
-    labelled = LabelledScene.of(source.scene(recording), base.config.sensors)
-    return labelled, [*real_gaps(labelled), *made_gaps(labelled, settings.passes, settings.seed)]
+def _prepared(of: _Preparation) -> tuple[LabelledScene, list[Gap]]:
+    labelled = LabelledScene.of(of.source.scene(of.recording), of.sensors)
+    return labelled, [*real_gaps(labelled), *made_gaps(labelled, of.settings.passes, of.settings.seed)]
 
 
 def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> Run:

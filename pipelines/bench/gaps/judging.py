@@ -4,7 +4,7 @@ Labels and tracks that were detected at the moment are matched one to one (`data
 *held* by the track it was matched to last, at most `SETTLING` s ago.
 
 kept      the track that holds the object `SETTLING` s after the gap is the one that held it before
-error     distance of that track, while it is not detected, to the label, m; `CAP` where it is lost or farther away
+error     distance of that track, while it is not detected, to the label, m; `CAP` where it is not known or farther away
 link      a track that is detected again after `SHORTEST` s or more; it is right if it holds the object it held before,
           false if it holds another, unknown if it holds none before or after
 """
@@ -37,14 +37,14 @@ class GapOutcome:
     """What became of one object in its gap.
 
     held, kept   whether a track had it before, and whether that track has it after
-    lost         whether that track is not known at the last moment of the gap, or there was none
+    reported     whether that track is among the results at the last moment of the gap
     error        mean over the gap, m
     at           error at the end of each length that the gap reaches, m
     """
 
     held: bool
     kept: bool
-    lost: bool
+    reported: bool
     error: float
     at: Mapping[float, float]
 
@@ -85,14 +85,14 @@ class JudgedRun:
         after = self._last(self._track_of, name, gap.stop, back=False)
         if before is None:
             at = dict.fromkeys(self._lengths(gap), CAP)
-            return GapOutcome(False, False, True, CAP, at)
+            return GapOutcome(False, False, False, CAP, at)
         moments = range(gap.start + 1, gap.stop)
         errors = np.array([self._error(before, gap.row, k) for k in moments])
-        lost = self._position(before, gap.stop - 1) is None
+        reported = before in self._row_of[gap.stop - 1]
         at = {length: float(errors[k - gap.start - 1]) for length, k in self._lengths(gap).items()}
         known = errors[np.isfinite(errors)]
         mean = float(known.mean()) if len(known) else float("nan")
-        return GapOutcome(True, after == before, lost, mean, {h: e for h, e in at.items() if np.isfinite(e)})
+        return GapOutcome(True, after == before, reported, mean, {h: e for h, e in at.items() if np.isfinite(e)})
 
     def holders(self, gap: Gap) -> list[int | None]:
         """The detected track of the object of a gap at each moment, None where there is none."""

@@ -20,7 +20,8 @@ FEWEST = 3  # gaps of a point
 def gap_plot(runs: Mapping[str, Sequence[Run]], reference: str) -> Any:
     """A matplotlib `Figure`: for each set a column for moving and for stationary objects.
 
-    Bands are 95 % intervals over recordings. Drawn are tracks that are kept alive, if these were run.
+    Bands are 95 % intervals over recordings, where there is one. Points of fewer than `FEWEST` gaps are left out.
+    Drawn are tracks that are kept alive, if these were run.
     """
     from matplotlib.figure import Figure
 
@@ -47,6 +48,7 @@ def gap_plot(runs: Mapping[str, Sequence[Run]], reference: str) -> Any:
     handles = {label: line for ax in axes[0] for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     if handles:
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    figure.suptitle(f"Made gaps. Points of fewer than {FEWEST} gaps are left out.", fontsize=9)
     return figure
 
 
@@ -54,7 +56,7 @@ def _line(ax: Any, figures: Sequence[GapFigure], row: str, colour: str, label: s
     of = {
         f.length: f.error if row == "error" else f.kept
         for f in figures
-        if (f.places if row == "error" else f.gaps) >= FEWEST
+        if (f.measured if row == "error" else f.gaps) >= FEWEST
     }
     if not of:
         return

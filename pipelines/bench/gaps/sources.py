@@ -11,12 +11,14 @@ from typing import Any
 
 from data_tools.datasets.annotated import detected
 from data_tools.datasets.registry import dataset_source
-from pipelines.bench.recordings import SETS, RecordingSet, recording_set
+from pipelines.bench.recordings import SETS, TRAFFIC_SETS, RecordingSet, recording_set
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 
 ANNOTATED = {"argoverse2": "av2", "eth_ucy": "eth_ucy"}
 """Data sets whose detections are their visible annotations, and their folders in that of --data."""
+KNOWN = (*SETS, "simulated", *TRAFFIC_SETS, *ANNOTATED)
+"""All sets."""
 
 
 @dataclass(frozen=True)

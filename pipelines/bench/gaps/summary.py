@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -18,6 +18,7 @@ from pipelines.bench.gaps.judging import GapOutcome
 from saga_fg.numerics.arrays import FloatArray
 
 FEWEST = 10  # gaps of a class that has rows of its own
+FEWEST_RECORDINGS, FEWEST_GAPS = 3, 5  # of an interval
 Kind = Literal["real", "made"]
 KINDS: tuple[Kind, ...] = ("real", "made")
 Selection = Callable[[Gap, str], bool]
@@ -28,12 +29,14 @@ Value = Callable[[GapOutcome], float]
 class GapFigure:
     """One contender on gaps of one kind and group. Changes are against the reference, None for itself.
 
+    Intervals of fewer than `FEWEST_RECORDINGS` recordings or `FEWEST_GAPS` gaps are NaN.
+
     moving, label of the objects; label: None for all classes
     length        of made gaps, s; None for real ones
     gaps          that decide about identity; of made gaps, those of this length
     kept          share whose identity is kept; kept_change: difference of shares
-    lost          share whose track is not known at the end of the gap
-    places        gaps that have an error; made ones that reach the length
+    reported      share whose track is among the results at the last moment of the gap
+    measured      gaps that have an error; made ones of this length or longer
     error         mean, m: over real gaps, or at the end of the length; error_change: relative
     median        of the same errors, m
     """
@@ -47,8 +50,8 @@ class GapFigure:
     gaps: int
     kept: Interval
     kept_change: Interval | None
-    lost: float
-    places: int
+    reported: float
+    measured: int
     error: Interval
     error_change: Interval | None
     median: float
@@ -137,7 +140,7 @@ def _figure(runs: Sequence[Run], base: Sequence[Run], life: Life, group: _Group)
         return group.has(gap, label) and group.length in (None, gap.length)
 
     kept = _values(runs, of_length, lambda outcome: outcome.kept)
-    lost = _values(runs, of_length, lambda outcome: outcome.lost)
+    reported = _values(runs, of_length, lambda outcome: outcome.reported)
     errors = _values(runs, group.has, group.error)
     changes: list[Interval | None] = [None, None]
     if runs[0].contender != base[0].contender:
@@ -156,7 +159,7 @@ def _figure(runs: Sequence[Run], base: Sequence[Run], life: Life, group: _Group)
         sum(map(len, kept)),
         _interval(kept),
         changes[0],
-        _mean(np.concatenate(lost)),
+        _mean(np.concatenate(reported)),
         len(every),
         _interval(errors),
         changes[1],
@@ -187,7 +190,12 @@ def _compared(ours: Sequence[FloatArray], theirs: Sequence[FloatArray], compare:
         if both.any():
             a.append((mine[both].sum(), both.sum()))
             b.append((other[both].sum(), both.sum()))
-    return paired_bootstrap(np.array(a), np.array(b), ratio_of_sums, compare) if a else None
+    if not a:
+        return None
+    found = paired_bootstrap(np.array(a), np.array(b), ratio_of_sums, compare)
+    if len(a) < FEWEST_RECORDINGS or sum(n for _, n in a) < FEWEST_GAPS:
+        return replace(found, low=float("nan"), high=float("nan"))
+    return found
 
 
 def _interval(values: Sequence[FloatArray]) -> Interval:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from typing import Any
 
-from data_tools.figures import FigureTable, cell, percent
+from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval
 from pipelines.bench.gaps.bench import Run
 from pipelines.bench.gaps.contenders import Life
@@ -50,7 +51,7 @@ def figures(runs: Sequence[Run], reference: str) -> dict[str, Any]:
                 "run": gap.run,
                 "held": outcome.held,
                 "kept": outcome.kept,
-                "lost": outcome.lost,
+                "reported": outcome.reported,
                 "error": outcome.error,
                 "at": outcome.at,
             }
@@ -63,9 +64,11 @@ def figures(runs: Sequence[Run], reference: str) -> dict[str, Any]:
 def _gaps(figures: Sequence[GapFigure], title: str, reference: str) -> FigureTable:
     """A row for each group, length and contender; errors only of tracks that are kept alive."""
     against = f"against {reference}"
-    columns: tuple[str, ...] = ("objects", "contender", "gaps", "identity kept, %", f"{against}, points", "lost, %")
+    columns: tuple[str, ...] = ("objects", "contender", "gaps", "identity kept, %", f"{against}, percentage points")
+    columns += ("reported at the end, %",)
     if figures and figures[0].life == "kept":
-        columns += ("places", "error, m", against, "median, m")
+        counted = "gaps with labels" if figures[0].kind == "real" else "gaps this long or longer"
+        columns += (counted, "error, m", f"{against}, %", "median, m")
     rows = []
     for f in figures:
         length = "" if f.length is None else f", {f.length:g} s"
@@ -74,27 +77,37 @@ def _gaps(figures: Sequence[GapFigure], title: str, reference: str) -> FigureTab
             f.contender,
             str(f.gaps),
             cell(100 * f.kept.estimate, 1),
-            _points(f.kept_change),
+            _change(f.kept_change),
+            cell(100 * f.reported, 1),
+            str(f.measured),
+            cell(f.error.estimate),
+            _change(f.error_change),
+            cell(f.median),
         )
-        row += (cell(100 * f.lost, 1), *_error(f))
-        if f.places:
+        if f.measured:
             rows.append(row[: len(columns)])
     return FigureTable(title, columns, tuple(rows))
 
 
-def _error(f: GapFigure) -> tuple[str, ...]:
-    change = "-" if f.error_change is None else percent(f.error_change)
-    return str(f.places), cell(f.error.estimate), change, cell(f.median)
-
-
-def _points(change: Interval | None) -> str:
+def _change(change: Interval | None) -> str:
+    """In hundredths with the interval, or "(-)" where there is none."""
     if change is None:
         return "-"
     estimate, low, high = (f"{100 * value:+.1f}" for value in (change.estimate, change.low, change.high))
-    return f"{estimate} ({low} to {high})"
+    return f"{estimate} ({low} to {high})" if isfinite(change.low) else f"{estimate} (-)"
 
 
 def _links(links: Sequence[LinkFigure], title: str) -> FigureTable:
-    columns = ("contender", "right", "false", "not of labelled objects", "false, %")
-    rows = [(x.contender, str(x.right), str(x.false), str(x.unknown), cell(100 * x.false_share, 1)) for x in links]
+    columns = ("contender", "links", "right", "false", "of unknown objects", "false, % of right and false")
+    rows = [
+        (
+            x.contender,
+            str(x.right + x.false + x.unknown),
+            str(x.right),
+            str(x.false),
+            str(x.unknown),
+            cell(100 * x.false_share, 1),
+        )
+        for x in links
+    ]
     return FigureTable(title, columns, tuple(rows))
