@@ -94,7 +94,8 @@ def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -
     if before is not None and now.graph is not None and now.timestamp > before.timestamp:
         _interactions(record, before, now, numbers, start)
     if now.running is not None:
-        ours = {one.key: numbers[id_] for id_, one in now.running.of(OBJECT, now.running.epoch).items()}
+        present = now.running.of(OBJECT, now.running.epoch)
+        ours = {one.key: numbers[id_] for id_, one in present.items() if id_ in numbers}  # others were handed over
         record.add(now.running, now.origin, ours)
     elif now.matching is not None and now.measurements is not None:
         for row in now.matching.track.tolist():

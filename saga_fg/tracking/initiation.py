@@ -43,6 +43,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         score=p.copy(),
         covariance_scale=measurements.covariance_scale[rows],
         position_bias=measurements.position_bias[rows],
+        initiated=np.full(k, time),
         last_detected=np.full(k, time),
         last_in_view=np.full(k, state.time),
         confirmed=(p >= state.settings.existence.confirm_above) & (unresolved == 0),
@@ -74,7 +75,7 @@ def initial_kinematics(
     are stationary."""
     boxes, measured = measurements.boxes.select(rows), measurements.with_velocity[rows]
     R, prior = measurements.R[rows], state.settings.stationarity.prior
-    velocity, P_velocity, stationary = _unmeasured_velocity(state, boxes, prior)
+    velocity, P_velocity, stationary = unmeasured_velocity(state, boxes, prior)
     if prior > 0:
         z, R_v = np.nan_to_num(boxes.velocity), R[:, 2:, 2:]
         evidence = log_density(z, R_v) - log_density(z - velocity, P_velocity + R_v)
@@ -88,7 +89,7 @@ def initial_kinematics(
     return kinematics, stationary
 
 
-def _unmeasured_velocity(state: TrackerState, boxes: Boxes, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def unmeasured_velocity(state: TrackerState, boxes: Boxes, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Velocity (k, 2), its covariance (k, 2, 2) and the probability (k,) to be stationary, by class, heading and
     traffic."""
     speed, drift = state.class_values(boxes.label, "initial_speed_deviation", "initial_lateral_speed_deviation")

@@ -40,6 +40,7 @@ class Journal:
         self._groups = ClassGroups(settings.class_groups)
         self._before: TrackerView | None = None  # at the end of the frame before
         self._predicted: TrackerView | None = None
+        self._matched: TrackerView | None = None
         self._effects: list[EdgeEffect] = []
         self._start: float | None = None
 
@@ -49,13 +50,15 @@ class Journal:
             self._predicted = view()
             self._effects = self._edge_effects(self._predicted)
         elif stage == "existence":
-            self._write_matches(view())
+            self._matched = view()
+            self._write_matches(self._matched)
         elif stage == "initiate":
             now = view()
             self._start = now.timestamp if self._start is None else self._start
             graph = graph_of_frame(self._before, now, self._start)
             self._write({"event": "graph", "time": now.timestamp, "sensor": now.sensor, **graph})
             self._before = now
+            self._write_handovers(now)
             self._write_initiations(now)
         elif stage == "delete":
             now = view()
@@ -150,6 +153,15 @@ class Journal:
                 ],
             }
             self._write(event)
+
+    def _write_handovers(self, now: TrackerView) -> None:
+        last = self._matched
+        assert last is not None
+        for row in np.flatnonzero(~np.isin(last.table.id, now.table.id)).tolist():
+            event = self._event("deleted", last, int(last.table.id[row]), row)
+            coasting, existence = 0.0, float(last.table.existence[row])
+            reason = "it is the return of an earlier track"
+            self._write(event | {"coasting": coasting, "existence": existence, "reason": reason})
 
     def _write_deletions(self, now: TrackerView) -> None:
         last, settings = self._before, self._settings

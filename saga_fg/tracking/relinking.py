@@ -53,8 +53,8 @@ def relinked(
     z, R = measurements.boxes.position[d, :2] - state.origin, measurements.R[d, :2, :2]
     moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
     still = _log_density(z - state.table.stationarity.position[t], S)
-    log_odds = _log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / _area(state))
-    chosen = least_total(t, d, _least_log_odds(state) - log_odds)
+    log_odds = log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / area(state))
+    chosen = least_total(t, d, least_log_odds(state) - log_odds)
     t, d = t[chosen], d[chosen]
     distance, _ = mahalanobis_of_pairs(z[chosen] - position[t], P[t] + R[chosen])
     return Matching(
@@ -71,9 +71,9 @@ def relinkable(state: TrackerState) -> BoolArray:
         return np.zeros(len(table), dtype=bool)
     none = np.zeros((len(table), 2))
     peaks = _log_density(none, state.kinematics().P), _log_density(none, table.stationarity.P)
-    log_odds = _log_survival(state) + _mixed(state, np.arange(len(table)), *peaks) + math.log(_area(state))
+    log_odds = log_survival(state) + _mixed(state, np.arange(len(table)), *peaks) + math.log(area(state))
     within = table.coasting(state.time) <= association.relink_within
-    return np.asarray(within & (log_odds >= _least_log_odds(state)))
+    return np.asarray(within & (log_odds >= least_log_odds(state)))
 
 
 def initiating(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
@@ -84,18 +84,19 @@ def initiating(state: TrackerState, measurements: FrameMeasurements, matching: M
     return np.flatnonzero(free & (measurements.probability >= initiation_score))
 
 
-def _area(state: TrackerState) -> float:
+def area(state: TrackerState) -> float:
     """Area over which objects spread, m^2: a sensor's own `clutter_area` says how its false detections do."""
-    area = state.settings.association.clutter_area
-    return area if math.isfinite(area) else NOMINAL_AREA
+    clutter_area = state.settings.association.clutter_area
+    return clutter_area if math.isfinite(clutter_area) else NOMINAL_AREA
 
 
-def _least_log_odds(state: TrackerState) -> float:
+def least_log_odds(state: TrackerState) -> float:
+    """Log-odds from which a track is re-linked."""
     above = state.settings.association.relink_above
     return math.log(above / (1 - above))
 
 
-def _log_survival(state: TrackerState) -> FloatArray:
+def log_survival(state: TrackerState) -> FloatArray:
     """(n,) log of the probability that the track is an object that is still there."""
     table, lifetime = state.table, state.settings.existence.lifetime
     real = np.maximum(table.last_existence, 1e-3)

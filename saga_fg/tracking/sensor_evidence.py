@@ -80,6 +80,14 @@ class SensorEvidence(Columns):
         self.time[missed, at] = self.time[seen, at] = now
         self.hits[seen, at] += 1
 
+    def join(self, rows: IntArray, others: IntArray) -> None:
+        """Add what is known of tracks `others` (k,) to tracks `rows` (k,), which missed all detections of theirs."""
+        newer = self.time[others] > self.time[rows]
+        for column in (self.logit, self.detected, self.time):
+            column[rows] = np.where(newer, column[others], column[rows])
+        self.hits[rows] += self.hits[others]
+        self.opportunities[rows] = np.maximum(self.opportunities[rows], self.hits[rows])
+
     def look(self, sensor: str, visible: BoolArray) -> BoolArray:
         """Note which tracks (n,) a frame of the sensor has in view; return those in view of some sensor's latest frame.
 

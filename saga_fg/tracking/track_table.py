@@ -30,6 +30,7 @@ class TrackTable(Columns):
     score             (n,) probability of its latest detection
     covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
     position_bias     (n,) standard deviation of the position error that all its detections share, m
+    initiated         (n,) time of its first detection
     last_detected     (n,) time of its latest detection
     last_in_view      (n,) time when it was last inside a sensor's field of view
     confirmed         (n,) whether misses no longer delete it
@@ -52,6 +53,7 @@ class TrackTable(Columns):
     score: FloatArray
     covariance_scale: FloatArray
     position_bias: FloatArray
+    initiated: FloatArray
     last_detected: FloatArray
     last_in_view: FloatArray
     confirmed: BoolArray
@@ -73,7 +75,7 @@ class TrackTable(Columns):
         return cls(
             np.empty(0, dtype=np.int64),
             np.empty(0, dtype="<U1"),
-            *(number,) * 7,
+            *(number,) * 8,
             *(truth,) * 2,
             *(number,) * 4,
             np.empty((0, classes)),

@@ -1,7 +1,7 @@
 """The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
     predict (prediction, ego_node) -> measure (measurements, map_nodes) -> associate (association) -> update (update)
-    -> existence (existence) -> initiate (initiation) -> delete (deletion) -> report (reporting)
+    -> existence (existence) -> hand over (handover) -> initiate (initiation) -> delete (deletion) -> report (reporting)
 
 (figure 2 of Sani and Anand, arXiv 2411.03702), in brackets the modules of each stage. Without edge rules this is the
 classical tracker of independent Kalman filters, by the same code.
@@ -28,6 +28,7 @@ from saga_fg.tracking.association import associate
 from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.deletion import delete_tracks
 from saga_fg.tracking.existence import update_existence
+from saga_fg.tracking.handover import hand_over
 from saga_fg.tracking.initiation import initiate_tracks
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
@@ -154,6 +155,7 @@ class Tracker:
         resolve_tracks(state, matching)
         self._notify("existence", state, frame.sensor, measurements, matching)
 
+        matching = hand_over(state, matching)
         rows = initiate_tracks(state, measurements, matching)
         state.joint.ask_providers()
         state.joint.set_frame(None, state.origin)

@@ -1,0 +1,128 @@
+r"""Hand over: a new track proves to be the return of an object that has a track already, and takes its identity.
+
+    odds = r e^(-T / lifetime) (moving + stationary) / density,   density = (new tracks of the class) / area
+    moving     = (1 - s) (1 - s') / (1 - p)  N(m' - m; 0, P + P') / N(0; 0, V)          over position and velocity
+    stationary = s s' / p  N(a' - a; 0, D + D')                                          over position
+
+A return that begins with a weak detection, or far from where it was expected, initiates a track
+(`saga_fg.tracking.relinking`). With each further detection of the new track the question is asked again, with all its
+detections: what they say about the object is its filtered state (' above) divided by its prior. That is a velocity of
+covariance V, a probability p to be stationary, and a position anywhere in the area. Of the velocity's prior its peak
+counts, so that no odd velocity speaks for a re-link. The other symbols are those of `saga_fg.tracking.relinking`: r is
+the existence of the old track at its latest detection, N(m, P) its state, s its probability to be stationary, N(a, D)
+its place if it is.
+
+The old track is then updated with the state of the new one, as with a measurement of position and velocity, and the
+new one is marginalised. Only a track that has been detected up to `confirming_detections` times hands over, is
+resolved (`saga_fg.tracking.unresolved`), and had its first detection after the latest one of the old track.
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.4:
+tests whether two tracks are of one object, and their fusion, errors taken for independent.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from saga_fg.model.interactions import POSITION, VELOCITY
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Matching, least_total
+from saga_fg.tracking.initiation import unmeasured_velocity
+from saga_fg.tracking.relinking import area, least_log_odds, log_survival
+from saga_fg.tracking.tracker_state import TrackerState
+
+
+def hand_over(state: TrackerState, matching: Matching) -> Matching:
+    """Join new tracks to the old ones whose objects they are; returns the matching by the rows that are left."""
+    new, old, others = _candidates(state, matching)
+    if len(new) == 0:
+        return matching
+    moving, still = _log_evidence(state, new, old)
+    evidence = np.logaddexp(moving, still)
+    log_odds = log_survival(state)[old] + evidence + math.log(area(state)) - np.log(others)
+    chosen = least_total(new, old, least_log_odds(state) - log_odds)
+    if len(chosen) == 0:
+        return matching
+    new, old = new[chosen], old[chosen]
+    _join(state, old, new, np.exp(still - evidence)[chosen])
+    row, kept = np.arange(len(state)), np.ones(len(state), dtype=bool)
+    row[new], kept[new] = old, False
+    state.remove(~kept)
+    return Matching((np.cumsum(kept) - 1)[row[matching.track]], matching.detection, matching.distance)
+
+
+def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntArray, IntArray]:
+    """Pairs of rows (k,): new tracks just detected, and old ones of their class; the number (k,) of such new tracks."""
+    table, settings = state.table, state.settings
+    resolved, detected = table.unresolved == 0, np.zeros(len(table), dtype=bool)
+    detected[matching.track] = settings.association.relink_above < 1
+    detections = table.sensors.hits.sum(axis=1)
+    new = np.flatnonzero(detected & resolved & (detections > 1) & (detections <= settings.confirming_detections))
+    if len(new) == 0:
+        return new, new, new
+    old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.association.relink_within))
+    others = (table.label[new][:, None] == table.label[new]).sum(axis=1)
+    possible = table.label[new][:, None] == table.label[old]
+    i, j = np.nonzero(possible & (table.last_detected[old] < table.initiated[new][:, None]))
+    return new[i], old[j], others[i]
+
+
+def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
+    """(k,) logs of `moving` and `stationary`, see the module."""
+    table, stationarity = state.table, state.table.stationarity
+    now = state.kinematics()
+    boxes, prior = state.boxes(now.position, now.velocity).select(new), state.settings.stationarity.prior
+    _, V_0, p = unmeasured_velocity(state, boxes, prior)
+    p = np.clip(p, 1e-9, 1 - 1e-9)
+    s, s_new = (np.clip(stationarity.probability[rows], 0.0, 1 - 1e-9) for rows in (old, new))
+    moving = np.log1p(-s) + np.log1p(-s_new) - np.log1p(-p)
+    for node_type, rows in state.joint.rows_by_type(table.label[new]):
+        H = node_type.selector(POSITION + VELOCITY if node_type.has(VELOCITY) else POSITION)
+        estimator, ids, ids_new = state.joint.estimator, table.id[old[rows]], table.id[new[rows]]
+        P, S = H @ estimator.covariance(ids) @ H.T, H @ estimator.covariance(ids_new) @ H.T
+        moving[rows] += _log_density((estimator.mean(ids_new) - estimator.mean(ids)) @ H.T, P + S)
+        if node_type.has(VELOCITY):
+            moving[rows] -= _log_density(np.zeros((len(rows), 2)), V_0[rows])
+    apart = stationarity.position[new] - stationarity.position[old]
+    still = _log_density(apart, stationarity.P[old] + stationarity.P[new])
+    with np.errstate(divide="ignore"):
+        return moving, np.asarray(np.log(s) + np.log(s_new) - np.log(p) + still)
+
+
+def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:
+    """Update tracks `old` (k,) with all that is known of tracks `new` (k,); stationary (k,): then, the probability."""
+    table, joint, box, groups = state.table, state.joint, state.table.box, state.class_groups
+    if state.settings.stationarity.prior > 0:
+        place, P = table.stationarity.position[new], np.tile(np.eye(4), (len(new), 1, 1))
+        P[:, :2, :2] = table.stationarity.P[new]
+        z, without_velocity = np.concatenate([place, 0 * place], axis=1), np.zeros(len(new), dtype=bool)
+        table.stationarity.update(old, z, P, state.kinematics().select(old), without_velocity)
+        table.stationarity.probability[old] = stationary
+    for node_type, rows in joint.rows_by_type(table.label[new], moving=True):
+        H = node_type.selector(POSITION + VELOCITY if node_type.has(VELOCITY) else POSITION)
+        ids = table.id[new[rows]]
+        R = H @ joint.estimator.covariance(ids) @ H.T
+        H_of_each = np.broadcast_to(H, (len(rows), *H.shape))
+        z = joint.estimator.mean(ids) @ H.T
+        joint.measure(node_type, table.id[old[rows]], z, H_of_each, (R + np.swapaxes(R, 1, 2)) / 2, 0.0)
+    z_noise, yaw_noise = np.sqrt(box.z_variance[new]), np.sqrt(box.yaw_variance[new])
+    box.update(old, box.size[new], box.size_weight[new], box.z[new], z_noise, box.yaw[new], yaw_noise)
+    table.turn.update(old, table.turn.heading[new], np.sqrt(table.turn.P[new, 0, 0]))
+    if len(groups):
+        table.class_belief[old] = groups.updated(table.class_belief[old], table.class_belief[new])
+    table.sensors.join(old, new)
+    table.hits, table.opportunities = table.sensors.best_hits()
+    for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):
+        column[old] = column[new]
+    table.confirmed[old] |= table.confirmed[new]
+    table.has_moved[old] |= table.has_moved[new]
+    table.existence[old] = np.maximum(table.existence[old], table.existence[new])
+    table.last_existence[old] = table.existence[old]
+
+
+def _log_density(x: FloatArray, S: FloatArray) -> FloatArray:
+    """(k,) log N(x; 0, S) in d dimensions."""
+    d2 = (x * np.linalg.solve(S, x[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.asarray(-0.5 * (d2 + np.linalg.slogdet(2 * math.pi * S)[1]))
