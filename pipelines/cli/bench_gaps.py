@@ -129,9 +129,8 @@ def gaps(
     splits = {name: splits_of(found, taught, judged, folds) for name, found in recordings.items()}
     for name, split in splits.items():
         if not split and (sets or not any(splits.values())):
-            raise InputError(
-                f"set {name}: expected recordings to judge, {'none is in --test' if judged else 'all are in --train'}"
-            )
+            why = "none is in --test" if judged else "all are in --train"
+            raise InputError(f"set {name}: expected recordings to judge, {why}")
     if plot is not None and passes == 0:
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
     settings = GapBenchSettings(passes, LIVES if life == "both" else (life,))

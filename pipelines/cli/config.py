@@ -13,8 +13,8 @@ from saga_fg.errors import InputError
 # Of each kind of settings, those one changes first.
 FIRST = {
     "tracking": (
+        "tracker.min_hits",
         "tracker.estimator",
-        "tracker.existence.report_above",
         "tracker.classes.*.motion",
         "tracker.classes.*.max_coasting",
         "sensors.*.noise.*.position",

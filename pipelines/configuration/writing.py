@@ -37,7 +37,7 @@ _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_./ -]*(?<! )")
 def write_settings(settings: Any, comments: bool = True, selection: Sequence[str] = EVERYTHING) -> str:
     """The YAML text of a settings dataclass; `read_settings(type(settings), text)` gives back an equal one.
 
-    Of a `selection` of dotted keys, only these are written, to be read over the same settings.
+    Of a `selection` of dotted keys, only these are written, values before sections, to be read over the same settings.
     """
     cls = type(settings)
     lines = _section_lines(Section((cls,)), settings, cls(), comments, selection)
@@ -82,6 +82,8 @@ def _section_lines(
         before = getattr(base, item.name) if same else None if item.required else item.default()
         lines = _entry_lines(item.name, _form(item.schema, getattr(settings, item.name), before, comments, below))
         entries.append((lines, _comment(item) if comments else ""))
+    if "" not in selection:
+        entries.sort(key=lambda entry: len(entry[0]) > 1)
     return _with_comments(entries)
 
 

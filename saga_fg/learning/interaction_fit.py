@@ -125,9 +125,10 @@ def couple_rules(
                 continue
             if isinstance(rule.interaction, AccelerationLaw):
                 raise InputError("edges: expected linear interactions to be learned, got nonlinear ones")
-            rate = np.where(mask & (seen > 0), rule.strength(features), 0.0)
+            there = mask & (seen > 0)
+            rate = np.where(there, rule.strength(features), 0.0)
             if isinstance(rule, Following):
-                remoteness = np.where(rate > 0, rule.remoteness(features), np.inf)
+                remoteness = np.where(there & rule.in_lane(features), rule.remoteness(features), np.inf)
                 rate = np.where(remoteness <= remoteness.min(axis=1, keepdims=True), rate, 0.0)
             found.append(Coupling(rule.interaction, rate))
         return found

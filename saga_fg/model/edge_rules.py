@@ -118,6 +118,7 @@ class Following(Settings):
     """A vehicle is led by the nearest vehicle ahead in its lane, as estimated from headings.
 
     Where it is not certain that the nearest exists, the next ones lead with the probability that none before them does.
+    All vehicles count there: one that is not among `leaders` leads nobody, but blocks those ahead of it.
     """
 
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
@@ -146,7 +147,7 @@ class Following(Settings):
         0.0, "ignore leaders nearer than this share of half of both lengths: they are duplicates; usual 0 to 0.8"
     )
     leaders: Leaders = setting(
-        "any", "which vehicles lead: any; moving: those once seen moving; stationary: all others"
+        "any", "which vehicles lead where nothing stands between: any; moving: once seen moving; stationary: all others"
     )
     cones: ConeGeometry | None = settings_group(
         lambda: None, "predict where cones push leaders and followers aside; null: use their present positions"
@@ -158,15 +159,17 @@ class Following(Settings):
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, before classes and nearest leaders are considered."""
-        lateral = lateral_of_arc(f)
-        led = (f.ahead > 0) & (np.abs(lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
         share = np.ones_like(f.ahead) if self.parked else f.target_moved
         if self.leaders != "any":
             share = share * (f.source_moved if self.leaders == "moving" else 1 - f.source_moved)
-        exponent = (
-            (f.ahead / self.gap_scale) ** 2 + (lateral / self.lateral_scale) ** 2 + (f.turn / self.heading_scale) ** 2
-        )
-        return np.where(led & (f.distance <= self.max_gap), share * self.rate * np.exp(-exponent / 2), 0.0)
+        exponent = (f.ahead / self.gap_scale) ** 2 + (f.turn / self.heading_scale) ** 2
+        exponent = exponent + (lateral_of_arc(f) / self.lateral_scale) ** 2
+        return np.where(self.in_lane(f), share * self.rate * np.exp(-exponent / 2), 0.0)
+
+    def in_lane(self, f: EdgeFeatures) -> BoolArray:
+        """Which sources (...) are ahead in the lane of their targets, near enough to lead or to be in between."""
+        lane = (np.abs(lateral_of_arc(f)) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
+        return np.asarray(lane & (f.ahead > 0) & (f.distance <= self.max_gap))
 
     def remoteness(self, f: EdgeFeatures) -> FloatArray:
         """Measure, m, that is least for the leader among all vehicles ahead."""
@@ -181,16 +184,13 @@ class Following(Settings):
         target, source = target[front], source[front]
         features = features_of(seen, target, source)
         near = self.min_separation * (nodes.length[target] + nodes.length[source]) / 2
-        led = (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
-        rate = weighted_by_gain(
-            np.where(led, self.strength(features), 0.0), self.information_gain, nodes, target, source
-        )
-        ahead = np.flatnonzero(rate > 0)
-        target, source, rate = target[ahead], source[ahead], rate[ahead]
-        exists = np.ones(len(ahead)) if nodes.existence is None else nodes.existence[source]
-        leads = rate * _none_before(target, self.remoteness(features)[ahead], exists)
-        kept = np.flatnonzero(leads > 0)
-        return Pairs(target[kept], source[kept], leads[kept])
+        between = self.in_lane(features) & (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
+        ahead = np.flatnonzero(between)
+        exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
+        rate = weighted_by_gain(self.strength(features), self.information_gain, nodes, target, source)[ahead]
+        rate = rate * _none_before(target[ahead], self.remoteness(features)[ahead], exists[source[ahead]])
+        target, source, led = target[ahead], source[ahead], rate > 0
+        return Pairs(target[led], source[led], rate[led])
 
 
 @dataclass(frozen=True)

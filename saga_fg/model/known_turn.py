@@ -4,6 +4,9 @@ r"""Motion along a known, fading turn: any linear motion whose velocity turns by
     v' = R(theta) (exp(A dt) x)_v,   a' = R(theta) (exp(A dt) x)_a
     p' = p + sin(theta / 2) / (theta / 2) R(theta / 2) ((exp(A dt) x)_p - p)
 
+The chord is exact for a constant speed and a constant rate; where the rate fades or the speed changes it is near. Q is
+that of straight motion, not rotated.
+
 With constant velocity and tau infinite this is the coordinated turn (`saga_fg.model.turning`), whose turn rate is part
 of the state and makes it nonlinear. Here the turn rate is estimated beside the joint state, and recorded with the
 interval as the edges are: given the record the motion is linear. Sources: Bar-Shalom, Li and Kirubarajan, Estimation

@@ -327,6 +327,7 @@ def test_contenders_are_judged_on_the_same_gaps() -> None:
     for ours, theirs in zip(figures[::2], figures[1::2], strict=True):
         assert (ours.contender, theirs.contender) == ("saga", "kf")
         assert (ours.gaps, ours.group, ours.length) == (theirs.gaps, theirs.group, theirs.length)
+        assert np.isnan(ours.kept.low), "one recording has no interval"
         if ours.error_change is not None and ours.measured:
             assert ours.error_change.estimate == pytest.approx(ours.error.estimate / theirs.error.estimate - 1)
 
@@ -346,6 +347,15 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     assert figures["recordings"] == ["scene-0001"]
     assert {row["contender"] for row in figures["gaps"]} == {"kf", "own"}
     assert {row["life"] for row in figures["outcomes"]} == {"shipped"}
+
+
+def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(SHORT, duration=1.0)
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: SimulatedSet(scenes, settings=settings))
+    arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--contenders", "kf"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "expected recordings with gaps, there is none" in result.output
 
 
 @pytest.mark.parametrize(

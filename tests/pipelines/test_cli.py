@@ -85,6 +85,11 @@ def test_config_begins_with_five_settings_and_leads_to_all(kind: str, tmp_path: 
         assert saga_fg("config", "--full", "--for", kind_of_data, *option, "--config", path).stdout == defaults
 
 
+def test_config_for_files_begins_with_the_detections_a_track_needs() -> None:
+    lines = [line.strip() for line in saga_fg("config", "--for", "file").stdout.splitlines() if "#" not in line]
+    assert lines[:2] == ["tracker:", "min_hits: 2"]
+
+
 def test_config_knows_the_settings_of_every_dataset() -> None:
     assert (
         saga_fg("config", "--full", "--for", "argoverse2").stdout

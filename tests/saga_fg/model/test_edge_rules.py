@@ -388,10 +388,27 @@ def test_who_leads_may_be_those_that_move_or_those_that_stand():
     nodes = table(*straight(3))
     nodes = replace(nodes, has_moved=np.array([True, False, True]))
     assert leaders(Following().pairs(nodes)) == {2: 1}
-    assert leaders(Following(leaders="moving").pairs(nodes)) == {2: 0}
+    assert leaders(Following(leaders="moving").pairs(nodes)) == {}
+    assert leaders(Following(leaders="moving").pairs(replace(nodes, has_moved=np.ones(3, dtype=bool)))) == {1: 0, 2: 1}
     assert leaders(Following(leaders="stationary").pairs(nodes)) == {2: 1}
     with pytest.raises(InputError, match="leaders: expected one of any, moving, stationary"):
         Following(leaders="parked")
+
+
+@pytest.mark.parametrize("exists", [1.0, 0.4])
+@pytest.mark.parametrize("leading", ["moving", "stationary"])
+def test_rates_are_continuous_in_whether_a_vehicle_between_moves(leading, exists):
+    nodes, rule = replace(table(*straight(3)), existence=np.array([1.0, exists, 1.0])), Following(leaders=leading)
+
+    def led(moved):
+        there = np.array([leading == "moving", moved, True], dtype=float)
+        found = edges(rule.pairs(replace(nodes, has_moved=there))).get(2, {})
+        return [found.get(source, 0.0) for source in (0, 1)]
+
+    certain = 0.0 if leading == "moving" else 1.0
+    assert led(certain) == pytest.approx(led(abs(certain - 1e-9)), abs=1e-8)
+    assert led(certain)[0] == led(1 - certain)[0], "who leads from beyond depends on its existence alone"
+    assert (led(certain)[0] == 0) == (exists == 1)
 
 
 def test_who_creeps_in_a_jam_is_not_coupled_as_parked_objects_are():
