@@ -25,6 +25,7 @@ from factors import (
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.graph import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, Additions, GraphError, NewVariable
+from saga_fg.model.edge_rules import Following, Neighbours
 from tests.saga_fg.estimator_programs import Add, Marginalise, TextbookEstimator, random_program
 from tests.saga_fg.random_graphs import CAR, POLE, TRAM
 from tests.saga_fg.tracking.test_tracker_road import SENSORS, queue_frames
@@ -184,8 +185,11 @@ CARS = straight([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)], [(1.2, 0.4), (1.2, 0.4),
 FRAMES = seen(np.random.default_rng(0), CARS, np.arange(12) / 10)
 
 
-def tracker(name, *providers, **settings):
-    return Tracker(TrackerSettings(estimator=name, **settings), providers=providers)
+EDGES = (Following(), Neighbours())
+
+
+def tracker(name, *providers, edges=EDGES, **settings):
+    return Tracker(TrackerSettings(estimator=name, edges=edges, **settings), providers=providers)
 
 
 class Given:
@@ -230,9 +234,7 @@ def test_a_users_range_changes_what_the_tracker_reports(name):
 
 @pytest.mark.parametrize("name", BACK_ENDS)
 def test_taking_the_interactions_out_changes_the_estimate(name):
-    together, alone = (
-        run(tracker(name, Given(tape), edges=edges), FRAMES)[-1] for edges in (TrackerSettings().edges, ())
-    )
+    together, alone = (run(tracker(name, Given(tape), edges=edges), FRAMES)[-1] for edges in (EDGES, ()))
     assert np.abs(state(together) - state(alone))[:2].max() > 1e-3
 
 
