@@ -76,7 +76,8 @@ class BoxFilter(Columns):
         total = self.size_weight[rows] + weight
         known = np.asarray(np.isfinite(size).all(axis=1))
         old = np.where(np.isfinite(self.size[rows]), self.size[rows], size)
-        mixed = old + (weight / total)[:, None] * (size - old)
+        share = np.divide(weight, total, out=np.zeros_like(total), where=total > 0)  # 0: no size known so far
+        mixed = old + share[:, None] * (size - old)
         self.size[rows] = np.where(known[:, None], mixed, self.size[rows])
         self.size_weight[rows] = np.where(known, np.minimum(total, 20.0), self.size_weight[rows])
         gain = self.z_variance[rows] / (self.z_variance[rows] + z_noise**2)

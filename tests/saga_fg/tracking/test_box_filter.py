@@ -60,6 +60,12 @@ def test_an_unknown_size_counts_for_nothing():
     assert box.size[0] == pytest.approx([4.5, 2.5, 2.0])
 
 
+def test_a_size_of_no_weight_leaves_an_unknown_one_unknown():
+    box = new_box(size=(NAN, NAN, NAN))
+    update(box, size=(NAN, NAN, NAN), weight=0.0)  # as of a track that hands over without any size
+    assert np.isnan(box.size).all()
+
+
 def test_height_is_a_scalar_kalman_filter():
     box = new_box(z=1.0, z_noise=0.2)
     box.predict(0.5, np.array([0.0]))
