@@ -52,7 +52,7 @@ SILENT = 0.3  # s without a frame of the LiDAR: an outage
 
 @dataclass(frozen=True, eq=False)
 class FusedScene:
-    """What a tracker made of one scene.
+    """The result of a tracker on one scene.
 
     scored  for AMOTA
     tracked (groups and all, 2): objects with a track, and objects

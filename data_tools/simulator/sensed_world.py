@@ -1,4 +1,4 @@
-"""What sensors, detectors and annotators need to know of a world, simulated or recorded."""
+"""The interface of a world, simulated or recorded, to sensors, detectors and annotators."""
 
 from __future__ import annotations
 

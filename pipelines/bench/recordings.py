@@ -144,47 +144,34 @@ class KittiSet:
         return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()), of_cars)
 
 
-class SimulatedSet:
-    """Simulated traffic, judged against its exact truth; hidden objects by the track that last followed them."""
+@dataclass(frozen=True)
+class TrueSet:
+    """Scenes with the exact truth at every frame, hidden objects by the track that last followed them."""
 
-    name = "simulated"
-    family: Family = "simulated"
-
-    def __init__(self, scenes: int, seed: int = 0, settings: SimulatorSettings | None = None) -> None:
-        self.dataset = SimulatedTraffic(settings, scenes, seed)
-
-    def score(self, runs: Runs) -> Score:
-        """Compare with the truth at every moment."""
-        return _score_at_every_moment(runs)
-
-
-class TrafficSet:
-    """Recorded traffic with made detections, judged as simulated traffic is."""
-
-    family: Family = "traffic"
-
-    def __init__(self, name: str, recordings: TrafficRecordings, viewpoint: str) -> None:
-        self.name, self.dataset = name, SensedRecordings(recordings, viewpoint, None, seed=0)
+    name: str
+    family: Family
+    dataset: Dataset
 
     def score(self, runs: Runs) -> Score:
-        """Compare with the truth at every moment."""
-        return _score_at_every_moment(runs)
+        """Compare with the truth at every frame."""
+        metrics, errors = [], []
+        for run in runs.values():
+            truth = run.scene.ground_truth
+            assert truth is not None
+            metrics.append(scene_metrics(truth, run.tracks))
+            labels = SceneBoxes.of_annotations(truth, hidden=False)
+            errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
+
+        def figures_of(rows: Sequence[int]) -> dict[str, float]:
+            m = SceneMetrics.pool(metrics[row] for row in rows)
+            return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
+
+        return Score(figures_of, tuple(errors))
 
 
-def _score_at_every_moment(runs: Runs) -> Score:
-    metrics, errors = [], []
-    for run in runs.values():
-        truth = run.scene.ground_truth
-        assert truth is not None
-        metrics.append(scene_metrics(truth, run.tracks))
-        labels = SceneBoxes.of_annotations(truth, hidden=False)
-        errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
-
-    def figures_of(rows: Sequence[int]) -> dict[str, float]:
-        m = SceneMetrics.pool(metrics[row] for row in rows)
-        return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
-
-    return Score(figures_of, tuple(errors))
+def simulated_set(scenes: int, seed: int = 0, settings: SimulatorSettings | None = None) -> RecordingSet:
+    """Simulated traffic."""
+    return TrueSet("simulated", "simulated", SimulatedTraffic(settings, scenes, seed))
 
 
 def recording_set(name: str, data: Path | None, scenes: int) -> RecordingSet:
@@ -193,7 +180,7 @@ def recording_set(name: str, data: Path | None, scenes: int) -> RecordingSet:
     Raises `InputError` for an unknown name or missing recordings.
     """
     if name == "simulated":
-        return SimulatedSet(scenes)
+        return simulated_set(scenes)
     build = (SETS | TRAFFIC_SETS).get(name)
     if build is None:
         raise InputError(f"unknown set {name!r}: expected some of {', '.join((*SETS, *TRAFFIC_SETS))}, simulated")
@@ -210,6 +197,11 @@ def _nuscenes(name: str, split: str, sensor: str, file: str) -> Callable[[Path],
     return build
 
 
+def _traffic(name: str, recordings: TrafficRecordings, viewpoint: str) -> RecordingSet:
+    """Recorded traffic with made detections."""
+    return TrueSet(name, "traffic", SensedRecordings(recordings, viewpoint, None, seed=0))
+
+
 SETS: dict[str, Callable[[Path], RecordingSet]] = {
     "megvii": _nuscenes("megvii", "mini_train", "lidar", "megvii_lidar.json"),
     "centerpoint": _nuscenes("centerpoint", "lidar_centerpoint", "lidar", "centerpoint_lidar.json"),
@@ -217,7 +209,7 @@ SETS: dict[str, Callable[[Path], RecordingSet]] = {
     "kitti": lambda data: KittiSet("kitti", data / "kitti", data / "kitti" / "detections" / "pointrcnn"),
 }
 TRAFFIC_SETS: dict[str, Callable[[Path], RecordingSet]] = {
-    "ngsim": lambda data: TrafficSet("ngsim", NgsimWindows(data / "ngsim"), MAST),
-    "openacc": lambda data: TrafficSet("openacc", OpenAccPlatoons(data / "openacc"), VEHICLE),
+    "ngsim": lambda data: _traffic("ngsim", NgsimWindows(data / "ngsim"), MAST),
+    "openacc": lambda data: _traffic("openacc", OpenAccPlatoons(data / "openacc"), VEHICLE),
 }
 """Sets that are taken only where they are asked for."""

@@ -177,7 +177,7 @@ def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str],
 def _contenders(
     chosen: str | None, own: Sequence[str], interactions: Path | None, base: TrackConfig
 ) -> list[Contender]:
-    """Those that are compared. Raises `InputError` for an unknown one and a wrong file."""
+    """The contenders to compare. Raises `InputError` for an unknown one and a wrong file."""
     from pipelines.bench.gaps.bench import Contender
     from pipelines.bench.gaps.contenders import CONTENDERS
     from pipelines.config import METHODS

@@ -167,7 +167,7 @@ class Following(Settings):
         return np.where(self.in_lane(f), share * self.rate * np.exp(-exponent / 2), 0.0)
 
     def in_lane(self, f: EdgeFeatures) -> BoolArray:
-        """Which sources (...) are ahead in the lane of their targets, near enough to lead or to be in between."""
+        """Mask (...) of the sources ahead in the lane of their targets, near enough to lead or to be in between."""
         lane = (np.abs(lateral_of_arc(f)) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
         return np.asarray(lane & (f.ahead > 0) & (f.distance <= self.max_gap))
 
@@ -322,7 +322,7 @@ def close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[I
 
 
 def in_front(nodes: NodeTable, target: IntArray, source: IntArray, lateral: float, slope: float) -> IntArray:
-    """Which of the pairs have the source ahead of the target, and off by at most `lateral` m and `slope` m a metre."""
+    """Indices of the pairs whose source is ahead of the target, off by at most `lateral` m and `slope` m a metre."""
     c, s, (x, y) = np.cos(nodes.heading), np.sin(nodes.heading), nodes.position.T
     dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
     ahead = dx * c + dy * s

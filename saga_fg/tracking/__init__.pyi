@@ -1,5 +1,5 @@
 from .clock import ClockSettings, TimeVerdict
-from .greedy import GreedyTracker
+from .greedy import GreedySettings, GreedyTracker
 from .journal import Journal
 from .names import AssociationName, EstimatorName
 from .observer import Observer, Stage, TrackerView
@@ -8,7 +8,6 @@ from .settings import (
     ClassSettings,
     EgoNodeSettings,
     ExistenceSettings,
-    GreedySettings,
     TrackerSettings,
     TrafficFlowSettings,
 )

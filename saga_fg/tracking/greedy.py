@@ -16,14 +16,38 @@ from saga_fg.errors import InputError
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
-from saga_fg.tracking.clock import Clock, TimeVerdict
-from saga_fg.tracking.settings import GreedySettings
+from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
+from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.by_class import DEFAULT, class_numbers
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
 
 NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 and (m/s)^2
+
+
+@dataclass(frozen=True)
+class GreedySettings(Settings):
+    """The greedy nearest-centre tracker (Yin et al., CenterPoint, CVPR 2021, section 4.2)."""
+
+    max_distance: Mapping[str, float] = settings_group(
+        lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
+        "largest distance of prediction and detection by class, m; default serves all others; usual 1 to "
+        "12; higher: more matches, right and wrong",
+    )
+    max_coasting: PositiveOrInf = setting(
+        1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
+    )
+    baseline: NonNegative = setting(
+        0.2, "least time between two positions whose difference gives a velocity, s; higher: smoother, later velocities"
+    )
+    min_score: Fraction = setting(
+        0.0, "discard detections with a lower probability; higher: fewer false tracks, more misses"
+    )
+    clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
+    max_delay: NonNegative = setting(
+        0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
+    )
 
 
 @dataclass(frozen=True, eq=False)

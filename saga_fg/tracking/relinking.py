@@ -28,6 +28,7 @@ import numpy as np
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.stationarity import log_density
 from saga_fg.tracking.tracker_state import TrackerState
 
 NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
@@ -57,11 +58,7 @@ def relinked(
     chosen = least_total(t, d, least_log_odds(state) - log_odds)
     t, d = t[chosen], d[chosen]
     distance, _ = mahalanobis_of_pairs(z[chosen] - position[t], P[t] + R[chosen])
-    return Matching(
-        np.concatenate([matching.track, t]),
-        np.concatenate([matching.detection, d]),
-        np.concatenate([matching.distance, distance]),
-    )
+    return matching.append(Matching(t, d, distance))
 
 
 def relinkable(state: TrackerState) -> BoolArray:
@@ -111,5 +108,4 @@ def _mixed(state: TrackerState, rows: IntArray, moving: FloatArray, still: Float
 
 def _log_density(innovation: FloatArray, S: FloatArray) -> FloatArray:
     """(k,) log N(innovation; 0, S) in the plane, 1/m^2."""
-    d2, log_det = mahalanobis_of_pairs(innovation, S)
-    return np.asarray(-0.5 * (d2 + log_det) - math.log(2 * math.pi))
+    return log_density(innovation, S) - math.log(2 * math.pi)

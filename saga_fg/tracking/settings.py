@@ -330,27 +330,3 @@ class TrackerSettings(Settings):
                     f"class_groups: expected one kind of motion in {', '.join(group)}, or one mixture, "
                     f"got {sorted(kinds)}"
                 )
-
-
-@dataclass(frozen=True)
-class GreedySettings(Settings):
-    """The greedy nearest-centre tracker (Yin et al., CenterPoint, CVPR 2021, section 4.2)."""
-
-    max_distance: Mapping[str, float] = settings_group(
-        lambda: {DEFAULT: 4.0, "pedestrian": 1.0, "bicycle": 3.0, "motorcycle": 13.0},
-        "largest distance of prediction and detection by class, m; default serves all others; usual 1 to "
-        "12; higher: more matches, right and wrong",
-    )
-    max_coasting: PositiveOrInf = setting(
-        1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
-    )
-    baseline: NonNegative = setting(
-        0.2, "least time between two positions whose difference gives a velocity, s; higher: smoother, later velocities"
-    )
-    min_score: Fraction = setting(
-        0.0, "discard detections with a lower probability; higher: fewer false tracks, more misses"
-    )
-    clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
-    max_delay: NonNegative = setting(
-        0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
-    )

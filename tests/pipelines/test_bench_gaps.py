@@ -22,7 +22,7 @@ from pipelines.bench.gaps.labelled import LabelledScene
 from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
-from pipelines.bench.recordings import SimulatedSet
+from pipelines.bench.recordings import simulated_set
 from pipelines.bench.variants import changed
 from pipelines.cli import app
 from pipelines.config import Family, load_config
@@ -220,7 +220,7 @@ def test_made_gaps_hide_one_object_among_others() -> None:
 def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated scenes of the benchmark that last for seconds."""
     settings = replace(SHORT, duration=7.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: SimulatedSet(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: simulated_set(scenes, settings=settings))
 
 
 @pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
@@ -351,7 +351,7 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
 
 def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(SHORT, duration=1.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: SimulatedSet(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: simulated_set(scenes, settings=settings))
     arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--contenders", "kf"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from data_tools.metrics import Interval, LabelErrors
 from data_tools.simulator import SimulatorSettings
 from pipelines.bench import tracking
-from pipelines.bench.recordings import NuScenesSet, Score, SimulatedSet
+from pipelines.bench.recordings import NuScenesSet, Score, simulated_set
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
 from pipelines.bench.variants import COMPONENTS, METHODS, changed, variants
 from pipelines.cli import app
@@ -80,7 +80,7 @@ def test_differences_and_their_verdicts() -> None:
 
 def test_a_set_is_tracked_by_every_variant() -> None:
     settings = TrackingBenchSettings(draws=5)
-    result = bench_set(SimulatedSet(2, settings=replace(SHORT, duration=1.0)), load_config("simulated"), settings)
+    result = bench_set(simulated_set(2, settings=replace(SHORT, duration=1.0)), load_config("simulated"), settings)
     assert result.ratio("centerpoint") == 1.0
     assert {"saga", "kf", "centerpoint", "without following"} <= set(result.variants)
     assert set(result.variants["saga"].figures) == {"MOTA", "IDS", "hidden RMSE"}
@@ -98,7 +98,7 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
         return LearnedInteractions(learned_from=" ".join(recordings))
 
     monkeypatch.setattr(tracking, "learn_interactions", learn)
-    recordings = SimulatedSet(3, settings=replace(SHORT, duration=1.0))
+    recordings = simulated_set(3, settings=replace(SHORT, duration=1.0))
     first, second, third = recordings.dataset.scenes
     learned = tracking.learn_by_folds(recordings.dataset)
     assert {name: found.learned_from for name, found in learned.items()} == {
@@ -111,7 +111,7 @@ def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.Monk
     assert list(result.variants) == ["saga", "kf", "centerpoint", "graph matching", "learned interactions"]
     assert result.variants["learned interactions"].figures == pytest.approx(result.variants["kf"].figures, nan_ok=True)
     with pytest.raises(InputError, match="scenes to learn from beside it"):
-        tracking.learn_by_folds(SimulatedSet(1, settings=SHORT).dataset)
+        tracking.learn_by_folds(simulated_set(1, settings=SHORT).dataset)
 
 
 def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ class Contender:
         return cls(variant.name, variant.method, variant.config(base))
 
     def same_as(self, other: Contender) -> bool:
-        """Whether the other does the same under another name."""
+        """Return True if the other is the same method and configuration."""
         return (self.method, self.config) == (other.method, other.config)
 
 
@@ -99,7 +99,7 @@ def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
 
 @dataclass(frozen=True)
 class _Preparation:
-    """What the gaps of a recording depend on; sensors place detections alike for all contenders."""
+    """Everything that the gaps of a recording depend on; sensors place detections alike for all contenders."""
 
     source: RecordingSource
     recording: str
@@ -120,20 +120,26 @@ def _prepared(of: _Preparation) -> tuple[LabelledScene, list[Gap]]:
 
 def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> Run:
     """Track with all detections, then without those of each pass, and judge."""
-    config, scene = with_life(contender.config, life), labelled.scene
     outcomes: dict[int, GapOutcome] = {}
     links = Links()
     for number in sorted({0, *(gap.run for gap in gaps)}):
         mine = {k: gap for k, gap in enumerate(gaps) if gap.run == number}
-        frames = labelled.scene.frames if number == 0 else hidden(labelled, list(mine.values()))
-        tracks = track_scene(replace(scene, frames=frames), config.new_tracker(contender.method)).tracks
-        judged = JudgedRun(labelled, tracks, extrapolated=contender.method == "centerpoint")
+        judged = judged_run(labelled, list(mine.values()), contender, life)
         outcomes |= {k: judged.outcome(gap) for k, gap in mine.items()}
         if number == 0:
             links = judged.links()
     label = tuple(str(labelled.label[gap.row]) for gap in gaps)
     ordered = tuple(outcomes[k] for k in range(len(gaps)))
-    return Run(scene.name, contender.name, life, tuple(gaps), label, ordered, links)
+    return Run(labelled.scene.name, contender.name, life, tuple(gaps), label, ordered, links)
+
+
+def judged_run(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> JudgedRun:
+    """Track without the detections of the made ones among the gaps of one run."""
+    scene, config = labelled.scene, with_life(contender.config, life)
+    made = [gap for gap in gaps if gap.run > 0]
+    frames = hidden(labelled, made) if made else scene.frames
+    tracks = track_scene(replace(scene, frames=frames), config.new_tracker(contender.method)).tracks
+    return JudgedRun(labelled, tracks, extrapolated=contender.method == "centerpoint")
 
 
 def hidden(labelled: LabelledScene, gaps: Sequence[Gap]) -> list[Frame]:

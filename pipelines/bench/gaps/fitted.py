@@ -26,7 +26,7 @@ class Split:
 def splits_of(
     recordings: Sequence[str], train: Sequence[str] = (), test: Sequence[str] = (), folds: int | None = None
 ) -> list[Split]:
-    """How the recordings of a set are used, of which `train` and `test` may name others as well.
+    """Split the recordings of a set; `train` and `test` may name recordings of other sets as well.
 
     test   those that are judged; all but `train` if it is empty
     folds  deal the judged recordings into so many, each judged after a fit to the others

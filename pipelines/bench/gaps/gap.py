@@ -7,7 +7,7 @@ it travels faster than `MOVING` over the gap.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 MOVING = 0.5  # m/s
 SHORTEST, LONGEST = 1.0, 6.0  # s: real gaps
-SEEN_BEFORE = 0.5  # s: for so long at least an object is detected before a real gap
+SEEN_BEFORE = 0.39  # s from the first to the last detection before a real gap: half a second of frames at 10 Hz
 LENGTHS = (1.0, 2.0, 3.0, 5.0)  # s: made gaps
 FOLLOWED, FOLLOWED_SHARE = 1.5, 0.8  # s before a made gap, and the share of its moments with a detection
 SPACING = 20.0  # m between objects that are hidden at the same time
@@ -52,7 +52,7 @@ def real_gaps(labelled: LabelledScene) -> list[Gap]:
             length = float(time[first] - time[last])
             if length < SHORTEST - 1e-6:
                 continue
-            if length <= LONGEST + 1e-6 and time[last] - spell >= SEEN_BEFORE - 0.11:
+            if length <= LONGEST + 1e-6 and time[last] - spell >= SEEN_BEFORE:
                 found.append(Gap(row, last, first, length, _moving(labelled, row, last, first)))
             spell = float(time[first])
     return found
@@ -76,12 +76,8 @@ def made_gaps(labelled: LabelledScene, passes: int, seed: int) -> list[Gap]:
         for k in order[:TRIALS].tolist():
             if taken.free(windows[k]):
                 taken.add(windows[k])
-                gaps.append(_of_pass(windows[k], number))
+                gaps.append(replace(windows[k], run=number))
     return gaps
-
-
-def _of_pass(gap: Gap, number: int) -> Gap:
-    return Gap(gap.row, gap.start, gap.stop, gap.length, gap.moving, number)
 
 
 def _windows(labelled: LabelledScene, rng: np.random.Generator) -> list[Gap]:
@@ -131,7 +127,7 @@ class _Taken:
         self._windows.append((gap.row, gap.start, gap.stop))
 
     def free(self, gap: Gap) -> bool:
-        """Whether no window of the object, or of one near it, is in the way."""
+        """Return True if no window of the object, or of one near it, is in the way."""
         if not self._windows:
             return True
         time, position = self._labelled.scene.timestamps, self._labelled.position

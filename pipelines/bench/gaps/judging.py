@@ -34,7 +34,7 @@ B = TypeVar("B")
 
 @dataclass(frozen=True)
 class GapOutcome:
-    """What became of one object in its gap.
+    """The outcome of one gap of an object.
 
     held, kept   whether a track had it before, and whether that track has it after
     reported     whether that track is among the results at the last moment of the gap
@@ -65,7 +65,7 @@ class JudgedRun:
     """
 
     def __init__(self, labelled: LabelledScene, tracks: Sequence[Tracks], extrapolated: bool = False) -> None:
-        self._labelled, self._tracks, self._extrapolated = labelled, tracks, extrapolated
+        self._labelled, self.tracks, self._extrapolated = labelled, tracks, extrapolated
         truth = labelled.scene.ground_truth
         assert truth is not None
         detected = [found.select(found.coasting <= DETECTED) for found in tracks]
@@ -150,8 +150,8 @@ class JudgedRun:
         for k in range(moment, -1, -1):
             row = self._row_of[k].get(track)
             if row is not None:
-                found = self._tracks[k]
-                elapsed = float(self._tracks[moment].timestamp - found.timestamp)
+                found = self.tracks[k]
+                elapsed = float(self.tracks[moment].timestamp - found.timestamp)
                 return np.asarray(found.boxes.position[row, :2] + elapsed * found.boxes.velocity[row])
             if not self._extrapolated:
                 return None

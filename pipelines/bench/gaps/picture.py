@@ -9,7 +9,7 @@ and after the gap is one identity.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,12 @@ import numpy as np
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import png
 from data_tools.plots.birds_eye import COLOURS, ellipse_95
-from pipelines.bench.gaps.bench import Contender, Run, hidden
-from pipelines.bench.gaps.contenders import Life, with_life
+from pipelines.bench.gaps.bench import Contender, Run, judged_run
+from pipelines.bench.gaps.contenders import Life
 from pipelines.bench.gaps.gap import Gap
-from pipelines.bench.gaps.judging import CAP, GapOutcome, JudgedRun
+from pipelines.bench.gaps.judging import CAP, GapOutcome
 from pipelines.bench.gaps.labelled import LabelledScene
 from pipelines.bench.gaps.sources import RecordingSource
-from pipelines.tracking import track_scene
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.track import Tracks
@@ -79,11 +78,8 @@ def write_telling_picture(
 
 def drawn_gap(labelled: LabelledScene, gaps: Sequence[Gap], gap: Gap, contender: Contender, life: Life) -> DrawnGap:
     """Track the recording again as the gap was judged; gaps: all of the recording."""
-    scene, config = labelled.scene, with_life(contender.config, life)
-    frames = scene.frames if gap.run == 0 else hidden(labelled, [each for each in gaps if each.run == gap.run])
-    tracks = track_scene(replace(scene, frames=frames), config.new_tracker(contender.method)).tracks
-    judged = JudgedRun(labelled, tracks, extrapolated=contender.method == "centerpoint")
-    return DrawnGap(contender.name, tracks, judged.holders(gap), judged.outcome(gap))
+    judged = judged_run(labelled, [each for each in gaps if each.run == gap.run], contender, life)
+    return DrawnGap(contender.name, judged.tracks, judged.holders(gap), judged.outcome(gap))
 
 
 def gap_picture(labelled: LabelledScene, gap: Gap, drawn: Sequence[DrawnGap]) -> Any:

@@ -115,7 +115,7 @@ class _Group:
     length: float | None
 
     def has(self, gap: Gap, label: str) -> bool:
-        """Whether a gap belongs to it, whatever its length."""
+        """Return True if a gap belongs to the group, whatever its length."""
         return (gap.run == 0) == (self.kind == "real") and gap.moving == self.moving and self.label in (None, label)
 
     def error(self, outcome: GapOutcome) -> float:
