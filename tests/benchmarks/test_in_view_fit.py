@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.in_view_fit import fit_interactions_in_view
+from benchmarks.trajectories import Trajectories
 from saga_fg import InputError
-from saga_fg.learning import Trajectories
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from tests.saga_fg.following_pairs import RATE, following_pairs

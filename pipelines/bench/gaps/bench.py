@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from multiprocessing import get_context
+from typing import Protocol
 
 import numpy as np
 
@@ -14,12 +15,23 @@ from pipelines.bench.gaps.contenders import LIVES, Life, with_life
 from pipelines.bench.gaps.gap import Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import GapOutcome, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
-from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.variants import Variant
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.model.sensor import Sensor
+from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
+
+
+class SceneSource(Protocol):
+    """Recordings by name, with ground truth and detections."""
+
+    @property
+    def name(self) -> str: ...
+
+    def scene(self, recording: str) -> Scene:
+        """Read a recording."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -64,14 +76,14 @@ class Run:
 
 @dataclass(frozen=True)
 class _Job:
-    source: RecordingSource
+    source: SceneSource
     recording: str
     contender: Contender
     settings: GapBenchSettings
 
 
 def bench_gaps(
-    source: RecordingSource,
+    source: SceneSource,
     recordings: Sequence[str],
     contenders: Sequence[Contender],
     settings: GapBenchSettings | None = None,
@@ -101,7 +113,7 @@ def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
 class _Preparation:
     """Everything that the gaps of a recording depend on; sensors place detections alike for all contenders."""
 
-    source: RecordingSource
+    source: SceneSource
     recording: str
     settings: GapBenchSettings
     sensors: Mapping[str, Sensor] = field(compare=False)

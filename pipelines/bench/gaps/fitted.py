@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
+from pipelines.bench.gaps.learned import LEARNED, learn_interactions
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.types.dataset import Scene
 
 
@@ -68,9 +68,9 @@ def fitted_contenders(
     Raises `InputError` where there is nothing to learn from.
     """
     noise = fit_acceleration_noise_by_class(measured_trajectories(iter(teaching), base.sensors))
-    truths = {scene.name: Trajectories.of_truth(scene) for scene in teaching}
-    learned = learn_interactions(truths, f"recordings {', '.join(truths)}", progress=progress)
+    scenes = {scene.name: scene for scene in teaching}
+    learned = learn_interactions(scenes, f"recordings {', '.join(scenes)}", base, progress=progress).interactions
     return [
         Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise)),
-        Contender("saga, learned edges", "saga", base.with_interactions(learned)),
+        Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned)),
     ]
