@@ -33,7 +33,6 @@ from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
 
-
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 
 

@@ -73,9 +73,7 @@ class SceneSettings:
         )
 
 
-def sampled_config(
-    settings: SceneSettings, edges: tuple[Following | Neighbours, ...] | None = None
-) -> TrackConfig:
+def sampled_config(settings: SceneSettings, edges: tuple[Following | Neighbours, ...] | None = None) -> TrackConfig:
     """Settings of trackers that know the true parameters; the edges are the true ones if left out.
 
     Objects come from anywhere, are hidden for any time, and a miss says little: they may be hidden.

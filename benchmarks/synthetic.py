@@ -21,8 +21,8 @@ import numpy as np
 import typer
 
 from benchmarks.in_view_fit import fit_interactions_in_view
-from benchmarks.trajectories import Trajectories
 from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sampled_config
+from benchmarks.trajectories import Trajectories
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics

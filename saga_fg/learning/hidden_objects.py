@@ -23,7 +23,7 @@ from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import Interaction, NodeTable
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking import Tracker, TrackerSettings
@@ -91,13 +91,21 @@ class RecordedTracks(Columns):
     P: FloatArray
 
 
+class _Shared(NamedTuple):
+    """Shared by all gaps: the tracks of the recordings, and the step, s."""
+
+    tracks: RecordedTracks
+    step: float
+
+
 @dataclass(frozen=True, eq=False)
 class HiddenObjects(Columns):
-    """W gaps of S steps of `step` s, each with at most M tracks around.
+    """W gaps of S steps, each with at most M tracks around.
 
     start       (W,) row of the hidden track in `recorded`; label (W,) of the object
     neighbours  (W, S, M) rows when a step starts, -1: none; lag (W, S), s, from their moment to the start of the step
     place       (W, S, 2) of the object at the end of each step, NaN where unknown
+    recorded    the tracks of the recordings, and the step
     """
 
     start: IntArray
@@ -105,13 +113,12 @@ class HiddenObjects(Columns):
     neighbours: IntArray
     lag: FloatArray
     place: FloatArray
-    recorded: tuple[RecordedTracks]
-    step: tuple[float]
+    recorded: _Shared
 
     @property
-    def known(self) -> FloatArray:
+    def known(self) -> BoolArray:
         """(W, S) whether the place is known."""
-        return np.isfinite(self.place[..., 0])
+        return np.asarray(np.isfinite(self.place[..., 0]))
 
     def sampled(self, most: int, seed: int) -> Self:
         """At most `most` of the gaps, chosen at random."""
@@ -122,14 +129,14 @@ class HiddenObjects(Columns):
     @classmethod
     def pooled(cls, parts: Sequence[HiddenObjects]) -> HiddenObjects:
         """The gaps of several recordings."""
-        recorded = RecordedTracks.concatenate([part.recorded[0] for part in parts])
-        first = np.cumsum([0, *(len(part.recorded[0].mean) for part in parts)])
+        recorded = RecordedTracks.concatenate([part.recorded.tracks for part in parts])
+        first = np.cumsum([0, *(len(part.recorded.tracks.mean) for part in parts)])
         moved = [
             replace(
                 part,
                 start=part.start + n,
                 neighbours=np.where(part.neighbours >= 0, part.neighbours + n, -1),
-                recorded=(recorded,),
+                recorded=_Shared(recorded, part.recorded.step),
             )
             for part, n in zip(parts, first, strict=False)
         ]
@@ -147,7 +154,7 @@ class HiddenObjects(Columns):
         last = S - self.known[:, ::-1].argmax(axis=1)
         order = np.argsort(np.where(self.known.any(axis=1), -last, 1), kind="stable")
         active = [int((last[self.known.any(axis=1)] > s).sum()) for s in range(S)]
-        recorded, step = self.recorded[0], self.step[0]
+        recorded, step = self.recorded
         side = int(np.ceil(np.sqrt(max(W, 1))))
         shift = APART * np.stack(np.divmod(np.arange(W), side), axis=1) - recorded.mean[self.start, :2]
         hidden = _placed(recorded.select(self.start[order]), np.arange(W), shift[order], 0.0)
@@ -232,8 +239,9 @@ def hidden_objects(
             there = np.isfinite(np.take_along_axis(apart, nearest, axis=1))
             near[:, s, : nearest.shape[1]] = np.where(there, first[m] + nearest, -1)
         columns.append((first[k] + rows, parts[k].table.label[rows], near, lag, place))
-    joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
-    return HiddenObjects(*joined, (recorded,), (settings.step,)) if len(joined[0]) else None
+    start, label, near, lag, place = (np.concatenate(column) for column in zip(*columns, strict=True))
+    found = HiddenObjects(start, label, near, lag, place, _Shared(recorded, settings.step))
+    return found if len(found) else None
 
 
 class _Labels(NamedTuple):
@@ -260,9 +268,9 @@ class _Labels(NamedTuple):
         if k == len(self.time) or (k == 0 and time < self.time[0] - 1e-6):
             return np.full(self.position.shape[1:], np.nan)
         if k == 0 or abs(self.time[k] - time) < 1e-6:
-            return self.position[k]
+            return np.asarray(self.position[k])
         share = (self.time[k] - time) / (self.time[k] - self.time[k - 1])
-        return share * self.position[k - 1] + (1 - share) * self.position[k]
+        return np.asarray(share * self.position[k - 1] + (1 - share) * self.position[k])
 
 
 def _tracked(

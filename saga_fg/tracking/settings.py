@@ -238,11 +238,9 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | RedLight | InLane | ConeLine | Attached, ...] = (
-        settings_group(
-            traffic_rules,
-            "edge rules of the scene graph: who interacts with whom; []: no interactions",
-        )
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | InLane | ConeLine | Attached, ...] = settings_group(
+        traffic_rules,
+        "edge rules of the scene graph: who interacts with whom; []: no interactions",
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"

@@ -3,10 +3,10 @@
 from functools import partial
 
 import numpy as np
+import pipelines.learning.interactions
 import pytest
 from typer.testing import CliRunner
 
-import pipelines.learning.interactions
 from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
 from saga_fg.learning import fit_interactions

@@ -128,7 +128,7 @@ def learn_interactions(
     ratios, chosen = {}, {}
     for group in groups:
         ratios[group] = {form: _ratio(runs, trials[BASE], group) for form, runs in trials.items() if form != BASE}
-        best = min(ratios[group], key=lambda form: ratios[group][form], default=NOWHERE)  # noqa: B023
+        best = min(ratios[group], key=lambda form: ratios[group][form], default=NOWHERE)
         chosen[group] = best if ratios[group].get(best, 1.0) < 1 else NOWHERE
 
     def combined(fits: Mapping[tuple[str, ...], Mapping[str, Rules]], what: str) -> LearnedInteractions:

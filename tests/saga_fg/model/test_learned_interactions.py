@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from saga_fg.model.edge_network import FEATURES, EdgeNetwork
 
 from pipelines.configuration import read_settings, write_settings
 from saga_fg import InputError
 from saga_fg.learning import TEMPLATE
-from saga_fg.model.edge_network import FEATURES, EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedCourse, SharedVelocity, velocity_triples
 from saga_fg.model.learned_interactions import LearnedInteractions
