@@ -28,12 +28,13 @@ from benchmarks.independent_filter import filter_independently
 from benchmarks.joint_view import JointView
 from benchmarks.trajectories import Trajectories
 from saga_fg.errors import InputError
-from saga_fg.learning.interaction_fit import EXPLAINED_BOUNDS, Rule, RuleParameters
+from saga_fg.learning.interaction_fit import Rule, RuleParameters
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
 
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
+EXPLAINED_BOUNDS = (0.0, 3.0)  # s
 
 
 @dataclass(frozen=True)

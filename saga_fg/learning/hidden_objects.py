@@ -13,30 +13,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.learning.marginals import Marginals
+from saga_fg.learning.recorded_tracks import LabelledPlaces, RecordedTracks, recorded_tracks
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import Interaction, NodeTable
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.columns import Columns
-from saga_fg.tracking import Tracker, TrackerSettings
+from saga_fg.tracking import TrackerSettings
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.prediction import predict
-from saga_fg.tracking.sensor_evidence import SensorEvidence
-from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.dataset import Scene
 
 APART = 5000.0  # m between gaps: no edge reaches as far
-GATE = 2.0  # m, from a track to its object
 
 
 @dataclass(frozen=True)
@@ -75,19 +72,6 @@ class GapPrediction(NamedTuple):
     """At the end of S steps: position (W, S, 2) and its covariance (W, S, 2, 2); NaN where nothing is to be compared"""
 
     position: FloatArray
-    P: FloatArray
-
-
-@dataclass(eq=False)
-class RecordedTracks(Columns):
-    """n tracks at some moments of a recording, as the tracker had them.
-
-    table         their rows; without the evidence of sensors, with times counted from the moment
-    mean, P       (n, D), (n, D, D) of their states, padded to the largest
-    """
-
-    table: TrackTable
-    mean: FloatArray
     P: FloatArray
 
 
@@ -172,7 +156,7 @@ class HiddenObjects(Columns):
                 ids = n + np.arange(len(gap))
                 parts.append(_placed(around, ids, shift[rows[gap]], s * step))
             scene = RecordedTracks.concatenate(parts)
-            marginals = Marginals(scene.mean, scene.P, wanted=n)
+            marginals: Any = Marginals(scene.mean, scene.P, wanted=n)
             state.rules = tuple(_Onto(rule, n) for rule in rules)
             state.time, state.table = s * step, scene.table
             state.joint = JointTrackState(marginals, partial(motion_of, settings))
@@ -206,8 +190,8 @@ def hidden_objects(
     Raises `InputError` for a scene without ground truth.
     """
     settings = settings or GapSettings()
-    labels = _Labels.of(scene)
-    parts, moments, held = _tracked(scene, tracker, sensors, labels)
+    labels = LabelledPlaces.of(scene)
+    parts, moments, held = recorded_tracks(scene, tracker, sensors, labels)
     if not parts:
         return None
     recorded = RecordedTracks.concatenate(parts)
@@ -242,76 +226,3 @@ def hidden_objects(
     start, label, near, lag, place = (np.concatenate(column) for column in zip(*columns, strict=True))
     found = HiddenObjects(start, label, near, lag, place, _Shared(recorded, settings.step))
     return found if len(found) else None
-
-
-class _Labels(NamedTuple):
-    """K labelled moments of N objects: time (K,), label (N,), position (K, N, 2), m, world, NaN where not labelled."""
-
-    time: FloatArray
-    label: StrArray
-    position: FloatArray
-
-    @classmethod
-    def of(cls, scene: Scene) -> Self:
-        if scene.ground_truth is None:
-            raise InputError(f"scene {scene.name}: expected ground truth, there is none")
-        names = np.unique(np.concatenate([moment.id for moment in scene.ground_truth]))
-        position, label = np.full((len(scene), len(names), 2), np.nan), np.full(len(names), "", dtype="U64")
-        for k, moment in enumerate(scene.ground_truth):
-            rows = np.searchsorted(names, moment.id)
-            position[k, rows], label[rows] = moment.boxes.position[:, :2], moment.boxes.label
-        return cls(scene.timestamps, label, position)
-
-    def at(self, time: float) -> FloatArray:
-        """(N, 2) interpolated between the moments before and after; NaN beyond the recording."""
-        k = int(np.searchsorted(self.time, time - 1e-6))
-        if k == len(self.time) or (k == 0 and time < self.time[0] - 1e-6):
-            return np.full(self.position.shape[1:], np.nan)
-        if k == 0 or abs(self.time[k] - time) < 1e-6:
-            return np.asarray(self.position[k])
-        share = (self.time[k] - time) / (self.time[k] - self.time[k - 1])
-        return np.asarray(share * self.position[k - 1] + (1 - share) * self.position[k])
-
-
-def _tracked(
-    scene: Scene, settings: TrackerSettings, sensors: Mapping[str, Sensor], labels: _Labels
-) -> tuple[list[RecordedTracks], FloatArray, list[IntArray]]:
-    """The tracks after each frame, in world coordinates; the times of the frames; the object of each track, -1: none.
-
-    Only tracks that were just detected hold an object.
-    """
-    settings = replace(settings, edges=(), providers=(), estimator="kalman")
-    tracker = Tracker(settings, sensors)
-    state = TrackerState(settings, ())
-    parts, times, held = [], [], []
-    for frame in scene.frames:
-        tracker.step(frame)
-        if tracker.time_verdict == "late":
-            continue
-        state.restore(tracker.snapshot())
-        table, time = state.table, state.start + state.time
-        if len(table) == 0:
-            continue
-        kinds = state.joint.rows_by_type(table.label)
-        D = max(kind.dim for kind, _ in kinds)
-        mean, P = np.zeros((len(table), max(D, 6))), np.zeros((len(table), max(D, 6), max(D, 6)))
-        for kind, rows in kinds:
-            mean[rows, : kind.dim] = state.joint.estimator.mean(table.id[rows])
-            P[rows, : kind.dim, : kind.dim] = state.joint.estimator.covariance(table.id[rows])
-        position = mean[:, :2] + state.origin
-        truth = labels.at(time)
-        apart = np.hypot(*np.moveaxis(position[:, None] - truth[None], -1, 0))
-        fresh = table.last_detected >= state.time - 1e-6
-        possible = fresh[:, None] & (table.label[:, None] == labels.label) & (np.nan_to_num(apart, nan=np.inf) < GATE)
-        row, column = assign(np.nan_to_num(apart, nan=1e9), possible, unmatched=GATE)
-        owner = np.full(len(table), -1)
-        owner[row] = column
-        mean[:, :2] = position
-        table.stationarity.position = table.stationarity.position + state.origin
-        for name in ("initiated", "last_detected", "last_in_view"):
-            setattr(table, name, getattr(table, name) - state.time)
-        table.sensors = SensorEvidence.empty(len(table))
-        parts.append(RecordedTracks(table, mean, P))
-        times.append(time)
-        held.append(owner)
-    return parts, np.array(times), held

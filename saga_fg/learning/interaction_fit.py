@@ -5,10 +5,9 @@ r"""Rates and kernel widths of edge rules by the likelihood of the places at whi
 p_theta and P_theta are the tracker's own prediction (`saga_fg.learning.hidden_objects`) on the base motion of its
 configuration. Innovations after gaps have heavy tails, hence Student's t. How wide they are is a matter of the process
 noise, which serves association as well and is left as it is: the scale c of each class is the most likely one, and is
-not kept. The parameters are the logarithms of rates and widths within bounds, so that rates stay positive, and the
-explained noise. The objective is minimised by L-BFGS-B with differences for derivatives, as one prediction of all gaps
-costs half a second and rules may be anybody's; a weak Gaussian prior about the template decides where the recordings do
-not.
+not kept. The parameters are the logarithms of rates and widths within bounds, so that rates stay positive. The
+objective is minimised by L-BFGS-B with differences for derivatives: one prediction of all gaps takes a fraction of a
+second, and rules may be anybody's. A weak Gaussian prior about the template decides where the recordings do not.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects
-from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.numerics.arrays import FloatArray, StrArray
@@ -41,7 +39,6 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "speed_scale": (0.1, 10.0),
 }
 """Bounds of rates and widths; an infinite width stays infinite. Others: a tenth to ten times the template's value."""
-EXPLAINED_BOUNDS = (0.0, 3.0)  # s
 PRIOR = 2e-2  # weight of a unit of squared difference from the template, against the mean over the gaps
 TAILS = 3.0  # degrees of freedom of the innovations
 PLACE_DEVIATION = 0.1  # m, of labels
@@ -49,33 +46,30 @@ FEWEST = 30  # places of a class; classes with fewer share a scale
 MOST_GAPS = 400  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
-HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
-_LED = Following(SharedVelocity(), rate=1.0, gap_scale=18.0, lateral_scale=1.2, classes=ROAD_USERS, leaders="moving")
+_LED = Following(
+    SharedVelocity(),
+    rate=1.5,
+    max_gap=60.0,
+    gap_scale=18.0,
+    lateral_scale=1.2,
+    min_separation=0.8,
+    classes=ROAD_USERS,
+    leaders="moving",
+)
 TEMPLATE: tuple[Rule, ...] = (
     _LED,
-    replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.2, leaders="stationary"),
+    replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.5, leaders="stationary"),
     Neighbours(
-        rate=1.0,
-        distance_scale=25.0,
-        heading_scale=math.inf,
-        speed_scale=1.0,
-        max_distance=50.0,
-        max_degree=8,
-        parked=True,
-        classes=ROAD_USERS,
-    ),
-    Neighbours(
-        rate=0.1,
+        rate=0.5,
         distance_scale=1.5,
         heading_scale=math.inf,
-        speed_scale=0.5,
+        speed_scale=1.0,
         max_distance=6.0,
         min_speed=0.2,
         classes=("pedestrian",),
     ),
 )
-"""Following a moving leader in speed and course; halting behind a stationary one; parked objects, which share errors of
-the pose; groups of people."""
+"""Following a moving leader in speed and course; halting behind a stationary one; groups of people."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,23 +105,18 @@ class RuleParameters:
 
 @dataclass(frozen=True)
 class FittedInteractions:
-    """rules with their values; explained_noise, s; loss per place."""
+    """rules with their values; loss per place."""
 
     rules: tuple[Rule, ...]
-    explained_noise: float
     loss: float
 
 
 def fit_interactions(
-    sample: HiddenObjects,
-    settings: TrackerSettings,
-    template: Sequence[Rule] = TEMPLATE,
-    explained_noise: float = 0.0,
-    iterations: int = 12,
+    sample: HiddenObjects, settings: TrackerSettings, template: Sequence[Rule] = TEMPLATE, iterations: int = 10
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
-    settings   of the tracker, with its base motion; template, explained_noise: where the search begins
+    settings   of the tracker, with its base motion; template: where the search begins
 
     Rules whose classes do not occur are left out. Raises `InputError` for a sample without gaps.
     """
@@ -136,16 +125,15 @@ def fit_interactions(
     sample = sample.sampled(MOST_GAPS, seed=0)
     occurring = set(np.unique(sample.label).tolist())
     parameters = RuleParameters.of([rule for rule in template if occurring & set(rule.classes)])
-    bounds = [*parameters.bounds, EXPLAINED_BOUNDS]
-    start = np.append(parameters.start, np.clip(explained_noise, *EXPLAINED_BOUNDS))
+    start = parameters.start
 
     def loss(x: FloatArray) -> float:
-        explained = replace(settings, edges=(), explained_noise=float(x[-1]))
-        prediction = sample.predict(explained, parameters.valued(x[:-1]))
-        return negative_log_likelihood(sample, prediction) + PRIOR * float(((x - start)[:-1] ** 2).sum())
+        prediction = sample.predict(settings, parameters.valued(x))
+        return negative_log_likelihood(sample, prediction) + PRIOR * float(((x - start) ** 2).sum())
 
-    found = minimize(loss, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations, "eps": 1e-3})
-    return FittedInteractions(parameters.valued(found.x[:-1]), float(found.x[-1]), float(found.fun))
+    options = {"maxiter": iterations, "eps": 1e-3}
+    found = minimize(loss, start, method="L-BFGS-B", bounds=parameters.bounds, options=options)
+    return FittedInteractions(parameters.valued(found.x), float(found.fun))
 
 
 def negative_log_likelihood(sample: HiddenObjects, prediction: GapPrediction) -> float:

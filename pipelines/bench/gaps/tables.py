@@ -32,11 +32,7 @@ def tables(
         found += [
             _gaps([f for f in mine if f.kind == "real"], f"{title}: real gaps of 1 to 6 s", reference),
             _gaps([f for f in mine if f.kind == "made"], f"{title}: made gaps", reference),
-            *(
-                _situations(situation_figures(runs, reference), title, reference)
-                if life == "kept" and situations
-                else ()
-            ),
+            *(situation_tables(runs, title, reference) if life == "kept" and situations else ()),
             _links([each for each in links if each.life == life], f"{title}: links through gaps"),
         ]
     return [table for table in found if table.rows]
