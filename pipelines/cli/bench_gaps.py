@@ -76,6 +76,22 @@ def gaps(
         typer.Option("--life", help="Tracks kept alive through all gaps, ended as configured, or both."),
     ] = "both",
     by_class: Annotated[bool, typer.Option("--by-class", help="Rows for classes of objects as well.")] = False,
+    situations: Annotated[
+        bool,
+        typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
+    ] = False,
+    lengths: Annotated[
+        str | None,
+        typer.Option("--lengths", help="Of made gaps, s, with commas: of 1, 2, 3, 5.  [default: all of them]"),
+    ] = None,
+    viewpoint: Annotated[
+        str,
+        typer.Option(
+            "--viewpoint",
+            help="Of the sensors in the sets ngsim and openacc: above, where nothing is hidden, mast, vehicle, the id "
+            "of one, or X,Y,Z in m.",
+        ),
+    ] = "above",
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 1,
     config: Config = None,
     plot: PictureFile = None,
@@ -97,7 +113,8 @@ def gaps(
 
     Real gaps: a labelled object has no detection for 1 to 6 s, and then again. Made gaps: the detections of one object
     are taken away for 1, 2, 3 or 5 s, while all others stay. Every contender tracks the same detections. A track that
-    is not known counts with an error of 10 m. Intervals are paired bootstraps over recordings, of 3 at least.
+    is not known counts with an error of 10 m. Intervals are paired bootstraps over recordings, of 3 at least;
+    those that overlap in time count as one.
 
     \b
     Examples:
@@ -105,6 +122,7 @@ def gaps(
       saga-fg bench gaps --data data --sets megvii,kitti --workers 2 --json gaps.json
       saga-fg bench gaps --data data --sets kitti --contenders saga,kf --contender trial=trial.yaml
       saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
+      saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -120,7 +138,7 @@ def gaps(
     for name in chosen:
         if name not in KNOWN:
             raise InputError(f"--sets: {unknown_name('set', name, KNOWN)}")
-    sources = [RecordingSource(name, data, scenes, labels) for name in chosen]
+    sources = [RecordingSource(name, data, scenes, labels, viewpoint) for name in chosen]
     taught, judged = (names(option, value) if value else () for option, value in (("--train", train), ("--test", test)))
     recordings = {source.name: _recordings(source) for source in sources}
     _check_names(recordings, taught, judged)
@@ -133,7 +151,9 @@ def gaps(
             raise InputError(f"set {name}: expected recordings to judge, {why}")
     if plot is not None and passes == 0:
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,))
+    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), _lengths(lengths))
+    if situations and (life == "shipped" or passes == 0):
+        raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
         for source in sources:
@@ -146,8 +166,9 @@ def gaps(
                 runs[source.name] = found
     if not any(run.gaps for found in runs.values() for run in found):
         raise InputError("expected recordings with gaps, there is none: longer ones are needed, or more --passes")
-    shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class)]
-    report(shown, {name: figures(found, against) for name, found in runs.items()}, json_file, markdown)
+    shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class, situations)]
+    told = {name: figures(found, against, situations) for name, found in runs.items()}
+    report(shown, told, json_file, markdown)
     if plot is not None:
         write_plot(plot, runs, against)
     if picture is not None:
@@ -161,6 +182,18 @@ def gaps(
 def _recordings(source: RecordingSource) -> tuple[str, ...]:
     with source.opened() as dataset:
         return dataset.scenes
+
+
+def _lengths(text: str | None) -> tuple[float, ...]:
+    """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
+    from pipelines.bench.gaps.gap import LENGTHS
+
+    known = {f"{length:g}": length for length in LENGTHS}
+    wanted = names("--lengths", text) if text else tuple(known)
+    for each in wanted:
+        if each not in known:
+            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {each!r:.40}")
+    return tuple(known[each] for each in known if each in wanted)
 
 
 def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str], judged: Sequence[str]) -> None:

@@ -220,7 +220,7 @@ def test_made_gaps_hide_one_object_among_others() -> None:
 def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated scenes of the benchmark that last for seconds."""
     settings = replace(SHORT, duration=7.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, viewpoint: simulated_set(scenes, settings=settings))
 
 
 @pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
@@ -336,7 +336,8 @@ def test_contenders_are_judged_on_the_same_gaps() -> None:
 def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     own, out = tmp_path / "own.yaml", tmp_path / "gaps.json"
     own.write_text("tracker: {explained_noise: 0.5}\n")
-    arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--life", "shipped"]
+    arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--life", "kept"]
+    arguments += ["--situations", "--lengths", "2"]
     arguments += ["--contenders", "kf", "--contender", f"own:saga={own}", "--json", str(out)]
     arguments += ["--plot", str(tmp_path / "gaps.png")]
     result = CliRunner().invoke(app, arguments)
@@ -346,12 +347,16 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     figures = json.loads(out.read_text())["simulated"]
     assert figures["recordings"] == ["scene-0001"]
     assert {row["contender"] for row in figures["gaps"]} == {"kf", "own"}
-    assert {row["life"] for row in figures["outcomes"]} == {"shipped"}
+    assert {row["life"] for row in figures["outcomes"]} == {"kept"}
+    assert {row["length"] for row in figures["outcomes"] if row["run"]} == {2.0}
+    assert "after 2 s, by situation" in result.output
+    everything = next(row for row in figures["situations"] if row["situation"] == "all")
+    assert everything["gaps"] + everything["lost"] == sum(row["run"] > 0 for row in figures["outcomes"]) / 2
 
 
 def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(SHORT, duration=1.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, viewpoint: simulated_set(scenes, settings=settings))
     arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--contenders", "kf"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
@@ -368,6 +373,8 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--train", "scene-0001", "--test", "scene-0001"], "in one of them only"),
         (["--train", "scene-0001", "--plot", "gaps.png"], "set simulated: expected recordings to judge"),
         (["--passes", "0", "--plot", "gaps.png"], "--plot: expected --passes of 1 or more"),
+        (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),
+        (["--situations", "--life", "shipped"], "--situations: expected --life kept or both"),
         (["--sets", "foo"], "megvii, centerpoint, camera, kitti, simulated, ngsim, openacc, argoverse2, eth_ucy"),
     ],
 )
