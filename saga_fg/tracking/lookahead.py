@@ -1,13 +1,14 @@
 """Look ahead: the tracks that are reported now at future times, predicted jointly, with edges that go on to act.
 
 The interval to a horizon is predicted in steps of at most `STEP`, each with the edges of the estimates at its start: as
-the leader slows down, gaps and rates change. Means and covariances are those that would be reported then without any
-further detection, see `saga_fg.tracking.reporting`. With s the probability that a track is stationary, c and b its
-calibration, P the filter's joint covariance and u the heading, the covariance between tracks i and j is
+the leader slows down, gaps and rates change. With s the probability that a track is stationary, and P the joint
+covariance of the filter, the covariance between tracks i and j is
 
-    c_i (1 - s_i) P_ij (1 - s_j) c_j     i != j
+    (1 - s_i) P_ij (1 - s_j)     i != j
 
-since whether an object is stationary, and the bias of its box, are its own; the blocks i = j are the reported ones.
+since whether an object is stationary is its own affair; the mean and the block i = j are those of
+`saga_fg.tracking.stationarity`. The calibration of reported covariances is left out: it is about the errors of
+detections (`saga_fg.tracking.reporting`), which soon are the smaller part.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking.prediction import predict
-from saga_fg.tracking.reporting import calibrated_covariance, reported_rows
+from saga_fg.tracking.reporting import reported_rows
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.predicted_tracks import PredictedTracks
 
@@ -78,21 +79,17 @@ def _predict_to(state: TrackerState, time: float) -> None:
 
 def _prediction(state: TrackerState, rows: IntArray) -> _Prediction:
     table, now = state.table.select(rows), state.reported_kinematics().select(rows)
-    P = calibrated_covariance(now.P, table.box.yaw, table.covariance_scale, table.position_bias)
-    return _Prediction(table.id, now.position, now.velocity, table.box.yaw, P, now.P_velocity)
+    return _Prediction(table.id, now.position, now.velocity, table.box.yaw, now.P, now.P_velocity)
 
 
 def _joint_covariance(state: TrackerState, rows: IntArray, own: FloatArray) -> FloatArray:
     """(2n, 2n) of the positions of the tracks `rows` (n,), whose own covariances are `own` (n, 2, 2)."""
     table, n = state.table.select(rows), len(rows)
-    weight = table.covariance_scale
-    if state.settings.stationarity.prior > 0:
-        unseen = table.coasting(state.time) > 0
-        weight = weight * np.where(unseen, 1 - table.stationarity.probability, 1.0)
     P = state.joint.position_covariance(table.id, table.label).reshape(n, 2, n, 2)
-    P = P * (weight[:, None] * weight)[:, None, :, None]
-    every = np.arange(n)
-    P[every, :, every] = own
+    if state.settings.stationarity.prior > 0:
+        moves = np.where(table.coasting(state.time) > 0, 1 - table.stationarity.probability, 1.0)
+        P = P * (moves[:, None] * moves)[:, None, :, None]
+    P[np.arange(n), :, np.arange(n)] = own
     return np.asarray(P.reshape(2 * n, 2 * n))
 
 

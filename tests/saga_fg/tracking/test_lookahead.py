@@ -84,12 +84,9 @@ def test_every_estimator_predicts_as_the_textbook(name, kind, monkeypatch):
             assert np.linalg.norm(found.joint_covariance[row] - P) < 1e-9 * np.linalg.norm(P)
 
 
-@pytest.mark.parametrize("sensor", [Sensor(), Sensor(noise={"default": NoiseModel(0.2, reported_deviation_scale=0.5)})])
-def test_joint_covariances_are_positive_definite_and_hold_those_of_each_track(sensor):
-    settings = TrackerSettings(CLASSES, edges=(LED,), stationarity=StationaritySettings(prior=0.5))
-    tracker = Tracker(settings, {"lidar": sensor})
-    label = ["truck", "car", "car"]
-    run(tracker, seen(np.random.default_rng(4), braking, np.arange(0, 3, 0.1), label=label))
+@pytest.mark.parametrize("stationary", [0.0, 0.5])
+def test_joint_covariances_are_positive_definite_and_hold_those_of_each_track(stationary):
+    tracker = followed(stationarity=StationaritySettings(prior=stationary))
     assert tracker.predict([1.0]).joint_covariance is None
     found = tracker.predict([0.0, *HORIZONS], joint=True)
     for P, own in zip(found.joint_covariance, found.position_covariance, strict=True):
