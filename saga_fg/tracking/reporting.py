@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
@@ -24,14 +24,8 @@ from saga_fg.types.track import Tracks
 
 def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     """The tracks to be reported, as of `timestamp` (s)."""
-    table, settings = state.table, state.settings
+    table, settings, rows = state.table, state.settings, reported_rows(state)
     coasting, tentative = table.coasting(state.time), table.tentative
-    rows = np.flatnonzero(
-        (~tentative | (settings.tentative_score_factor > 0))
-        & (table.confirmed | (table.existence >= settings.existence.report_above))
-        & (coasting <= settings.report_coasting)
-        & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
-    )
     table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
     boxes = table.boxes(now.position + state.origin, now.velocity)
     P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.position_bias)
@@ -39,6 +33,17 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     score = reported_score(table, certainty, coasting > 0, settings.existence)
     score = np.where(tentative[rows], settings.tentative_score_factor * score, score)
     return Tracks(timestamp, table.id, boxes, score, P, now.P_velocity, coasting)
+
+
+def reported_rows(state: TrackerState) -> IntArray:
+    """Rows of the tracks to be reported."""
+    table, settings = state.table, state.settings
+    return np.flatnonzero(
+        (~table.tentative | (settings.tentative_score_factor > 0))
+        & (table.confirmed | (table.existence >= settings.existence.report_above))
+        & (table.coasting(state.time) <= settings.report_coasting)
+        & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
+    )
 
 
 def reported_score(
