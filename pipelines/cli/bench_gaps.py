@@ -63,7 +63,13 @@ def gaps(
         typer.Option("--test", help="Judge these recordings alone, with commas.  [default: all but --train]"),
     ] = None,
     folds: Annotated[
-        int | None, typer.Option("--folds", min=2, help="Judge each fold of recordings after a fit to the others.")
+        str | None,
+        typer.Option(
+            "--folds",
+            help="Judge each of so many folds of the recordings after a fit to the others; place: each place (site of "
+            "ngsim, setting of openacc, sequence or log of others).",
+            metavar="N|place",
+        ),
     ] = None,
     labels: Annotated[
         bool, typer.Option("--labels", help="Take the visible annotations for detections, in all sets.")
@@ -123,6 +129,7 @@ def gaps(
       saga-fg bench gaps --data data --sets kitti --contenders saga,kf --contender trial=trial.yaml
       saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
       saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
+      saga-fg bench gaps --data data --sets ngsim --life kept --folds place --situations
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -144,7 +151,12 @@ def gaps(
     _check_names(recordings, taught, judged)
     if taught and folds is not None:
         raise InputError("--folds: goes without --train")
-    splits = {name: splits_of(found, taught, judged, folds) for name, found in recordings.items()}
+    number = _folds(folds)
+    splits = {}
+    for source in sources:
+        found = recordings[source.name]
+        unit = source.places(found) if number == 0 else source.clusters if number is not None else None
+        splits[source.name] = splits_of(found, taught, judged, number, unit)
     for name, split in splits.items():
         if not split and (sets or not any(splits.values())):
             why = "none is in --test" if judged else "all are in --train"
@@ -158,12 +170,13 @@ def gaps(
     with progress_bar(unit="runs") as progress:
         for source in sources:
             base = load_config(source.family, config)
-            compared = _contenders(contenders, own or [], interactions, base)
+            compared = _contenders(contenders, own or [], interactions, source.family, base)
             if against not in (known := tuple(each.name for each in compared)):
                 raise InputError(f"--against: {unknown_name('contender', against, known)}")
             if splits[source.name]:
-                found = bench_splits(source, splits[source.name], compared, base, settings, workers, progress)
-                runs[source.name] = found
+                runs[source.name] = bench_splits(
+                    source, splits[source.name], compared, base, settings, workers, progress
+                )
     if not any(run.gaps for found in runs.values() for run in found):
         raise InputError("expected recordings with gaps, there is none: longer ones are needed, or more --passes")
     shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class, situations)]
@@ -173,7 +186,7 @@ def gaps(
         write_plot(plot, runs, against)
     if picture is not None:
         source = next(each for each in sources if each.name in runs)
-        compared = _contenders(contenders, own or [], interactions, load_config(source.family, config))
+        compared = _contenders(contenders, own or [], interactions, source.family, load_config(source.family, config))
         better = next((each for each in compared if each.name != against), compared[0])
         pair = [next(each for each in compared if each.name == against), better]
         write_telling_picture(picture, source, runs[source.name], pair)
@@ -182,6 +195,15 @@ def gaps(
 def _recordings(source: RecordingSource) -> tuple[str, ...]:
     with source.opened() as dataset:
         return dataset.scenes
+
+
+def _folds(text: str | None) -> int | None:
+    """The number of folds, 0 for places. Raises `InputError` for others."""
+    if text is None or text == "place":
+        return None if text is None else 0
+    if not (text.isascii() and text.isdecimal() and int(text) >= 2):
+        raise InputError(f"--folds: expected a number of 2 or more, or place, got {text!r:.40}")
+    return int(text)
 
 
 def _lengths(text: str | None) -> tuple[float, ...]:
@@ -208,19 +230,19 @@ def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str],
 
 
 def _contenders(
-    chosen: str | None, own: Sequence[str], interactions: Path | None, base: TrackConfig
+    chosen: str | None, own: Sequence[str], interactions: Path | None, family: str | Path, base: TrackConfig
 ) -> list[Contender]:
     """The contenders to compare. Raises `InputError` for an unknown one and a wrong file."""
     from pipelines.bench.gaps.bench import Contender
-    from pipelines.bench.gaps.contenders import CONTENDERS
+    from pipelines.bench.gaps.contenders import contenders
     from pipelines.config import METHODS
     from pipelines.configuration import load_settings
 
-    found: list[Contender] = []
-    for name in names("--contenders", chosen) if chosen else CONTENDERS:
-        if name not in CONTENDERS:
-            raise InputError(f"--contenders: {unknown_name('contender', name, tuple(CONTENDERS))}")
-        contender = Contender.of(CONTENDERS[name], base)
+    known, found = contenders(family), list[Contender]()
+    for name in names("--contenders", chosen) if chosen else known:
+        if name not in known:
+            raise InputError(f"--contenders: {unknown_name('contender', name, tuple(known))}")
+        contender = Contender.of(known[name], base)
         if chosen or not any(contender.same_as(other) for other in found):
             found.append(contender)
     for text in own:

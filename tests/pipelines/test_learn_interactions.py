@@ -39,7 +39,7 @@ QUICK = LearningSettings(passes=1, gaps=GapSettings(longest=1.5))
 @pytest.fixture(scope="module")
 def scenes():
     return {
-        name: following_pairs(pairs=3, moments=70, seed=seed, name=name, apart=40.0)
+        name: following_pairs(pairs=2, moments=70, seed=seed, name=name, apart=40.0)
         for seed, name in enumerate(("one", "two"))
     }
 
@@ -76,7 +76,7 @@ def test_the_form_that_does_best_on_recordings_held_out_is_the_form_that_is_writ
 
 
 def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkeypatch, scenes):
-    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(time_constant=1.0, headway=5.0)))
+    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
     config = load_config("file")
     config = replace(config, tracker=replace(config.tracker, edges=()))
     found = learn_interactions(scenes, "two scenes", config, settings=QUICK)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -66,6 +66,10 @@ class RecordingSource:
             return {}
         recordings = TRAFFIC_SETS[self.name][0](self.data)
         return overlapping(recordings.recording(name) for name in recordings.names)
+
+    def places(self, recordings: Sequence[str]) -> Mapping[str, str]:
+        """The site or setting of each recording of traffic; of other sets, each is a place of its own."""
+        return {name: name.partition("-")[0] for name in recordings} if self.name in TRAFFIC_SETS else {}
 
     def scene(self, recording: str) -> Scene:
         """Read a recording."""
