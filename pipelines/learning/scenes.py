@@ -11,14 +11,15 @@ from data_tools.datasets.annotated import detected
 from data_tools.datasets.source import DatasetSource
 from pipelines.config import TrackConfig
 from pipelines.tracking import track_scene
+from saga_fg.model.sensor import Sensor
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.track import Tracks
 
 
 def scenes_to_learn_from(source: DatasetSource, config: TrackConfig, with_truth: bool) -> dict[str, Scene]:
-    """Scenes by name. With the truth, what is annotated and visible is detected, by the configuration's only sensor or
-    its default one. Without it, the tracks of the tracker without edges stand for the truth.
+    """Scenes by name. With the truth, what is annotated and visible is detected, by the only sensor that the
+    configuration has a model of. Without it, the tracks of the tracker without edges stand for the truth.
 
     Raises `InputError` for what cannot be read.
     """
@@ -31,9 +32,9 @@ def scenes_to_learn_from(source: DatasetSource, config: TrackConfig, with_truth:
 
 
 def _detected(scene: Scene, config: TrackConfig) -> Scene:
-    frames = detected(scene)
-    if DEFAULT not in config.sensors and len(config.sensors) == 1:
-        frames = [replace(frame, sensor=next(iter(config.sensors))) for frame in frames]
+    frames, named = detected(scene), [name for name in config.sensors if name != DEFAULT]
+    if len(named) == 1 and config.sensors.get(DEFAULT, Sensor()) == Sensor():
+        frames = [replace(frame, sensor=named[0]) for frame in frames]
     return replace(scene, frames=frames)
 
 

@@ -43,7 +43,8 @@ PRIOR = 2e-2  # weight of a unit of squared difference from the template, agains
 TAILS = 3.0  # degrees of freedom of the innovations
 PLACE_DEVIATION = 0.1  # m, of labels
 FEWEST = 30  # places of a class; classes with fewer share a scale
-MOST_GAPS = 400  # a random sample to learn from; more only take longer
+MOVED = 0.01  # m; edges that move a prediction by less do not reach it
+MOST_GAPS = 300  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
 _LED = Following(
@@ -112,20 +113,23 @@ class FittedInteractions:
 
 
 def fit_interactions(
-    sample: HiddenObjects, settings: TrackerSettings, template: Sequence[Rule] = TEMPLATE, iterations: int = 10
+    sample: HiddenObjects, settings: TrackerSettings, template: Sequence[Rule] = TEMPLATE, iterations: int = 8
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
     settings   of the tracker, with its base motion; template: where the search begins
 
-    Rules whose classes do not occur are left out. Raises `InputError` for a sample without gaps.
+    Rules whose classes do not occur are left out. Rules that reach no gap stay as they are, with a loss of NaN. Raises
+    `InputError` for a sample without gaps.
     """
     if len(sample) == 0:
         raise InputError("sample: expected at least one object that is followed for long enough")
-    sample = sample.sampled(MOST_GAPS, seed=0)
     occurring = set(np.unique(sample.label).tolist())
     parameters = RuleParameters.of([rule for rule in template if occurring & set(rule.classes)])
     start = parameters.start
+    sample = reached(sample, settings, parameters).sampled(MOST_GAPS, seed=0)
+    if len(sample) == 0:
+        return FittedInteractions(parameters.rules, math.nan)
 
     def loss(x: FloatArray) -> float:
         prediction = sample.predict(settings, parameters.valued(x))
@@ -134,6 +138,13 @@ def fit_interactions(
     options = {"maxiter": iterations, "eps": 1e-3}
     found = minimize(loss, start, method="L-BFGS-B", bounds=parameters.bounds, options=options)
     return FittedInteractions(parameters.valued(found.x), float(found.fun))
+
+
+def reached(sample: HiddenObjects, settings: TrackerSettings, parameters: RuleParameters) -> HiddenObjects:
+    """The gaps in which edges act where rates and widths are at their upper bounds; others say nothing about them."""
+    widest = parameters.valued(np.array([high for _, high in parameters.bounds]))
+    alone, acted = (sample.predict(settings, rules).position for rules in ((), widest))
+    return sample.select(np.flatnonzero((np.abs(acted - alone) > MOVED).any(axis=(1, 2))))
 
 
 def negative_log_likelihood(sample: HiddenObjects, prediction: GapPrediction) -> float:
