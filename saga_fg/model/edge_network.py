@@ -13,7 +13,7 @@ written once for NumPy, with which it runs, and JAX, with which it is trained.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class EdgeNetwork(Settings):
     Raises `InputError` for weights whose sizes don't fit or that are not finite.
     """
 
+    map_classes: ClassVar[tuple[str, ...]] = ()
     interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
         SharedVelocity, "interaction function of the edges"
     )
