@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
@@ -24,22 +24,32 @@ class Split:
 
 
 def splits_of(
-    recordings: Sequence[str], train: Sequence[str] = (), test: Sequence[str] = (), folds: int | None = None
+    recordings: Sequence[str],
+    train: Sequence[str] = (),
+    test: Sequence[str] = (),
+    folds: int | None = None,
+    unit: Mapping[str, str] | None = None,
 ) -> list[Split]:
     """Split the recordings of a set; `train` and `test` may name recordings of other sets as well.
 
     test   those that are judged; all but `train` if it is empty
-    folds  deal the judged recordings into so many, each judged after a fit to the others
+    folds  deal the judged recordings into so many, each judged after a fit to the others; 0: into units
+    unit   what recordings are dealt by: those of one unit are in one fold; each by itself where it has none
 
-    Raises `InputError` for more folds than recordings.
+    Raises `InputError` for more folds than units, and for units of which there is one.
     """
+    unit = unit or {}
     judged = [name for name in recordings if (name in test if test else name not in train)]
     if folds is None:
         return [Split(tuple(name for name in recordings if name in train), tuple(judged))] if judged else []
-    if folds > len(judged):
-        raise InputError(f"--folds {folds}: expected at most the number of recordings, {len(judged)}")
-    dealt = [tuple(judged[k::folds]) for k in range(folds)]
-    return [Split(tuple(name for name in judged if name not in fold), fold) for fold in dealt]
+    units = list(dict.fromkeys(unit.get(name, name) for name in judged))
+    if folds == 0 and len(units) == 1:
+        raise InputError(f"--folds place: expected recordings of two places or more, all are of {units[0]}")
+    if folds > len(units):
+        raise InputError(f"--folds {folds}: expected at most the number of recordings, {len(units)}")
+    dealt = [set(units[k :: folds or len(units)]) for k in range(folds or len(units))]
+    parts = [tuple(name for name in judged if unit.get(name, name) in fold) for fold in dealt]
+    return [Split(tuple(name for name in judged if name not in part), part) for part in parts]
 
 
 def bench_splits(
