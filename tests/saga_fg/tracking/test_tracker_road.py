@@ -119,11 +119,11 @@ def test_an_unreported_light_is_believed_by_who_stops_and_who_goes():
     halted = believed(light_frames(lambda time: 3.0))
     braking = believed(light_frames(lambda time: 30 - 10 * time + 2.0 * time**2 / 2, 2.5))
     passing = believed(light_frames(lambda time: 32 - 12 * time, 2.5))
-    starting = believed(light_frames(lambda time: 3.0 - max(0, time - 2) ** 2, 3.6))
+    starting = believed(light_frames(lambda time: 3.0 - max(0, time - 2) ** 2, 4.0))
     assert halted["red"] > 0.7 > before["red"]
     assert braking["red"] > 0.7
     assert passing["green"] > before["green"] + 0.15
-    assert starting["green"] > 0.65
+    assert starting["green"] > before["green"] + 0.15
 
 
 def test_two_vehicles_tell_more_than_one_and_heedless_drivers_nothing():
