@@ -55,6 +55,7 @@ class Contender:
 class Run:
     """A contender's outcomes in the gaps of one recording, and its links in the run without made gaps.
 
+    links       None of a contender that does not track
     cluster     the first of the recordings that overlap with this one, or itself
     situations  of the object of each gap, by the length until which; none for real gaps
     """
@@ -67,7 +68,7 @@ class Run:
     label: tuple[str, ...]
     situations: tuple[Mapping[float, frozenset[str]], ...]
     outcomes: tuple[GapOutcome, ...]
-    links: Links
+    links: Links | None
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,15 @@ class _Preparation:
 
 
 def _perform(job: _Job) -> list[Run]:
-    labelled, gaps = _prepared(_Preparation(job.source, job.recording, job.settings, job.contender.config.sensors))
+    labelled, gaps = prepared(job.source, job.recording, job.settings, job.contender.config.sensors)
     return [run_of(labelled, gaps, job.contender, life) for life in job.settings.lives]
+
+
+def prepared(
+    source: RecordingSource, recording: str, settings: GapBenchSettings, sensors: Mapping[str, Sensor]
+) -> tuple[LabelledScene, list[Gap]]:
+    """A recording and its gaps; the latest one is kept, for the next contender."""
+    return _prepared(_Preparation(source, recording, settings, sensors))
 
 
 @lru_cache(maxsize=1)
