@@ -108,7 +108,7 @@ class SignalSettings(Settings):
 
 def colours(belief: FloatArray) -> FloatArray:
     """Probabilities (3,) of red, amber and green of a belief (4,)."""
-    return np.bincount(COLOUR_OF_STATE, belief, len(COLOURS))
+    return np.asarray(np.bincount(COLOUR_OF_STATE, belief, len(COLOURS)), dtype=np.float64)
 
 
 def colour_updated(belief: FloatArray, colour: int, accuracy: float) -> FloatArray:

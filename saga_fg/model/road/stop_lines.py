@@ -33,7 +33,7 @@ class Approach(NamedTuple):
 
     def select(self, rows: IntArray | BoolArray) -> Approach:
         """Some of the pairs."""
-        return Approach(*(column[rows] for column in self))
+        return Approach(self.comes[rows], self.way[rows], self.direction[rows], self.crossing[rows])
 
 
 def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:

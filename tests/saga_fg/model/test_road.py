@@ -221,8 +221,8 @@ def test_the_way_to_a_line_is_along_the_lane():
         {1: lane, 2: np.stack([end - t + 1.75 * across, end - t - 1.75 * across])},
         {1: 3.5},
     )
-    ends = [tuple(point) for point in with_line.outline[2].tolist()]
-    crossing = LaneAcross.of(Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", *ends, "light"))
+    left, right = (tuple(point) for point in with_line.outline[2].tolist())
+    crossing = LaneAcross.of(Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light"))
     assert crossing is not None
     assert len(RedLight().pairs(with_line).target) == 0  # straight on it would miss the line
     with_line = replace(with_line, lanes={2: (crossing,)}, derived={})
