@@ -16,15 +16,16 @@ import numpy as np
 
 from data_tools.evaluation.hota import HotaRow
 from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
+from pipelines.bench.gaps.learned import learn_interactions
+from pipelines.bench.predictions import PredictionErrors, PredictionRecorder
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import Variant, variants
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories
 from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Dataset
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
@@ -55,7 +56,8 @@ class TrackingBenchSettings:
 class VariantResult:
     """One variant on one set: headline figures, errors at labels scene by scene, ms of CPU time a frame.
 
-    stages  ms a frame by stage, of the trackers that tell (not `centerpoint`)
+    stages       ms a frame by stage, of the trackers that tell (not `centerpoint`)
+    predictions  errors of predictions, scene by scene, of the methods that predict covariances (not `centerpoint`)
     """
 
     variant: Variant
@@ -63,6 +65,7 @@ class VariantResult:
     figures: Mapping[str, float]
     milliseconds: float
     stages: Mapping[str, float]
+    predictions: tuple[PredictionErrors, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +87,18 @@ class SetResult:
 
 
 class _Timed:
-    """A tracker with a clock."""
+    """A tracker with a clock; with `predictions`, recorded while the clock stands still."""
 
-    def __init__(self, tracker: OnlineTracker, stages: StageClock) -> None:
-        self.seconds, self._tracker, self._stages = 0.0, tracker, stages
+    def __init__(self, tracker: OnlineTracker, stages: StageClock, predictions: PredictionRecorder | None) -> None:
+        self.seconds, self._tracker, self._stages, self._predictions = 0.0, tracker, stages, predictions
 
     def step(self, frame: Frame) -> Tracks:
         self._stages.start()
         begin = time.thread_time()
         tracks = self._tracker.step(frame)
         self.seconds += time.thread_time() - begin
+        if self._predictions is not None and isinstance(self._tracker, Tracker):
+            self._predictions.after(self._tracker, tracks)
         return tracks
 
     def tracks(self, timestamp: float) -> Tracks:
@@ -114,19 +119,23 @@ def bench_set(
     compared = variants(base, settings.components, settings.contenders)
     learned: dict[str, LearnedInteractions] = {}
     if settings.contenders:
-        learned = learn_by_folds(recordings.dataset, progress)
+        learned = learn_by_folds(recordings.dataset, base, progress)
         compared += (LEARNED,)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
     scenes = recordings.dataset.scenes
+    predictions: dict[str, list[PredictionErrors]] = {name: [] for name in runs}
     for name in scenes:
         scene = recordings.dataset.scene(name)
         for done, variant in enumerate(compared):
             clock = clocks[variant.name]
             config = base.with_interactions(learned[name]) if variant is LEARNED else variant.config(base)
-            timed = _Timed(config.new_tracker(variant.method, clock), clock)
+            recorder = PredictionRecorder() if variant.name in (SAGA, KF) else None
+            timed = _Timed(config.new_tracker(variant.method, clock), clock, recorder)
             runs[variant.name][name] = track_scene(scene, timed)
             seconds[variant.name] += timed.seconds
+            if recorder is not None:
+                predictions[variant.name].append(recorder.errors(scene))
             if progress is not None:
                 progress(f"{recordings.name} {name}", done + 1, len(compared))
     results = {}
@@ -137,7 +146,8 @@ def bench_set(
         stages = {stage: per_frame * spent for stage, spent in clocks[variant.name].seconds.items()}
         spent = per_frame * seconds[variant.name]
         judged = {f"HOTA {row.label}": row.figures.hota for row in _in_space(score)} if settings.contenders else {}
-        results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages)
+        ahead = tuple(predictions[variant.name])
+        results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages, ahead)
     differences = graph_differences(results[SAGA].score, results[KF].score, settings)
     return SetResult(recordings.name, scenes, results, differences)
 
@@ -147,20 +157,21 @@ def _in_space(score: Score) -> list[HotaRow]:
     return [row for row in score.hota() if row.label == "car" and row.overlap == "3D"]
 
 
-def learn_by_folds(dataset: Dataset, progress: Progress | None = None) -> dict[str, LearnedInteractions]:
+def learn_by_folds(
+    dataset: Dataset, base: TrackConfig, progress: Progress | None = None
+) -> dict[str, LearnedInteractions]:
     """Interactions for every scene, learned from the truth of the scenes of the other fold.
 
     Raises `InputError` for a single scene.
     """
     if len(dataset.scenes) < FOLDS:
         raise InputError(f"{', '.join(dataset.scenes)}: expected scenes to learn from beside it")
-    trajectories = {name: Trajectories.of_truth(dataset.scene(name)) for name in dataset.scenes}
     learned: dict[str, LearnedInteractions] = {}
     for fold in range(FOLDS):
         tested = dataset.scenes[fold::FOLDS]
-        others = {name: found for name, found in trajectories.items() if name not in tested}
-        found = learn_interactions(others, f"scenes {', '.join(others)}", progress=progress)
-        learned |= dict.fromkeys(tested, found)
+        others = {name: dataset.scene(name) for name in dataset.scenes if name not in tested}
+        found = learn_interactions(others, f"scenes {', '.join(others)}", base, progress=progress)
+        learned |= dict.fromkeys(tested, found.interactions)
     return learned
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
@@ -167,9 +166,6 @@ class ExistenceSettings(Settings):
     hit_ratio_weight: NonNegative = setting(
         0.0, "power of the hit ratio (hits / opportunities) in the score of a track; 0: it does not count"
     )
-    coasting_score_factor: Fraction = setting(
-        1.0, "factor on the score of a track that was not detected in the frame; lower: coasting tracks rank lower"
-    )
     occlusion_weight: Fraction = setting(
         0.0, "share by which full occlusion by another track lowers the detection probability; 0: occlusion is ignored"
     )
@@ -239,11 +235,9 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
-        settings_group(
-            traffic_rules,
-            "edge rules of the scene graph: who interacts with whom; []: no interactions",
-        )
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | InLane | ConeLine | Attached, ...] = settings_group(
+        traffic_rules,
+        "edge rules of the scene graph: who interacts with whom; []: no interactions",
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"
