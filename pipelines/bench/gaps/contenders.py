@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pipelines.bench.gaps.gap import LONGEST
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.tracking import ClassSettings
 
@@ -42,12 +42,12 @@ def _moving(turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, 
     def change(classes: Mapping[str, ClassSettings]) -> Mapping[str, ClassSettings]:
         found = dict(classes)
         for label, own in classes.items():
-            fading = isinstance(own.motion, ConstantAcceleration)
-            noise = getattr(own.motion, "acceleration_noise", CLASSICAL_NOISE if fading else None)
+            fading = isinstance(own.motion, ConstantAcceleration | Curvilinear)
+            noise = getattr(own.motion, "acceleration_noise", None) or (CLASSICAL_NOISE if fading else None)
             if noise is not None:
                 turns = turn and label in TURNING
                 motion = CoordinatedTurn(noise) if turns else ConstantVelocity(noise)
-                found[label] = replace(own, motion=motion, turn_time=0.0)
+                found[label] = replace(own, motion=motion)
         return found
 
     return change
