@@ -6,6 +6,7 @@ from .tracking import GreedyTracker, Tracker, TrackerSettings
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
+from .types.predicted_tracks import PredictedTracks
 from .types.track import Track, Tracks
 
 __version__: str
@@ -25,6 +26,7 @@ __all__ = [
     "InputError",
     "MissingExtraError",
     "NodeType",
+    "PredictedTracks",
     "RandomWalk",
     "SagaError",
     "Scene",

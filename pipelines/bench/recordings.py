@@ -174,19 +174,23 @@ def simulated_set(scenes: int, seed: int = 0, settings: SimulatorSettings | None
     return TrueSet("simulated", "simulated", SimulatedTraffic(settings, scenes, seed))
 
 
-def recording_set(name: str, data: Path | None, scenes: int) -> RecordingSet:
+def recording_set(name: str, data: Path | None, scenes: int, viewpoint: str | None = None) -> RecordingSet:
     """A set by name; `data` holds a folder for each kind of recordings, `scenes` simulated ones are made.
+
+    viewpoint  of the sensors that see recorded traffic, see `data_tools.simulator.recorded_world`; None: the set's own
 
     Raises `InputError` for an unknown name or missing recordings.
     """
     if name == "simulated":
         return simulated_set(scenes)
-    build = (SETS | TRAFFIC_SETS).get(name)
-    if build is None:
+    if name not in (*SETS, *TRAFFIC_SETS):
         raise InputError(f"unknown set {name!r}: expected some of {', '.join((*SETS, *TRAFFIC_SETS))}, simulated")
     if data is None:
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
-    return build(data)
+    if name in SETS:
+        return SETS[name](data)
+    recordings, usual = TRAFFIC_SETS[name]
+    return TrueSet(name, "traffic", SensedRecordings(recordings(data), viewpoint or usual, None, seed=0))
 
 
 def _nuscenes(name: str, split: str, sensor: str, file: str) -> Callable[[Path], RecordingSet]:
@@ -197,19 +201,14 @@ def _nuscenes(name: str, split: str, sensor: str, file: str) -> Callable[[Path],
     return build
 
 
-def _traffic(name: str, recordings: TrafficRecordings, viewpoint: str) -> RecordingSet:
-    """Recorded traffic with made detections."""
-    return TrueSet(name, "traffic", SensedRecordings(recordings, viewpoint, None, seed=0))
-
-
 SETS: dict[str, Callable[[Path], RecordingSet]] = {
     "megvii": _nuscenes("megvii", "mini_train", "lidar", "megvii_lidar.json"),
     "centerpoint": _nuscenes("centerpoint", "lidar_centerpoint", "lidar", "centerpoint_lidar.json"),
     "camera": _nuscenes("camera", "camera", "camera", "fastbev_camera.json"),
     "kitti": lambda data: KittiSet("kitti", data / "kitti", data / "kitti" / "detections" / "pointrcnn"),
 }
-TRAFFIC_SETS: dict[str, Callable[[Path], RecordingSet]] = {
-    "ngsim": lambda data: _traffic("ngsim", NgsimWindows(data / "ngsim"), MAST),
-    "openacc": lambda data: _traffic("openacc", OpenAccPlatoons(data / "openacc"), VEHICLE),
+TRAFFIC_SETS: dict[str, tuple[Callable[[Path], TrafficRecordings], str]] = {
+    "ngsim": (lambda data: NgsimWindows(data / "ngsim"), MAST),
+    "openacc": (lambda data: OpenAccPlatoons(data / "openacc"), VEHICLE),
 }
-"""Sets that are taken only where they are asked for."""
+"""Recorded traffic, whose detections are made, and the usual viewpoint; taken only where it is asked for."""

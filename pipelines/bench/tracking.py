@@ -16,6 +16,7 @@ import numpy as np
 
 from data_tools.evaluation.hota import HotaRow
 from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
+from pipelines.bench.predictions import PredictionErrors, PredictionRecorder
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import Variant, variants
 from pipelines.config import TrackConfig
@@ -25,6 +26,7 @@ from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scen
 from saga_fg.errors import InputError
 from saga_fg.learning import Trajectories
 from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Dataset
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
@@ -55,7 +57,8 @@ class TrackingBenchSettings:
 class VariantResult:
     """One variant on one set: headline figures, errors at labels scene by scene, ms of CPU time a frame.
 
-    stages  ms a frame by stage, of the trackers that tell (not `centerpoint`)
+    stages       ms a frame by stage, of the trackers that tell (not `centerpoint`)
+    predictions  errors of predictions, scene by scene, of the methods that predict covariances (not `centerpoint`)
     """
 
     variant: Variant
@@ -63,6 +66,7 @@ class VariantResult:
     figures: Mapping[str, float]
     milliseconds: float
     stages: Mapping[str, float]
+    predictions: tuple[PredictionErrors, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +88,18 @@ class SetResult:
 
 
 class _Timed:
-    """A tracker with a clock."""
+    """A tracker with a clock; with `predictions`, recorded while the clock stands still."""
 
-    def __init__(self, tracker: OnlineTracker, stages: StageClock) -> None:
-        self.seconds, self._tracker, self._stages = 0.0, tracker, stages
+    def __init__(self, tracker: OnlineTracker, stages: StageClock, predictions: PredictionRecorder | None) -> None:
+        self.seconds, self._tracker, self._stages, self._predictions = 0.0, tracker, stages, predictions
 
     def step(self, frame: Frame) -> Tracks:
         self._stages.start()
         begin = time.thread_time()
         tracks = self._tracker.step(frame)
         self.seconds += time.thread_time() - begin
+        if self._predictions is not None and isinstance(self._tracker, Tracker):
+            self._predictions.after(self._tracker, tracks)
         return tracks
 
     def tracks(self, timestamp: float) -> Tracks:
@@ -119,14 +125,18 @@ def bench_set(
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
     scenes = recordings.dataset.scenes
+    predictions: dict[str, list[PredictionErrors]] = {name: [] for name in runs}
     for name in scenes:
         scene = recordings.dataset.scene(name)
         for done, variant in enumerate(compared):
             clock = clocks[variant.name]
             config = base.with_interactions(learned[name]) if variant is LEARNED else variant.config(base)
-            timed = _Timed(config.new_tracker(variant.method, clock), clock)
+            recorder = PredictionRecorder() if variant.name in (SAGA, KF) else None
+            timed = _Timed(config.new_tracker(variant.method, clock), clock, recorder)
             runs[variant.name][name] = track_scene(scene, timed)
             seconds[variant.name] += timed.seconds
+            if recorder is not None:
+                predictions[variant.name].append(recorder.errors(scene))
             if progress is not None:
                 progress(f"{recordings.name} {name}", done + 1, len(compared))
     results = {}
@@ -137,7 +147,8 @@ def bench_set(
         stages = {stage: per_frame * spent for stage, spent in clocks[variant.name].seconds.items()}
         spent = per_frame * seconds[variant.name]
         judged = {f"HOTA {row.label}": row.figures.hota for row in _in_space(score)} if settings.contenders else {}
-        results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages)
+        ahead = tuple(predictions[variant.name])
+        results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages, ahead)
     differences = graph_differences(results[SAGA].score, results[KF].score, settings)
     return SetResult(recordings.name, scenes, results, differences)
 

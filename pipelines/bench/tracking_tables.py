@@ -6,12 +6,16 @@ from typing import Any
 
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, calibration, error_summary, errors_by_class
-from pipelines.bench.tracking import SetResult, verdict
+from pipelines.bench.predictions import PredictionErrors, prediction_figures
+from pipelines.bench.tracking import KF, SAGA, SetResult, verdict
 
 
 def tables(result: SetResult) -> list[FigureTable]:
-    """For people: the variants, times by stage, what the graph changes, the consistency of the covariances."""
-    return [_variants(result), _stages(result), *_differences(result), *_calibrations(result)]
+    """For people: variants, times by stage, what the graph changes, consistency of the covariances, predictions."""
+    return [
+        *(_variants(result), _stages(result)),
+        *(*_differences(result), *_calibrations(result), *_predictions(result)),
+    ]
 
 
 def figures(result: SetResult) -> dict[str, Any]:
@@ -32,6 +36,7 @@ def figures(result: SetResult) -> dict[str, Any]:
             name: {"difference": interval, "verdict": verdict(name, interval)}
             for name, interval in result.differences.items()
         },
+        "predictions": prediction_figures(_predicting(result), KF),
         "calibration": {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()},
     }
 
@@ -92,3 +97,26 @@ def _calibrations(result: SetResult) -> list[FigureTable]:
     )
     columns = ("class", "objects", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
     return [FigureTable(f"{result.name}: errors within saga's ellipses, in %", columns, rows)] if rows else []
+
+
+def _predictions(result: SetResult) -> list[FigureTable]:
+    rows = tuple(
+        (
+            "moving" if f.moving else "all",
+            cell(f.horizon, 0),
+            f.method,
+            cell(f.predictions, 0),
+            cell(f.error, 2),
+            "" if f.change is None else ", ".join(_interval("RMSE", f.change)),
+            cell(f.nll, 2),
+            *(cell(100 * share, 0) for share in f.coverage.values()),
+        )
+        for f in prediction_figures(_predicting(result), KF)
+    )
+    names = ("objects", "s ahead", "method", "predictions", "mean error, m", f"against {KF}, from, to", "NLL")
+    title = f"{result.name}: predictions of objects that are detected now"
+    return [FigureTable(title, (*names, "in 50 %", "in 90 %"), rows)] if rows else []
+
+
+def _predicting(result: SetResult) -> dict[str, tuple[PredictionErrors, ...]]:
+    return {name: result.variants[name].predictions for name in (KF, SAGA)}

@@ -209,6 +209,14 @@ class JointTrackState:
                 result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
         return result
 
+    def position_covariance(self, ids: IntArray, label: StrArray) -> FloatArray:
+        """(2n, 2n) joint covariance of the positions of n tracks, track by track."""
+        types = self.types_of(label)
+        start = np.cumsum([0, *(node_type.dim for node_type in types)])
+        at = [offset + node_type.index(POSITION) for offset, node_type in zip(start[:-1], types, strict=True)]
+        places = np.concatenate([np.empty(0, dtype=np.int64), *at])
+        return np.asarray(self.estimator.joint_covariance(ids)[np.ix_(places, places)])
+
     def snapshot(self) -> Any:
         """The state as a value."""
         return self.estimator.snapshot(), dict(self._initiated), dict(self._modes)

@@ -25,8 +25,11 @@ log = logging.getLogger(__name__)
 MOST_STEPS = 100  # that an interval is predicted in
 
 
-def predict(state: TrackerState, time: float) -> None:
-    """Predict to a `time` counted from the state's start, s, which is not before the state's."""
+def predict(state: TrackerState, time: float, ahead: bool = False) -> None:
+    """Predict to a `time` counted from the state's start, s, which is not before the state's.
+
+    ahead: of all detections to come, so that the headings of detected tracks too turn with their velocities.
+    """
     settings, dt = state.settings, time - state.time
     if dt > 0 and not state.joint.empty:
         wanted = dt / settings.max_step
@@ -34,22 +37,22 @@ def predict(state: TrackerState, time: float) -> None:
         if wanted > MOST_STEPS:
             log.warning("%g s are predicted in %d steps, max_step asks for %.3g", dt, steps, wanted)
         for _ in range(steps):
-            _predict_step(state, dt / steps)
+            _predict_step(state, dt / steps, ahead)
         state.table.box.predict(dt, state.class_values(state.table.label, "yaw_drift")[0])
     state.time = time
 
 
-def _predict_step(state: TrackerState, dt: float) -> None:
+def _predict_step(state: TrackerState, dt: float, ahead: bool) -> None:
     """Predict by `dt` s with the edges of the present estimates."""
     table = state.table
-    coasting = table.last_detected < state.time
+    unseen = ahead | (table.last_detected < state.time)
     noise = _predict_stationarity(state, dt)
     explained = state.settings.explained_noise
     state.graph = build_graph(node_table(state), state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
     state.graph = replace(state.graph, modes=_known_courses(state, dt))
     state.joint.predict(state.graph, dt)
-    table.box.turn_with(before, state.kinematics().velocity, coasting)
+    table.box.turn_with(before, state.kinematics().velocity, unseen)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
 

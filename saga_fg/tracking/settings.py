@@ -166,9 +166,6 @@ class ExistenceSettings(Settings):
     hit_ratio_weight: NonNegative = setting(
         0.0, "power of the hit ratio (hits / opportunities) in the score of a track; 0: it does not count"
     )
-    coasting_score_factor: Fraction = setting(
-        1.0, "factor on the score of a track that was not detected in the frame; lower: coasting tracks rank lower"
-    )
     occlusion_weight: Fraction = setting(
         0.0, "share by which full occlusion by another track lowers the detection probability; 0: occlusion is ignored"
     )

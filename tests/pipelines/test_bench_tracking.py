@@ -89,6 +89,7 @@ def test_a_set_is_tracked_by_every_variant() -> None:
     assert not result.variants["centerpoint"].stages
     assert len(result.errors("saga")) == len(result.errors("kf"))
     assert "velocity RMSE" in result.differences
+    assert [len(result.variants[name].predictions) for name in ("saga", "kf", "centerpoint")] == [2, 2, 0]
 
 
 def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.MonkeyPatch) -> None:
