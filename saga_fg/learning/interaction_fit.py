@@ -44,7 +44,7 @@ FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
 MOST_GAPS = 500  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
-_LED = Following(SharedVelocity(), rate=1.0, gap_scale=18.0, lateral_scale=1.2, classes=ROAD_USERS, leaders="moving")
+_LED = Following(SharedVelocity(), rate=2.0, gap_scale=16.0, lateral_scale=1.2, classes=ROAD_USERS, leaders="moving")
 TEMPLATE: tuple[Rule, ...] = (
     _LED,
     replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.2, leaders="stationary"),

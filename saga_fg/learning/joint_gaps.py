@@ -16,7 +16,8 @@ from saga_fg.learning.gaps import GapSample, GapSettings, gap_moments
 from saga_fg.learning.independent_filter import INITIAL_SPEED_DEVIATION, FilteredTrajectories
 from saga_fg.learning.trajectories import Trajectories
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray

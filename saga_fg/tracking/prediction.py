@@ -11,17 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.model.edge_rules import build_graph
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.known_turn import KnownTurns, turns_as_known
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.deletion import untrackable
+from saga_fg.tracking.known_turns import known_turns
 from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
 
-LEAST_TURN = 0.01  # rad/s; less is straight on: 0.2 m aside in 2 s at 10 m/s, within the noise of a detection
 MOST_STEPS = 100  # that an interval is predicted in
 
 
@@ -50,10 +48,12 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool) -> None:
     explained = state.settings.explained_noise
     state.graph = build_graph(node_table(state), state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
-    state.graph = replace(state.graph, modes=_known_turns(state))
+    turns, heading = known_turns(state, dt, unseen)
+    state.graph = replace(state.graph, modes=turns)
     state.joint.predict(state.graph, dt)
     table.turn.predict(dt, state.class_values(table.label, "turn_time")[0])
     table.box.turn_with(before, state.kinematics().velocity, unseen)
+    table.box.yaw = np.where(np.isfinite(heading), heading, table.box.yaw)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
 
@@ -65,21 +65,6 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
         return None
     stationarity.predict(dt, state.kinematics(), settings)
     return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
-
-
-def _known_turns(state: TrackerState) -> tuple[KnownTurns, ...]:
-    """The turns of moving tracks whose classes turn, by motion and time constant."""
-    table = state.table
-    fading_time, rate = state.class_values(table.label, "turn_time")[0], table.turn.known()
-    turning = (fading_time > 0) & (np.abs(rate) > LEAST_TURN) & (np.hypot(*state.kinematics().velocity.T) > MOVING)
-    found = []
-    for node_type, rows in state.joint.rows_by_type(table.label[turning], moving=True) if turning.any() else []:
-        rows = np.flatnonzero(turning)[rows]
-        if turns_as_known(node_type):
-            for time in np.unique(fading_time[rows]).tolist():
-                same = rows[fading_time[rows] == time]
-                found.append(KnownTurns(node_type, table.id[same], rate[same], time))
-    return tuple(found)
 
 
 def node_table(state: TrackerState) -> NodeTable:

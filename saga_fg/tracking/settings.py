@@ -32,6 +32,7 @@ from saga_fg.settings import (
 from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName, EstimatorName
 from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.trails import TrailSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.road_map import RoadMap
 from saga_fg.types.signal import SignalSettings
@@ -88,6 +89,11 @@ class ClassSettings(Settings):
     turn_time: NonNegative = setting(
         0.0,
         "time constant with which a turn seen in the headings fades, s; usual 1 to 3, 0: none; higher: longer curves",
+    )
+    course_time: NonNegative = setting(
+        0.0,
+        "time constant with which the velocity across the course of an undetected object fades, s; usual 0.5 to 2, "
+        "0: never; lower: it keeps to its path, that of its heading and of earlier traffic",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
@@ -274,6 +280,7 @@ class TrackerSettings(Settings):
     traffic_flow_prior: TrafficFlowSettings = settings_group(
         TrafficFlowSettings, "speed of new tracks from the traffic around them"
     )
+    trails: TrailSettings = settings_group(TrailSettings, "paths of undetected objects from those of earlier traffic")
     stationarity: StationaritySettings = settings_group(
         StationaritySettings, "estimation of which objects are stationary"
     )

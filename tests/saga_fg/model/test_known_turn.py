@@ -72,3 +72,45 @@ def test_motions_that_turn_by_themselves_do_not_turn_twice():
     assert turns_as_known(TRAM)
     assert not turns_as_known(NodeType("car", CoordinatedTurn()))
     assert not turns_as_known(NodeType("car", Mixture()))
+
+
+def on_course(node_type, rate, course, course_rate):
+    graph = SceneGraph.of([7], node_type)
+    one = (np.array([each], dtype=float) for each in (rate, course, course_rate))
+    turn, course, fades = one
+    return SceneGraph(graph.nodes, graph.types, modes=(KnownTurns(node_type, graph.nodes, turn, LONG, course, fades),))
+
+
+def test_what_is_across_the_course_fades_and_what_is_along_stays():
+    """On a straight course: the velocity across fades like exp(-k t), and moves the object by its integral."""
+    F = discretise(on_course(CAR, 0.0, 0.0, 2.0), 0.5).F[0].values[0]
+    left = (1 - np.exp(-1.0)) / 2.0
+    assert pytest.approx([5.0, left, 10.0, np.exp(-1.0)]) == F @ [0, 0, 10.0, 1.0]
+
+
+def test_on_a_bend_the_course_turns_with_the_velocity():
+    """Who moves along the course has the motion of the turn alone, and keeps the speed."""
+    course = 0.7
+    x = np.array([1.0, 2.0, 8 * np.cos(course), 8 * np.sin(course)])
+    plain, led = (
+        discretise(g, 0.5).F[0].values[0] for g in (turning(CAR, np.array([0.4])), on_course(CAR, 0.4, course, 2))
+    )
+    assert led @ x == pytest.approx(plain @ x)
+    assert np.hypot(*(led @ x)[2:]) == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("node_type", [CAR, TRAM])
+def test_two_half_steps_along_a_course_are_as_one(node_type):
+    graph, dt = on_course(node_type, 0.4, -0.3, 1.5), 0.2
+    halves = discretise(graph.after(dt / 2), dt / 2).F_matrix @ discretise(graph, dt / 2).F_matrix
+    whole = discretise(graph, dt).F_matrix.toarray()
+    at = node_type.index(VELOCITY)
+    assert whole[at][:, at] == pytest.approx(halves.toarray()[at][:, at], abs=1e-12)
+    assert whole == pytest.approx(halves.toarray(), abs=2e-3)
+
+
+def test_a_course_that_nothing_fades_on_changes_nothing():
+    plain, led = (
+        discretise(g, 0.5).F_matrix.toarray() for g in (turning(CAR, np.array([0.4])), on_course(CAR, 0.4, 1, 0))
+    )
+    assert led == pytest.approx(plain, abs=1e-8)
