@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
@@ -242,11 +241,9 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
-        settings_group(
-            traffic_rules,
-            "edge rules of the scene graph: who interacts with whom; []: no interactions",
-        )
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | InLane | ConeLine | Attached, ...] = settings_group(
+        traffic_rules,
+        "edge rules of the scene graph: who interacts with whom; []: no interactions",
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"
