@@ -15,6 +15,7 @@ from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
@@ -241,9 +242,11 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | RedLight | InLane | ConeLine | Attached, ...] = settings_group(
-        traffic_rules,
-        "edge rules of the scene graph: who interacts with whom; []: no interactions",
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | GreenLight | InLane | ConeLine | Attached, ...] = (
+        settings_group(
+            traffic_rules,
+            "edge rules of the scene graph: who interacts with whom; []: no interactions",
+        )
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"
