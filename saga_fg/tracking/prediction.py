@@ -15,7 +15,7 @@ from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.deletion import untrackable
-from saga_fg.tracking.known_turns import known_turns
+from saga_fg.tracking.known_courses import known_courses
 from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
@@ -50,10 +50,9 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
     state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
-    turns, heading = known_turns(state, dt, unseen)
-    state.graph = replace(state.graph, modes=turns)
+    courses, heading = known_courses(state, dt, unseen)
+    state.graph = replace(state.graph, modes=courses)
     state.joint.predict(state.graph, dt)
-    table.turn.predict(dt, state.class_values(table.label, "turn_time")[0])
     table.box.turn_with(before, state.kinematics().velocity, unseen)
     table.box.yaw = np.where(np.isfinite(heading), heading, table.box.yaw)
     state.map_nodes.predict(dt)
