@@ -16,15 +16,14 @@ import numpy as np
 
 from data_tools.evaluation.hota import HotaRow
 from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
+from pipelines.bench.gaps.learned import learn_interactions
 from pipelines.bench.predictions import PredictionErrors, PredictionRecorder
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import GRAPH_MATCHING, Variant, variants
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
@@ -120,7 +119,7 @@ def bench_set(
     compared = variants(base, settings.components, settings.contenders)
     learned: dict[str, LearnedInteractions] = {}
     if settings.contenders:
-        learned = learn_by_folds(recordings, progress)
+        learned = learn_by_folds(recordings, base, progress)
         compared += (LEARNED,)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
@@ -165,7 +164,9 @@ def _in_space(score: Score) -> list[HotaRow]:
     return [row for row in score.hota() if row.label == "car" and row.overlap == "3D"]
 
 
-def learn_by_folds(recordings: RecordingSet, progress: Progress | None = None) -> dict[str, LearnedInteractions]:
+def learn_by_folds(
+    recordings: RecordingSet, base: TrackConfig, progress: Progress | None = None
+) -> dict[str, LearnedInteractions]:
     """Interactions for every scene, learned from the truth of the scenes of the other fold.
 
     Scenes that overlap are in one fold. Raises `InputError` for a single one.
@@ -175,19 +176,13 @@ def learn_by_folds(recordings: RecordingSet, progress: Progress | None = None) -
     units = list(dict.fromkeys(unit.values()))
     if len(units) < FOLDS:
         raise InputError(f"{', '.join(scenes)}: expected scenes to learn from beside it")
-    trajectories: dict[str, Trajectories] = {}
-    recording: dict[str, str] = {}
-    for name in scenes:
-        scene = recordings.dataset.scene(name)
-        recording[name] = scene.name  # that of several scenes with the same truth
-        if scene.name not in trajectories:
-            trajectories[scene.name] = Trajectories.of_truth(scene)
     learned: dict[str, LearnedInteractions] = {}
     for fold in range(FOLDS):
         tested = [name for name in scenes if unit[name] in units[fold::FOLDS]]
-        others = {recording[name]: trajectories[recording[name]] for name in scenes if name not in tested}
-        found = learn_interactions(others, f"scenes {', '.join(others)}", progress=progress)
-        learned |= dict.fromkeys(tested, found)
+        read = (recordings.dataset.scene(name) for name in scenes if name not in tested)
+        others = {scene.name: scene for scene in read}  # several may have the same truth
+        found = learn_interactions(others, f"scenes {', '.join(others)}", base, progress=progress)
+        learned |= dict.fromkeys(tested, found.interactions)
     return learned
 
 

@@ -8,12 +8,12 @@ from typing import Literal
 
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
 from pipelines.bench.gaps.boosted import boosted_runs
+from pipelines.bench.gaps.learned import LEARNED, learn_interactions
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
 
 Fit = Literal["noise", "edges", "boosted"]
 FITS: tuple[Fit, ...] = ("noise", "edges", "boosted")
@@ -95,6 +95,6 @@ def _with_learned_edges(
     source: RecordingSource, split: Split, base: TrackConfig, progress: Progress | None
 ) -> Contender:
     """Saga with the edges of some annotated recordings."""
-    truths = {name: Trajectories.of_truth(source.scene(name)) for name in split.train}
-    learned = learn_interactions(truths, f"recordings {', '.join(truths)}", progress=progress)
-    return Contender("saga, learned edges", "saga", base.with_interactions(learned))
+    scenes = {name: source.scene(name) for name in split.train}
+    learned = learn_interactions(scenes, f"recordings {', '.join(scenes)}", base, progress=progress).interactions
+    return Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned))
