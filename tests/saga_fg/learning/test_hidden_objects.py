@@ -10,6 +10,7 @@ from saga_fg.learning import GapSettings, HiddenObjects, hidden_objects
 from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
@@ -128,3 +129,5 @@ def test_nothing_to_learn_from_and_nonlinear_interactions():
     sample = hidden_objects(following_pairs(pairs=1, moments=40), VELOCITY, SENSORS, ONCE)
     with pytest.raises(InputError, match="linear motions and interactions"):
         sample.predict(VELOCITY, (Repulsion(classes=("car",), sources=("car",)),))
+    with pytest.raises(InputError, match="or mixtures"):
+        sample.predict(settings_of(Mixture()), ())
