@@ -3,7 +3,8 @@
 The object travels from left to right. Its labels are a grey line, dashed where it has no detection; the boxes of its
 neighbours are grey, and crosses are detections, at the last moment of the gap. Each track that holds the object has a
 colour of its own, from the moment at which it does, with its 95 % ellipse at every second of the gap: one colour before
-and after the gap is one identity.
+and after the gap is one identity. Lanes of a road map are white bands; its stop lines are red where their light was
+last reported closed at the start of the gap, else green.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pipelines.bench.gaps.contenders import Life
 from pipelines.bench.gaps.gap import Gap
 from pipelines.bench.gaps.judging import CAP, GapOutcome
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.situations import lights_at
 from pipelines.bench.gaps.sources import RecordingSource
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -97,6 +99,7 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: Sequence[DrawnGap]) ->
     figure = Figure(figsize=(11.0, (11.0 * height / length + 0.6) * len(drawn) + 0.5), layout="constrained")
     axes = figure.subplots(len(drawn), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for ax, each in zip(axes, drawn, strict=True):
+        _draw_road(ax, labelled, gap, origin, turn)
         _draw_scene(ax, labelled, gap, origin, turn)
         unseen = (shown > gap.start) & (shown < gap.stop)
         ax.plot(*np.where(unseen[:, None], np.nan, way).T, color="#555555", linewidth=3.0, zorder=2)
@@ -126,6 +129,23 @@ def _frame(way: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _widened(unseen: BoolArray) -> FloatArray:
     """With the moments beside, so that lines meet."""
     return np.asarray(unseen | np.append(unseen[1:], False) | np.append(False, unseen[:-1]))
+
+
+def _draw_road(ax: Any, labelled: LabelledScene, gap: Gap, origin: FloatArray, turn: FloatArray) -> None:
+    """Lanes, and stop lines by the colours of their lights when the gap starts."""
+    road, closed = lights_at(labelled, float(labelled.scene.timestamps[gap.start]))
+    if road is None:
+        return
+    ax.set_facecolor("#efefec")
+    for lane in road.lanes:
+        centre = np.array(lane.centre)
+        along = np.gradient(centre, axis=0)
+        across = lane.width / 2 * np.column_stack([-along[:, 1], along[:, 0]]) / np.hypot(*along.T)[:, None]
+        border = np.concatenate([centre + across, (centre - across)[::-1]])
+        ax.fill(*((border - origin) @ turn).T, facecolor="white", edgecolor="#dcdcd6", linewidth=0.6, zorder=0)
+    for line in road.stop_lines:
+        colour = "#c62828" if line.light in closed else "#2e7d32"
+        ax.plot(*((line.ends - origin) @ turn).T, color=colour, linewidth=3.0, zorder=1)
 
 
 def _draw_scene(ax: Any, labelled: LabelledScene, gap: Gap, origin: FloatArray, turn: FloatArray) -> None:
