@@ -288,7 +288,7 @@ def test_places_are_sites_and_settings() -> None:
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
     config = load_config("simulated")
-    fitted = config.with_acceleration_noise({"default": 0.5, "truck": 0.25})
+    fitted = config.with_motions({"default": ConstantVelocity(0.5), "truck": ConstantVelocity(0.25)})
     classes = fitted.tracker.classes
     assert classes["truck"].motion.acceleration_noise == 0.25
     assert classes["default"].motion.acceleration_noise == 0.5
