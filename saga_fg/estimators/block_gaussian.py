@@ -35,7 +35,7 @@ class BlockGaussian:
 
     def over(self, partition: Partition) -> BlockGaussian:
         """Change the partition; nodes that it separates lose their correlation."""
-        if partition is self.partition:
+        if partition is self.partition or np.array_equal(partition.label, self.partition.label):
             return self
         rows = np.arange(len(self.layout))
         return BlockGaussian(partition, self.mean, regrouped(self.blocks, self.partition, partition, rows))
@@ -71,16 +71,22 @@ class BlockGaussian:
 
     def decoupled(self) -> BlockGaussian:
         """Separate the parts of components that are no longer correlated, long after the last interaction."""
+        return self.over(self.uncorrelated(_UNCORRELATED))
+
+    def uncorrelated(self, tolerance: float) -> Partition:
+        """The partition into parts that no correlation above `tolerance` ties."""
         partition, layout = self.partition, self.layout
         if partition.count == len(layout):
-            return self
+            return partition
         node_of = np.repeat(np.arange(len(layout)), layout.dims)
         a, b = [], []
         for places, P in zip(partition.groups, self.blocks, strict=True):
-            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            tied = np.abs(P) > _UNCORRELATED * sigma[:, :, None] * sigma[:, None, :]
             node, (c, s) = node_of[places], places.shape
             d = int(layout.dims[node[0, 0]])
+            if s == d and (node == node[:, :1]).all():  # nodes on their own
+                continue
+            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+            tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
             if s % d == 0 and (layout.dims[node] == d).all():  # node by node where all are of one size
                 tied = np.asarray(tied.reshape(c, s // d, d, s // d, d).any(axis=(2, 4)))
                 node = node[:, ::d]
@@ -90,7 +96,7 @@ class BlockGaussian:
         i, j = np.concatenate(a), np.concatenate(b)
         pairs = scipy.sparse.coo_array((np.ones(len(i), dtype=bool), (i, j)), shape=(len(layout), len(layout)))
         count, label = connected_components(pairs, directed=False)
-        return self if count == partition.count else self.over(Partition(layout, label.astype(np.int64)))
+        return partition if count == partition.count else Partition(layout, label.astype(np.int64))
 
     def covariances(self, rows: IntArray) -> FloatArray:
         """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
