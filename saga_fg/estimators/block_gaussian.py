@@ -6,8 +6,6 @@ from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
 
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
@@ -91,12 +89,11 @@ class BlockGaussian:
                 tied = np.asarray(tied.reshape(c, s // d, d, s // d, d).any(axis=(2, 4)))
                 node = node[:, ::d]
             k, i, j = np.nonzero(tied)
-            a.append(node[k, i])
-            b.append(node[k, j])
-        i, j = np.concatenate(a), np.concatenate(b)
-        pairs = scipy.sparse.coo_array((np.ones(len(i), dtype=bool), (i, j)), shape=(len(layout), len(layout)))
-        count, label = connected_components(pairs, directed=False)
-        return partition if count == partition.count else Partition(layout, label.astype(np.int64))
+            once = i < j
+            a.append(node[k[once], i[once]])
+            b.append(node[k[once], j[once]])
+        parts = Partition.apart(layout).joined(np.concatenate(a), np.concatenate(b))
+        return partition if parts.count == partition.count else parts
 
     def covariances(self, rows: IntArray) -> FloatArray:
         """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
