@@ -1,11 +1,12 @@
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
-from .model.motion import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
+from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
 from .tracking import GreedyTracker, Tracker, TrackerSettings
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
+from .types.predicted_tracks import PredictedTracks
 from .types.track import Track, Tracks
 
 __version__: str
@@ -15,6 +16,7 @@ __all__ = [
     "Boxes",
     "ConstantAcceleration",
     "ConstantVelocity",
+    "Curvilinear",
     "Dataset",
     "Detection",
     "Detections",
@@ -24,6 +26,7 @@ __all__ = [
     "InputError",
     "MissingExtraError",
     "NodeType",
+    "PredictedTracks",
     "RandomWalk",
     "SagaError",
     "Scene",

@@ -6,12 +6,16 @@ from typing import Any
 
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, calibration, error_summary, errors_by_class
-from pipelines.bench.tracking import SetResult, verdict
+from pipelines.bench.predictions import PredictionErrors, prediction_figures
+from pipelines.bench.tracking import KF, RELATIVE_SWITCHES, SAGA, SetResult, verdict
 
 
 def tables(result: SetResult) -> list[FigureTable]:
-    """For people: the variants, times by stage, what the graph changes, the consistency of the covariances."""
-    return [_variants(result), _stages(result), *_differences(result), *_calibrations(result)]
+    """For people: variants, times by stage, what the graph changes, consistency of the covariances, predictions."""
+    return [
+        *(_variants(result), _stages(result)),
+        *(*_differences(result), *_calibrations(result), *_predictions(result)),
+    ]
 
 
 def figures(result: SetResult) -> dict[str, Any]:
@@ -28,10 +32,11 @@ def figures(result: SetResult) -> dict[str, Any]:
             }
             for name, each in result.variants.items()
         },
-        "saga_against_kf": {
-            name: {"difference": interval, "verdict": verdict(name, interval)}
-            for name, interval in result.differences.items()
+        "against_kf": {
+            variant: {name: {"difference": each, "verdict": verdict(name, each)} for name, each in found.items()}
+            for variant, found in result.differences.items()
         },
+        "predictions": prediction_figures(_predicting(result), KF),
         "calibration": {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()},
     }
 
@@ -63,16 +68,18 @@ def _headline(name: str, value: float) -> str:
 
 
 def _differences(result: SetResult) -> list[FigureTable]:
-    if not result.differences:
-        return []
-    rows = tuple((name, *_interval(name, each), verdict(name, each)) for name, each in result.differences.items())
-    title = f"{result.name}: what the graph changes, saga less kf (RMSE: relative), 95 % intervals over scenes"
-    return [FigureTable(title, ("figure", "difference", "from", "to", "saga is"), rows)]
+    tables = []
+    for variant, found in result.differences.items():
+        rows = tuple((name, *_interval(name, each), verdict(name, each)) for name, each in found.items())
+        title = f"{result.name}: what the graph changes, {variant} less kf (RMSE: relative), 95 % intervals over scenes"
+        if rows:
+            tables.append(FigureTable(title, ("figure", "difference", "from", "to", f"{variant} is"), rows))
+    return tables
 
 
 def _interval(name: str, difference: Interval) -> tuple[str, ...]:
     values = (difference.estimate, difference.low, difference.high)
-    if name.endswith("RMSE") and not name.startswith("hidden"):
+    if name == RELATIVE_SWITCHES or (name.endswith("RMSE") and not name.startswith("hidden")):
         return tuple(f"{100 * value:+.2f} %" for value in values)
     return tuple(f"{value:+.4g}" for value in values)
 
@@ -92,3 +99,26 @@ def _calibrations(result: SetResult) -> list[FigureTable]:
     )
     columns = ("class", "objects", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
     return [FigureTable(f"{result.name}: errors within saga's ellipses, in %", columns, rows)] if rows else []
+
+
+def _predictions(result: SetResult) -> list[FigureTable]:
+    rows = tuple(
+        (
+            "moving" if f.moving else "all",
+            cell(f.horizon, 0),
+            f.method,
+            cell(f.predictions, 0),
+            cell(f.error, 2),
+            "" if f.change is None else ", ".join(_interval("RMSE", f.change)),
+            cell(f.nll, 2),
+            *(cell(100 * share, 0) for share in f.coverage.values()),
+        )
+        for f in prediction_figures(_predicting(result), KF)
+    )
+    names = ("objects", "s ahead", "method", "predictions", "mean error, m", f"against {KF}, from, to", "NLL")
+    title = f"{result.name}: predictions of objects that are detected now"
+    return [FigureTable(title, (*names, "in 50 %", "in 90 %"), rows)] if rows else []
+
+
+def _predicting(result: SetResult) -> dict[str, tuple[PredictionErrors, ...]]:
+    return {name: result.variants[name].predictions for name in (KF, SAGA)}

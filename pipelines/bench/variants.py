@@ -54,7 +54,6 @@ COMPONENTS = (
     GRAPH_MATCHING,
     Variant("tracks that never leave unseen", changes={"tracker.existence.lifetime": math.inf}),
     Variant("scores without hit ratio", changes={"tracker.existence.hit_ratio_weight": 0.0}),
-    Variant("coasting tracks scored in full", changes={"tracker.existence.coasting_score_factor": 1.0}),
     Variant("without tentative tracks", changes={"tracker.tentative_score_factor": 0.0}),
     Variant("without output while coasting", changes={"tracker.report_coasting": 0.0}),
     Variant("headings that drift freely", changes={"tracker.classes.*.yaw_drift": 3.0}),

@@ -16,8 +16,13 @@ from pipelines.cli.tables import JsonFile, MarkdownFile, PictureFile, report, wr
 from pipelines.cli.tracking_options import InteractionsOption, with_interactions
 from saga_fg.errors import InputError
 
+LengthsOption = Annotated[
+    str | None, typer.Option("--lengths", help="Of made gaps, s, with commas: of 1, 2, 3, 5.  [default: all of them]")
+]
+
 if TYPE_CHECKING:
     from pipelines.bench.gaps.bench import Contender, Run
+    from pipelines.bench.gaps.fitted import Fit
     from pipelines.bench.gaps.sources import RecordingSource
     from pipelines.config import TrackConfig
 
@@ -56,15 +61,29 @@ def gaps(
     interactions: InteractionsOption = None,
     train: Annotated[
         str | None,
-        typer.Option("--train", help="Fit noise and edges to these recordings, with commas: two contenders more."),
+        typer.Option("--train", help="Fit contenders to these recordings, with commas; see --fit."),
     ] = None,
     test: Annotated[
         str | None,
         typer.Option("--test", help="Judge these recordings alone, with commas.  [default: all but --train]"),
     ] = None,
     folds: Annotated[
-        int | None, typer.Option("--folds", min=2, help="Judge each fold of recordings after a fit to the others.")
+        str | None,
+        typer.Option(
+            "--folds",
+            help="Judge each of so many folds of the recordings after a fit to the others; place: each place (site of "
+            "ngsim, setting of openacc, sequence or log of others).",
+            metavar="N|place",
+        ),
     ] = None,
+    fit: Annotated[
+        str,
+        typer.Option(
+            "--fit",
+            help="To --train or the other folds, with commas: the noise of kf, the edges of saga, boosted trees as an "
+            "outside judge (needs the extra [bench]).",
+        ),
+    ] = "noise,edges",
     labels: Annotated[
         bool, typer.Option("--labels", help="Take the visible annotations for detections, in all sets.")
     ] = False,
@@ -76,6 +95,19 @@ def gaps(
         typer.Option("--life", help="Tracks kept alive through all gaps, ended as configured, or both."),
     ] = "both",
     by_class: Annotated[bool, typer.Option("--by-class", help="Rows for classes of objects as well.")] = False,
+    situations: Annotated[
+        bool,
+        typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
+    ] = False,
+    lengths: LengthsOption = None,
+    viewpoint: Annotated[
+        str,
+        typer.Option(
+            "--viewpoint",
+            help="Of the sensors in the sets ngsim and openacc: above, where nothing is hidden, mast, vehicle, the id "
+            "of one, or X,Y,Z in m.",
+        ),
+    ] = "above",
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 1,
     config: Config = None,
     plot: PictureFile = None,
@@ -97,7 +129,8 @@ def gaps(
 
     Real gaps: a labelled object has no detection for 1 to 6 s, and then again. Made gaps: the detections of one object
     are taken away for 1, 2, 3 or 5 s, while all others stay. Every contender tracks the same detections. A track that
-    is not known counts with an error of 10 m. Intervals are paired bootstraps over recordings, of 3 at least.
+    is not known counts with an error of 10 m. Intervals are paired bootstraps over recordings, of 3 at least;
+    those that overlap in time count as one.
 
     \b
     Examples:
@@ -105,6 +138,8 @@ def gaps(
       saga-fg bench gaps --data data --sets megvii,kitti --workers 2 --json gaps.json
       saga-fg bench gaps --data data --sets kitti --contenders saga,kf --contender trial=trial.yaml
       saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
+      saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
+      saga-fg bench gaps --data data --sets ngsim --life kept --folds place --fit edges,boosted --situations
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -120,47 +155,86 @@ def gaps(
     for name in chosen:
         if name not in KNOWN:
             raise InputError(f"--sets: {unknown_name('set', name, KNOWN)}")
-    sources = [RecordingSource(name, data, scenes, labels) for name in chosen]
+    sources = [RecordingSource(name, data, scenes, labels, viewpoint) for name in chosen]
     taught, judged = (names(option, value) if value else () for option, value in (("--train", train), ("--test", test)))
     recordings = {source.name: _recordings(source) for source in sources}
     _check_names(recordings, taught, judged)
     if taught and folds is not None:
         raise InputError("--folds: goes without --train")
-    splits = {name: splits_of(found, taught, judged, folds) for name, found in recordings.items()}
+    number, fits = _folds(folds), _fits(fit)
+    splits = {}
+    for source in sources:
+        found = recordings[source.name]
+        unit = source.places(found) if number == 0 else source.clusters if number is not None else None
+        splits[source.name] = splits_of(found, taught, judged, number, unit)
     for name, split in splits.items():
         if not split and (sets or not any(splits.values())):
             why = "none is in --test" if judged else "all are in --train"
             raise InputError(f"set {name}: expected recordings to judge, {why}")
     if plot is not None and passes == 0:
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,))
+    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths))
+    if situations and (life == "shipped" or passes == 0):
+        raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
         for source in sources:
             base = load_config(source.family, config)
-            compared = _contenders(contenders, own or [], interactions, base)
+            compared = _contenders(contenders, own or [], interactions, source.family, base)
             if against not in (known := tuple(each.name for each in compared)):
                 raise InputError(f"--against: {unknown_name('contender', against, known)}")
             if splits[source.name]:
-                found = bench_splits(source, splits[source.name], compared, base, settings, workers, progress)
-                runs[source.name] = found
+                runs[source.name] = bench_splits(
+                    source, splits[source.name], compared, base, settings, fits, workers, progress
+                )
     if not any(run.gaps for found in runs.values() for run in found):
         raise InputError("expected recordings with gaps, there is none: longer ones are needed, or more --passes")
-    shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class)]
-    report(shown, {name: figures(found, against) for name, found in runs.items()}, json_file, markdown)
+    shown = [table for name, found in runs.items() for table in tables(name, found, against, by_class, situations)]
+    told = {name: figures(found, against, situations) for name, found in runs.items()}
+    report(shown, told, json_file, markdown)
     if plot is not None:
         write_plot(plot, runs, against)
     if picture is not None:
         source = next(each for each in sources if each.name in runs)
-        compared = _contenders(contenders, own or [], interactions, load_config(source.family, config))
+        compared = _contenders(contenders, own or [], interactions, source.family, load_config(source.family, config))
         better = next((each for each in compared if each.name != against), compared[0])
         pair = [next(each for each in compared if each.name == against), better]
         write_telling_picture(picture, source, runs[source.name], pair)
 
 
+def chosen_lengths(text: str | None) -> tuple[float, ...]:
+    """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
+    from pipelines.bench.gaps.gap import LENGTHS
+
+    known = {f"{length:g}": length for length in LENGTHS}
+    wanted = names("--lengths", text) if text else tuple(known)
+    for each in wanted:
+        if each not in known:
+            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {each!r:.40}")
+    return tuple(known[each] for each in known if each in wanted)
+
+
 def _recordings(source: RecordingSource) -> tuple[str, ...]:
     with source.opened() as dataset:
         return dataset.scenes
+
+
+def _fits(text: str) -> list[Fit]:
+    from pipelines.bench.gaps.fitted import FITS
+
+    for name in (wanted := names("--fit", text)):
+        if name not in FITS:
+            raise InputError(f"--fit: expected some of {', '.join(FITS)}, got {name!r:.40}")
+    return [name for name in FITS if name in wanted]
+
+
+def _folds(text: str | None) -> int | None:
+    """The number of folds, 0 for places. Raises `InputError` for others."""
+    if text is None or text == "place":
+        return None if text is None else 0
+    if not (text.isascii() and text.isdecimal() and int(text) >= 2):
+        raise InputError(f"--folds: expected a number of 2 or more, or place, got {text!r:.40}")
+    return int(text)
 
 
 def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str], judged: Sequence[str]) -> None:
@@ -175,19 +249,19 @@ def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str],
 
 
 def _contenders(
-    chosen: str | None, own: Sequence[str], interactions: Path | None, base: TrackConfig
+    chosen: str | None, own: Sequence[str], interactions: Path | None, family: str | Path, base: TrackConfig
 ) -> list[Contender]:
     """The contenders to compare. Raises `InputError` for an unknown one and a wrong file."""
     from pipelines.bench.gaps.bench import Contender
-    from pipelines.bench.gaps.contenders import CONTENDERS
+    from pipelines.bench.gaps.contenders import contenders
     from pipelines.config import METHODS
     from pipelines.configuration import load_settings
 
-    found: list[Contender] = []
-    for name in names("--contenders", chosen) if chosen else CONTENDERS:
-        if name not in CONTENDERS:
-            raise InputError(f"--contenders: {unknown_name('contender', name, tuple(CONTENDERS))}")
-        contender = Contender.of(CONTENDERS[name], base)
+    known, found = contenders(family), list[Contender]()
+    for name in names("--contenders", chosen) if chosen else known:
+        if name not in known:
+            raise InputError(f"--contenders: {unknown_name('contender', name, tuple(known))}")
+        contender = Contender.of(known[name], base)
         if chosen or not any(contender.same_as(other) for other in found):
             found.append(contender)
     for text in own:

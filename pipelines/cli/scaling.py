@@ -53,12 +53,10 @@ def run_at_scale(
     ray: str | None,
     merged: str,
     merge: Callable[[Path, Sequence[str], Dataset | None], None],
-) -> None:
-    """Do the task with all parts of a dataset, and print what became of them.
+) -> RunSummary:
+    """Do the task with all parts of a dataset; print and return what became of them.
 
     merge  makes the file `merged` of what they left, if all have done it; "" for none
-
-    Scenes that failed are named with their reasons, and end the command with an exit code.
     """
     from pipelines.scale_out import LocalPool, RayPool, file_name, run_scenes
 
@@ -87,6 +85,11 @@ def run_at_scale(
     counts = "".join(f", {number} {noun}" for noun, number in report.counts.items())
     states = f"{len(report.done)} done, {len(report.unchanged)} unchanged, {len(report.failed)} failed"
     typer.echo(f"{output}: {counted(report.scenes, 'scene')}: {states}{counts}")
+    return report
+
+
+def exit_on_failures(report: RunSummary) -> None:
+    """Name the scenes that failed, with their reasons, and end the command with an exit code if there are any."""
     for name, reason in report.failed.items():
         typer.echo(f"failed: {name}: {reason}", err=True)
     if report.failed:

@@ -89,7 +89,8 @@ def serve(
     bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
     if reorder is not None:
         bounds = replace(bounds, reorder=reorder)
-    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds)
+    rules = settings.of_method(method).tracker.edges
+    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, rules)
     return_large_blocks()
     keeper = None if snapshot is None else _restored(stream, snapshot, every, settings, method)
     last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)

@@ -12,7 +12,7 @@ from pipelines.cli import options
 from pipelines.cli import tracking_options as how
 from pipelines.cli.console import progress_bar
 from pipelines.cli.datasets import dataset_commands
-from pipelines.cli.scaling import RayAddress, Workers, at_scale, run_at_scale
+from pipelines.cli.scaling import RayAddress, Workers, at_scale, exit_on_failures, run_at_scale
 from pipelines.cli.summary import counted
 
 if TYPE_CHECKING:
@@ -54,7 +54,8 @@ def _smooth(
     settings = replace(settings, tracking=tracking.with_association(association))
     if at_scale(workers, ray):
         task = SmoothTask(settings, method, source, f".{table}")
-        run_at_scale(source, task, output, workers, ray, source.merged[1], source.merge_labels)
+        report = run_at_scale(source, task, output, workers, ray, source.merged[1], source.merge_labels)
+        exit_on_failures(report)
         return
     stream = source.stream()
     if stream is not None:

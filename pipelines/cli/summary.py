@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,8 +12,6 @@ import typer
 if TYPE_CHECKING:
     from pipelines.config import TrackConfig
     from pipelines.tracking import TrackedScene
-
-log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -52,13 +49,6 @@ class Summary:
 
         rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
         write_run_record(self.output, RunRecord(method, write_settings(settings, comments=False), rounded))
-
-    def warn_of_idle_edges(self, settings: TrackConfig) -> None:
-        """Warn if there are edge rules, but none acts on a class of the tracks."""
-        acting = {c for rule in settings.tracker.edges for c in getattr(rule, "classes", getattr(rule, "attached", ()))}
-        if acting and self.classes and not acting & self.classes:
-            text = "no edges: tracker.edges act on %s, and the tracks are of %s; objects are tracked one by one"
-            log.warning(text, ", ".join(sorted(acting)), ", ".join(sorted(self.classes)))
 
     def show(self) -> None:
         """Print the line on stdout."""

@@ -11,7 +11,7 @@ from pipelines.cli import options
 from pipelines.cli import tracking_options as how
 from pipelines.cli.console import progress_bar
 from pipelines.cli.datasets import Source, dataset_commands
-from pipelines.cli.scaling import RayAddress, Workers, at_scale, run_at_scale
+from pipelines.cli.scaling import RayAddress, Workers, at_scale, exit_on_failures, run_at_scale
 from pipelines.cli.summary import Summary
 
 if TYPE_CHECKING:
@@ -34,15 +34,20 @@ def _track(
 ) -> None:
     """Track the detections of recordings."""
     from pipelines.explaining import trackers
+    from pipelines.idle_edges import IdleEdges
     from pipelines.scale_out import TrackTask
     from pipelines.tracking import track_dataset
 
     settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
     kept = how.journal(explain, output, at_scale(workers, ray))
+    idle = IdleEdges(settings.of_method(method).tracker.edges)
     if at_scale(workers, ray):
         task = TrackTask(settings, method, source)
-        run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
+        report = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
+        idle.add(task.classes(report.counts))
+        idle.warn()
+        exit_on_failures(report)
         return
     summary = Summary(output)
     with source.open() as dataset:
@@ -51,8 +56,8 @@ def _track(
             runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
             source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in runs))
     summary.write_record(method, settings)
-    if method == "saga":
-        summary.warn_of_idle_edges(settings)
+    idle.add(summary.classes)
+    idle.warn()
     summary.show()
 
 

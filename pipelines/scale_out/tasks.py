@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from pipelines.smoothing import SmoothConfig, smooth_dataset
 from pipelines.tracking import TrackedScene, track_dataset
 from saga_fg.smoothing import LabelCounts
 from saga_fg.types.dataset import Dataset
+
+_OF_CLASS = "tracks of "
 
 
 @dataclass(frozen=True)
@@ -31,12 +34,17 @@ class TrackTask:
         return head + write_settings(self.settings, comments=False)
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
-        """Write the tracks; counts frames, tracks and boxes."""
+        """Write the tracks; counts frames, boxes and tracks, these also by class."""
         counts = dict.fromkeys(("frames", "tracks", "boxes"), 0)
         runs = _counted(track_dataset(dataset, lambda: self.settings.new_tracker(self.method)), counts)
         (folder / "tracks").mkdir()
         self.source.write_track_part(folder, file_name(name), dataset, ((run.scene, run.tracks) for run in runs))
         return counts
+
+    @staticmethod
+    def classes(counts: Mapping[str, int]) -> tuple[str, ...]:
+        """The classes of the tracks that were counted."""
+        return tuple(name.removeprefix(_OF_CLASS) for name in counts if name.startswith(_OF_CLASS))
 
 
 @dataclass(frozen=True)
@@ -69,6 +77,13 @@ class SmoothTask:
 def _counted(runs: Iterable[TrackedScene], counts: dict[str, int]) -> Iterator[TrackedScene]:
     for run in runs:
         counts["frames"] += run.frames
-        counts["tracks"] += len({id_ for tracks in run.tracks for id_ in tracks.id.tolist()})
+        label_of = {
+            id_: c
+            for tracks in run.tracks
+            for id_, c in zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
+        }
+        counts["tracks"] += len(label_of)
+        for label, number in sorted(Counter(label_of.values()).items()):
+            counts[_OF_CLASS + label] = counts.get(_OF_CLASS + label, 0) + number
         counts["boxes"] += sum(len(tracks) for tracks in run.tracks)
         yield run

@@ -7,12 +7,13 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from pipelines.idle_edges import IdleEdges
 from pipelines.process import resident_memory
 from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.messages import (
@@ -28,6 +29,7 @@ from pipelines.serving.reordering import Reordering
 from pipelines.serving.settings import StreamSettings
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.tracking import TimeVerdict
 
 log = logging.getLogger(__name__)
@@ -88,6 +90,7 @@ class StreamTracker(Generic[Client]):
 
     new_tracker  makes a tracker; called at the start, on a reset, and after repeated internal errors
     settings     limits of the stream
+    rules        edge rules of the tracker, to warn where none acts on a class of the tracks
     keeper       keeps the state in a file, None: nothing is kept
 
     A line that cannot be used is answered, counted and otherwise without effect; so is one that makes the tracker fail.
@@ -95,7 +98,12 @@ class StreamTracker(Generic[Client]):
     connection, or a killed service that kept its state, a client sends again what may be lost. One thread at a time.
     """
 
-    def __init__(self, new_tracker: Callable[[], StreamedTracker], settings: StreamSettings | None = None) -> None:
+    def __init__(
+        self,
+        new_tracker: Callable[[], StreamedTracker],
+        settings: StreamSettings | None = None,
+        rules: Sequence[EdgeRule] = (),
+    ) -> None:
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # ms
@@ -110,6 +118,7 @@ class StreamTracker(Generic[Client]):
         self._durable: dict[str, int] = {}
         self._failed_in_a_row = 0
         self._log_limit = LogLimit()
+        self._idle_edges = IdleEdges(rules)
         self._started = time.monotonic()
         self._lock = threading.Lock()
 
@@ -241,6 +250,7 @@ class StreamTracker(Generic[Client]):
         """Take in one frame. Raises the errors of the tracker."""
         frame, number = message.frame, message.seq
         tracks = self._tracker.step(frame)
+        self._idle_edges.watch(tracks)
         verdict = self._tracker.time_verdict
         if verdict == "unconfirmed":
             self.counts["unconfirmed"] += 1

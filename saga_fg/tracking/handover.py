@@ -1,6 +1,6 @@
 r"""Hand over: a new track proves to be the return of an object that has a track already, and takes its identity.
 
-    odds = r e^(-T / lifetime) (moving + stationary) / density,   density = (new tracks of the class) / area
+    odds = r e^(-T / lifetime) (moving + stationary) / density,   density = (new tracks of the class or group) / area
     moving     = (1 - s) (1 - s') / (1 - p)  N(m' - m; 0, P + P') / N(0; 0, V)          over position and velocity
     stationary = s s' / p  N(a' - a; 0, D + D')                                          over position
 
@@ -54,7 +54,8 @@ def hand_over(state: TrackerState, matching: Matching) -> Matching:
 
 
 def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntArray, IntArray]:
-    """Pairs of rows (k,): new tracks just detected, and old ones of their class; the number (k,) of such new tracks."""
+    """Pairs of rows (k,): new tracks just detected, and old ones of their class, or its group; the number (k,) of such
+    new tracks."""
     table, settings = state.table, state.settings
     resolved, detected = table.unresolved == 0, np.zeros(len(table), dtype=bool)
     detected[matching.track] = settings.association.relink_above < 1
@@ -63,9 +64,11 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     if len(new) == 0:
         return new, new, new
     old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.association.relink_within))
-    others = (table.label[new][:, None] == table.label[new]).sum(axis=1)
-    possible = table.label[new][:, None] == table.label[old]
-    i, j = np.nonzero(possible & (table.last_detected[old] < table.initiated[new][:, None]))
+    same = state.class_groups.same_group
+    others = same(table.label[new], table.label[new]).sum(axis=1)
+    i, j = np.nonzero(
+        same(table.label[new], table.label[old]) & (table.last_detected[old] < table.initiated[new][:, None])
+    )
     return new[i], old[j], others[i]
 
 
@@ -112,6 +115,7 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     table.turn.update(old, table.turn.heading[new], np.sqrt(table.turn.P[new, 0, 0]))
     if len(groups):
         table.class_belief[old] = groups.updated(table.class_belief[old], table.class_belief[new])
+        table.label = groups.labels(table.class_belief, table.label)
     table.sensors.join(old, new)
     table.hits, table.opportunities = table.sensors.best_hits()
     for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):

@@ -15,7 +15,7 @@ import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
-from saga_fg.model.discretisation import discretise
+from saga_fg.model.discretisation import discretise, own_motion
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
@@ -25,7 +25,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, d
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.kinematics import Kinematics, RelativePositions
-from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
+from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.frame import Frame
 
@@ -210,6 +210,14 @@ class JointTrackState:
                 at_v = node_type.index(VELOCITY)
                 result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
         return result
+
+    def position_covariance(self, ids: IntArray, label: StrArray) -> FloatArray:
+        """(2n, 2n) joint covariance of the positions of n tracks, track by track."""
+        types = self.types_of(label)
+        start = np.cumsum([0, *(node_type.dim for node_type in types)])
+        at = [offset + node_type.index(POSITION) for offset, node_type in zip(start[:-1], types, strict=True)]
+        places = np.concatenate([np.empty(0, dtype=np.int64), *at])
+        return np.asarray(self.estimator.joint_covariance(ids)[np.ix_(places, places)])
 
     def snapshot(self) -> Any:
         """The state as a value."""

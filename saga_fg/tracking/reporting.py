@@ -1,7 +1,6 @@
 r"""Report: the tracks of sufficient existence that were detected recently, with a score and a calibrated covariance.
 
-    score       p ( hits / (opportunities + prior_opportunities) )^w           when detected; while coasting times r and
-                                                                   coasting_score_factor
+    score       p ( hits / (opportunities + prior_opportunities) )^w        when detected; while coasting times r
     P_reported  = ( c (1 + h (1 - p)) )^2 P + ( b (1 + g (1 - p)) )^2 u u^T
 
 A filter's noise is wider than its errors where it also has to let the right detections through the gate, which are not
@@ -16,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
@@ -25,14 +24,8 @@ from saga_fg.types.track import Tracks
 
 def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     """The tracks to be reported, as of `timestamp` (s)."""
-    table, settings = state.table, state.settings
+    table, settings, rows = state.table, state.settings, reported_rows(state)
     coasting, tentative = table.coasting(state.time), table.tentative
-    rows = np.flatnonzero(
-        (~tentative | (settings.tentative_score_factor > 0))
-        & (table.confirmed | (table.existence >= settings.existence.report_above))
-        & (coasting <= settings.report_coasting)
-        & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
-    )
     table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
     boxes = table.boxes(now.position + state.origin, now.velocity)
     P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.position_bias)
@@ -42,14 +35,24 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     return Tracks(timestamp, table.id, boxes, score, P, now.P_velocity, coasting)
 
 
+def reported_rows(state: TrackerState) -> IntArray:
+    """Rows of the tracks to be reported."""
+    table, settings = state.table, state.settings
+    return np.flatnonzero(
+        (~table.tentative | (settings.tentative_score_factor > 0))
+        & (table.confirmed | (table.existence >= settings.existence.report_above))
+        & (table.coasting(state.time) <= settings.report_coasting)
+        & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
+    )
+
+
 def reported_score(
     table: TrackTable, certainty: FloatArray, coasting: BoolArray, settings: ExistenceSettings
 ) -> FloatArray:
     """(n,) score of the tracks' boxes: of the latest detection, times the certainty (n,) of the class and the hit
-    ratio; less while coasting."""
+    ratio; while coasting times the existence, which misses of a well-seen track hardly lower."""
     hit_ratio = (table.hits / (table.opportunities + settings.prior_opportunities)) ** settings.hit_ratio_weight
-    unseen = table.existence * settings.coasting_score_factor
-    return np.asarray(table.score * certainty * hit_ratio * np.where(coasting, unseen, 1.0))
+    return np.asarray(table.score * certainty * hit_ratio * np.where(coasting, table.existence, 1.0))
 
 
 def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:

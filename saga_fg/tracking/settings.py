@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
@@ -41,9 +41,12 @@ from saga_fg.types.signal import SignalSettings
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
-    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
-        lambda: ConstantVelocity(acceleration_noise=2.0),
-        "motion model of the class; random_walk for objects that never move, such as cones",
+    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Bicycle | Mixture = (
+        settings_group(
+            lambda: ConstantVelocity(acceleration_noise=2.0),
+            "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
+            "never move, such as cones",
+        )
     )
     initial_speed_deviation: Positive = setting(
         5.0, "standard deviation of the velocity of a new track along its heading, m/s; usual 1 (pedestrians) to 8"
@@ -84,10 +87,6 @@ class ClassSettings(Settings):
         1.2,
         "delete a track this long after its last detection, s, unless it can be re-linked; usual 1 to 2; higher: "
         "doubtful tracks live longer",
-    )
-    turn_time: NonNegative = setting(
-        0.0,
-        "time constant with which a turn seen in the headings fades, s; usual 1 to 3, 0: none; higher: longer curves",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
@@ -167,9 +166,6 @@ class ExistenceSettings(Settings):
     hit_ratio_weight: NonNegative = setting(
         0.0, "power of the hit ratio (hits / opportunities) in the score of a track; 0: it does not count"
     )
-    coasting_score_factor: Fraction = setting(
-        1.0, "factor on the score of a track that was not detected in the frame; lower: coasting tracks rank lower"
-    )
     occlusion_weight: Fraction = setting(
         0.0, "share by which full occlusion by another track lowers the detection probability; 0: occlusion is ignored"
     )
@@ -239,7 +235,7 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | GreenLight | InLane | ConeLine | Attached, ...] = (
         settings_group(
             traffic_rules,
             "edge rules of the scene graph: who interacts with whom; []: no interactions",
@@ -264,7 +260,7 @@ class TrackerSettings(Settings):
         "of the last `lag` seconds, exact for late frames",
     )
     tolerance: Fraction = setting(
-        0.02,
+        0.01,
         "correlation up to which the estimator kalman takes objects for independent; usual 0 to 0.1; 0: never; higher: "
         "faster in crowds, interactions of objects in plain view count less",
     )

@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
@@ -30,6 +31,7 @@ from saga_fg.tracking.deletion import delete_tracks
 from saga_fg.tracking.existence import update_existence
 from saga_fg.tracking.handover import hand_over
 from saga_fg.tracking.initiation import initiate_tracks
+from saga_fg.tracking.lookahead import look_ahead
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
@@ -39,8 +41,9 @@ from saga_fg.tracking.reporting import report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
 from saga_fg.tracking.unresolved import resolve_tracks
-from saga_fg.tracking.update import update_tracks
+from saga_fg.tracking.update import infer_signals, update_tracks
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
+from saga_fg.types.predicted_tracks import PredictedTracks, checked_horizons
 from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)
@@ -149,6 +152,8 @@ class Tracker:
         self._notify("associate", state, frame.sensor, measurements, matching)
 
         update_tracks(state, measurements, matching)
+        if delay == 0:
+            infer_signals(state, matching)
         self._notify("update", state, frame.sensor, measurements, matching)
 
         update_existence(state, measurements, matching, state.time - before)
@@ -188,6 +193,20 @@ class Tracker:
         ahead = self._state.copied()
         predict(ahead, ahead.relative(min(timestamp, newest + LATEST)))
         return report_tracks(ahead, timestamp)
+
+    def predict(self, horizons: ArrayLike, joint: bool = False) -> PredictedTracks:
+        """The tracks reported now at future times, with the edges of the graph that go on to act.
+
+        horizons  (H,) s from the newest frame on, increasing, from 0 to 60
+        joint     with the joint covariance of all positions at each of these times
+
+        Nothing is taken in or changed. Left out are tracks that can't be predicted that far. Raises `InputError` for
+        other horizons, and before the first frame.
+        """
+        checked = checked_horizons(horizons)
+        if self._state.clock.newest == -math.inf:
+            raise InputError("predict: expected a frame before, there is no time to predict from")
+        return look_ahead(self._state.copied(), checked, joint)
 
     def snapshot(self) -> TrackerSnapshot:
         """Everything that the tracker knows, as a value."""

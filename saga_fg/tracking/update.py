@@ -8,13 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from factors import RangeRate
+from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
+from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.tracking.retrodiction import past_positions
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic_flow import Passages
@@ -48,6 +49,15 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     if state.settings.traffic_flow_prior.weight > 0:
         passing, now = table.select(t), state.kinematics().select(t)
         state.traffic.update(Passages.of(passing, now.position + state.origin, now, state.time))
+
+
+def infer_signals(state: TrackerState, matching: Matching) -> None:
+    """Update the states of traffic lights by the tracks that have just been detected."""
+    if state.map_nodes.infers and len(state.map_nodes.drivers):
+        t, now = matching.track, state.reported_kinematics()
+        P = now.P_velocity[t]
+        variance = (P[:, 0, 0] + P[:, 1, 1]) / 2
+        state.map_nodes.infer(state.table.id[t], now.velocity[t], variance, state.time)
 
 
 def _update_class(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> None:

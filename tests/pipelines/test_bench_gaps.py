@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.bench.gaps import fitted, sources
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps, hidden, run_of
-from pipelines.bench.gaps.contenders import CONTENDERS, KEPT_ALIVE, LIFE, with_life
+from pipelines.bench.gaps.contenders import KEPT_ALIVE, LIFE, contenders, with_life
 from pipelines.bench.gaps.fitted import Split, splits_of
 from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.learned import LearnedForms
 from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
@@ -170,7 +171,7 @@ def test_a_tracker_that_reports_nothing_unseen_is_extrapolated() -> None:
 def test_the_picture_shows_the_gap_that_tells_most() -> None:
     drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
     gaps, base = real_gaps(drawn), load_config("file")
-    pair = [Contender.of(CONTENDERS[name], base) for name in ("centerpoint", "kf")]
+    pair = [Contender.of(contenders("file")[name], base) for name in ("centerpoint", "kf")]
     worse, better = ([run_of(drawn, gaps, each, life)] for each, life in zip(pair, ("shipped", "kept"), strict=True))
     assert telling_gap(better, worse) == ("drawn", gaps[0])
     shown = [drawn_gap(drawn, gaps, gaps[0], each, "kept") for each in pair]
@@ -220,7 +221,7 @@ def test_made_gaps_hide_one_object_among_others() -> None:
 def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated scenes of the benchmark that last for seconds."""
     settings = replace(SHORT, duration=7.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, viewpoint: simulated_set(scenes, settings=settings))
 
 
 @pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
@@ -228,7 +229,7 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family)
     base = load_config(family)
     for name, value in KEPT_ALIVE.items():
         changed(base, name, value)
-    for variant in CONTENDERS.values():
+    for variant in contenders(family).values():
         config = with_life(variant.config(base), "kept")
         config.new_tracker(variant.method)
         assert {each.max_coasting for each in config.tracker.classes.values()} == {LIFE}
@@ -237,20 +238,20 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family)
 
 def test_classical_contenders_differ_in_motion_alone() -> None:
     base = load_config("kitti")
-    turn = CONTENDERS["stationary + turn"].config(base).tracker
+    turn = contenders("kitti")["stationary + turn"].config(base).tracker
     assert isinstance(turn.classes["default"].motion, CoordinatedTurn)
     assert isinstance(turn.classes["pedestrian"].motion, ConstantVelocity)
     assert turn.stationarity.prior == 0.5
-    alone = CONTENDERS["constant velocity"].config(base).tracker
+    alone = contenders("kitti")["constant velocity"].config(base).tracker
     assert alone.stationarity.prior == 0
     assert alone.classes["default"].max_coasting == base.tracker.classes["default"].max_coasting
-    assert Contender.of(CONTENDERS["kf"], base).same_as(Contender("classical", "kf", base))
-    assert not Contender.of(CONTENDERS["saga"], base).same_as(Contender("classical", "kf", base))
+    assert Contender.of(contenders("kitti")["kf"], base).same_as(Contender("classical", "kf", base))
+    assert not Contender.of(contenders("kitti")["saga"], base).same_as(Contender("classical", "kf", base))
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
-    kf = Contender.of(CONTENDERS["kf"], load_config("file"))
+    kf = Contender.of(contenders("file")["kf"], load_config("file"))
     gaps = real_gaps(drawn)
     kept, shipped = (run_of(drawn, gaps, kf, life) for life in ("kept", "shipped"))
     assert kept.outcomes[0].error < 0.5
@@ -271,6 +272,18 @@ def test_recordings_are_dealt() -> None:
     assert splits_of(five, folds=2) == [Split(("b", "d"), ("a", "c", "e")), Split(("a", "c", "e"), ("b", "d"))]
     with pytest.raises(InputError, match="--folds 6: expected at most the number of recordings, 5"):
         splits_of(five, folds=6)
+    place = {"a": "north", "b": "south", "c": "north"}
+    apart = [Split(("b", "d"), ("a", "c")), Split(("a", "c", "d"), ("b",)), Split(("a", "b", "c"), ("d",))]
+    assert splits_of(five[:4], folds=0, unit=place) == apart
+    assert splits_of(five[:3], folds=2, unit=place) == [Split(("b",), ("a", "c")), Split(("a", "c"), ("b",))]
+    with pytest.raises(InputError, match="--folds place: expected recordings of two places or more, all are of north"):
+        splits_of(("a", "c"), folds=0, unit=place)
+
+
+def test_places_are_sites_and_settings() -> None:
+    names = ("USA_Lanker-1_10_T-1", "USA_Lanker-2_4_T-1", "USA_US101-1_1_T-1")
+    assert list(RecordingSource("ngsim").places(names).values()) == ["USA_Lanker", "USA_Lanker", "USA_US101"]
+    assert RecordingSource("kitti").places(("0000",)) == {}
 
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
@@ -289,13 +302,13 @@ def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.
     """Learning finds no interactions here: then saga is kf."""
     taught_by = []
 
-    def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
+    def learn(recordings, origin, base, progress=None):  # type: ignore[no-untyped-def]
         taught_by.append(origin)
-        return LearnedInteractions(learned_from=origin)
+        return LearnedForms(LearnedInteractions(learned_from=origin), {}, {}, (), {})
 
     monkeypatch.setattr(fitted, "learn_interactions", learn)
     base = load_config("simulated")
-    kf = Contender.of(CONTENDERS["kf"], base)
+    kf = Contender.of(contenders("simulated")["kf"], base)
     source = RecordingSource("simulated", scenes=2, labels=True)
     splits, settings = splits_of(("scene-0001", "scene-0002"), folds=2), GapBenchSettings(0, ("kept",))
     runs = fitted.bench_splits(source, splits, [kf], base, settings)
@@ -319,7 +332,7 @@ def test_scenes_without_truth_or_detections_are_refused() -> None:
 def test_contenders_are_judged_on_the_same_gaps() -> None:
     base = load_config("simulated")
     source = RecordingSource("simulated", scenes=1)
-    compared = [Contender.of(CONTENDERS[name], base) for name in ("saga", "kf")]
+    compared = [Contender.of(contenders("simulated")[name], base) for name in ("saga", "kf")]
     saga, kf = bench_gaps(source, ["scene-0001"], compared, GapBenchSettings(passes=1, lives=("kept",)))
     assert saga.gaps == kf.gaps
     assert len(saga.gaps) > 3
@@ -336,7 +349,8 @@ def test_contenders_are_judged_on_the_same_gaps() -> None:
 def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     own, out = tmp_path / "own.yaml", tmp_path / "gaps.json"
     own.write_text("tracker: {explained_noise: 0.5}\n")
-    arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--life", "shipped"]
+    arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--life", "kept"]
+    arguments += ["--situations", "--lengths", "2"]
     arguments += ["--contenders", "kf", "--contender", f"own:saga={own}", "--json", str(out)]
     arguments += ["--plot", str(tmp_path / "gaps.png")]
     result = CliRunner().invoke(app, arguments)
@@ -346,12 +360,16 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
     figures = json.loads(out.read_text())["simulated"]
     assert figures["recordings"] == ["scene-0001"]
     assert {row["contender"] for row in figures["gaps"]} == {"kf", "own"}
-    assert {row["life"] for row in figures["outcomes"]} == {"shipped"}
+    assert {row["life"] for row in figures["outcomes"]} == {"kept"}
+    assert {row["length"] for row in figures["outcomes"] if row["run"]} == {2.0}
+    assert "after 2 s, by situation" in result.output
+    everything = next(row for row in figures["situations"] if row["situation"] == "all")
+    assert everything["gaps"] + everything["lost"] == sum(row["run"] > 0 for row in figures["outcomes"]) / 2
 
 
 def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(SHORT, duration=1.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, viewpoint: simulated_set(scenes, settings=settings))
     arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--contenders", "kf"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
@@ -368,6 +386,10 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--train", "scene-0001", "--test", "scene-0001"], "in one of them only"),
         (["--train", "scene-0001", "--plot", "gaps.png"], "set simulated: expected recordings to judge"),
         (["--passes", "0", "--plot", "gaps.png"], "--plot: expected --passes of 1 or more"),
+        (["--fit", "edge"], "--fit: expected some of noise, edges, boosted, got 'edge'"),
+        (["--folds", "1"], "--folds: expected a number of 2 or more, or place, got '1'"),
+        (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),
+        (["--situations", "--life", "shipped"], "--situations: expected --life kept or both"),
         (["--sets", "foo"], "megvii, centerpoint, camera, kitti, simulated, ngsim, openacc, argoverse2, eth_ucy"),
     ],
 )

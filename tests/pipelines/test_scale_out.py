@@ -51,6 +51,7 @@ def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
             "frames": 75,
             "tracks": 10,
             "boxes": 140,
+            "tracks of car": 10,
         }  # tracks are reported from their second hit on
     assert not list(tmp_path.rglob("*.tmp"))
     assert not list(tmp_path.rglob(".scratch"))

@@ -207,6 +207,24 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     assert result.stderr == 'error: --ray: Ray is not installed; pip install "saga-fg[ray]"\n'
 
 
+def test_edge_rules_that_meet_no_class_are_told_once_however_it_runs(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_recordings(tmp_path / "in", 2)
+    pattern, warnings = tmp_path / "in" / "*.csv", list[list[str]]()
+    for classes in ("[truck]", "[car]"):
+        rules = f"tracker: {{edges: [{{kind: following, classes: {classes}}}]}}\n"
+        (tmp_path / "rules.yaml").write_text(rules)
+        for where in (("--workers", "1"), ("--workers", "1"), ("--workers", "1", "--method", "kf")):
+            caplog.clear()
+            command = ("track", "file", pattern, "-o", tmp_path / "out", "--config", tmp_path / "rules.yaml", *where)
+            result = saga_fg(*command)
+            assert result.exit_code == 0, result.output
+            warnings.append([record.getMessage() for record in caplog.records])
+    told = ["no edges: tracker.edges act on truck, and the tracks are of car; objects are tracked one by one"]
+    assert warnings == [told, told, [], [], [], []]  # also where the results are there already
+
+
 def test_labels_are_those_of_one_process(simulated: Path, tmp_path: Path) -> None:
     smooth = ["smooth", *nuscenes(simulated)[1:]]
     assert saga_fg(*smooth, "-o", tmp_path / "serial").exit_code == 0

@@ -17,6 +17,7 @@ from pipelines.serving import StreamSettings, StreamTracker, parse_address, serv
 from pipelines.serving.messages import FrameMessage, encode, parse_message
 from pipelines.serving.reordering import Reordering
 from saga_fg import InputError
+from saga_fg.model.edge_rules import Following
 from saga_fg.numerics.geometry import yaw_of
 
 SETTINGS = StreamSettings()
@@ -31,6 +32,15 @@ def frame(timestamp: float, seq: int | None = None, sensor: str = "lidar", x: fl
     car = {"label": "car", "x": 8.0 * timestamp if x is None else x, "y": 2.0, "score": 0.9}
     message = {"timestamp": timestamp, "sensor": sensor, "detections": [car]}
     return encode(message if seq is None else {"seq": seq, **message})
+
+
+def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFixture):
+    for label, told in (("truck", 1), ("car", 0)):
+        rules = (Following(classes=(label,)),)
+        service: StreamTracker[str] = StreamTracker(lambda: load_config("file").new_tracker("saga"), SETTINGS, rules)
+        caplog.clear()
+        answers(service, *(frame(0.1 * k) for k in range(300)))
+        assert [record.levelname for record in caplog.records] == ["WARNING"] * told
 
 
 def answers(service: StreamTracker[str], *lines: bytes) -> list[dict[str, Any]]:

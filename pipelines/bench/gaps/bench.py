@@ -7,27 +7,46 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from multiprocessing import get_context
+from typing import Protocol
 
 import numpy as np
 
 from pipelines.bench.gaps.contenders import LIVES, Life, with_life
-from pipelines.bench.gaps.gap import Gap, made_gaps, real_gaps
+from pipelines.bench.gaps.gap import LENGTHS, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import GapOutcome, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
-from pipelines.bench.gaps.sources import RecordingSource
+from pipelines.bench.gaps.situations import situations_of
 from pipelines.bench.variants import Variant
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.model.sensor import Sensor
+from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
+
+
+class SceneSource(Protocol):
+    """Recordings by name, with ground truth and detections."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def clusters(self) -> Mapping[str, str]:
+        """The first of the recordings that overlap in time with each, by name; empty where none can."""
+        ...
+
+    def scene(self, recording: str) -> Scene:
+        """Read a recording."""
+        ...
 
 
 @dataclass(frozen=True)
 class GapBenchSettings:
-    """Passes over each recording with made gaps, the lives that are compared, seed of the choice of gaps."""
+    """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s, seed of their choice."""
 
     passes: int = 4
     lives: tuple[Life, ...] = LIVES
+    lengths: tuple[float, ...] = LENGTHS
     seed: int = 0
 
 
@@ -51,27 +70,34 @@ class Contender:
 
 @dataclass(frozen=True)
 class Run:
-    """A contender's outcomes in the gaps of one recording, and its links in the run without made gaps."""
+    """A contender's outcomes in the gaps of one recording, and its links in the run without made gaps.
+
+    links       None of a contender that does not track
+    cluster     the first of the recordings that overlap with this one, or itself
+    situations  of the object of each gap, by the length until which; none for real gaps
+    """
 
     recording: str
+    cluster: str
     contender: str
     life: Life
     gaps: tuple[Gap, ...]
     label: tuple[str, ...]
+    situations: tuple[Mapping[float, frozenset[str]], ...]
     outcomes: tuple[GapOutcome, ...]
-    links: Links
+    links: Links | None
 
 
 @dataclass(frozen=True)
 class _Job:
-    source: RecordingSource
+    source: SceneSource
     recording: str
     contender: Contender
     settings: GapBenchSettings
 
 
 def bench_gaps(
-    source: RecordingSource,
+    source: SceneSource,
     recordings: Sequence[str],
     contenders: Sequence[Contender],
     settings: GapBenchSettings | None = None,
@@ -80,10 +106,11 @@ def bench_gaps(
 ) -> list[Run]:
     """All runs on some recordings of a set. workers: processes; 1: this one."""
     settings = settings or GapBenchSettings()
+    cluster = source.clusters
     jobs = [_Job(source, name, contender, settings) for name in recordings for contender in contenders]
     runs: list[Run] = []
     for done, (job, found) in enumerate(zip(jobs, _performed(jobs, workers), strict=True)):
-        runs += found
+        runs += [replace(run, cluster=cluster.get(run.recording, run.recording)) for run in found]
         if progress is not None:
             progress(f"{source.name} {job.recording} {job.contender.name}", done + 1, len(jobs))
     return runs
@@ -101,21 +128,28 @@ def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
 class _Preparation:
     """Everything that the gaps of a recording depend on; sensors place detections alike for all contenders."""
 
-    source: RecordingSource
+    source: SceneSource
     recording: str
     settings: GapBenchSettings
     sensors: Mapping[str, Sensor] = field(compare=False)
 
 
 def _perform(job: _Job) -> list[Run]:
-    labelled, gaps = _prepared(_Preparation(job.source, job.recording, job.settings, job.contender.config.sensors))
+    labelled, gaps = prepared(job.source, job.recording, job.settings, job.contender.config.sensors)
     return [run_of(labelled, gaps, job.contender, life) for life in job.settings.lives]
+
+
+def prepared(
+    source: SceneSource, recording: str, settings: GapBenchSettings, sensors: Mapping[str, Sensor]
+) -> tuple[LabelledScene, list[Gap]]:
+    """A recording and its gaps; the latest one is kept, for the next contender."""
+    return _prepared(_Preparation(source, recording, settings, sensors))
 
 
 @lru_cache(maxsize=1)
 def _prepared(of: _Preparation) -> tuple[LabelledScene, list[Gap]]:
-    labelled = LabelledScene.of(of.source.scene(of.recording), of.sensors)
-    return labelled, [*real_gaps(labelled), *made_gaps(labelled, of.settings.passes, of.settings.seed)]
+    labelled, settings = LabelledScene.of(of.source.scene(of.recording), of.sensors), of.settings
+    return labelled, [*real_gaps(labelled), *made_gaps(labelled, settings.passes, settings.seed, settings.lengths)]
 
 
 def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> Run:
@@ -130,7 +164,9 @@ def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, l
             links = judged.links()
     label = tuple(str(labelled.label[gap.row]) for gap in gaps)
     ordered = tuple(outcomes[k] for k in range(len(gaps)))
-    return Run(labelled.scene.name, contender.name, life, tuple(gaps), label, ordered, links)
+    situations = tuple(situations_of(labelled, gap) if gap.run > 0 else {} for gap in gaps)
+    name = labelled.scene.name
+    return Run(name, name, contender.name, life, tuple(gaps), label, situations, ordered, links)
 
 
 def judged_run(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> JudgedRun:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import inf
+from pathlib import Path
 from typing import Any, Literal
 
 from pipelines.bench.gaps.gap import LONGEST
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.tracking import ClassSettings
+from saga_fg.types.by_class import class_settings
 
 Life = Literal["kept", "shipped"]
 LIVES: tuple[Life, ...] = ("kept", "shipped")
@@ -27,49 +29,57 @@ KEPT_ALIVE: Mapping[str, Any] = {
 }
 TURNING = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle", "cyclist", "default")
 """Classes of vehicles."""
-CLASSICAL_NOISE = 1.5
-"""Spectral density of the acceleration, m^2/s^3, of classes configured with a fading acceleration instead.
+CLASSICAL_NOISE: Mapping[str | Path, Mapping[str, float]] = {
+    "kitti": {"default": 1.5},
+    "nuscenes": {"default": 1.5, "car": 3.0, "motorcycle": 3.0, "pedestrian": 0.5},
+    "traffic": {"default": 1.0, "pedestrian": 0.3},
+    "simulated": {"default": 0.3, "pedestrian": 0.1},
+    "heterogeneous": {"default": 0.3, "pedestrian": 0.3},
+    "file": {"default": 1.0},
+}
+"""Spectral density of the acceleration, m^2/s^3, of classes that are configured with another motion.
 
-White acceleration is the textbook's motion; a noise of the jerk means nothing to it. KITTI is the only set configured
-with fading accelerations. The density was chosen for constant velocity by tracking its sequences 0000, 0003, 0004,
-0005 and 0011.
+White acceleration is the textbook's motion, and the noise of another one means nothing to it. The densities are those
+chosen for constant velocity: by tracking sequences 0000, 0003, 0004, 0005 and 0011 of KITTI, others as they were
+configured before motions that suit better.
 """
 
 
-def _moving(turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, ClassSettings]]:
-    """All classes at constant velocity, or vehicles at a constant turn rate; acceleration noise, where set, stays."""
+def _moving(family: str | Path, turn: bool) -> Callable[[Mapping[str, ClassSettings]], Mapping[str, ClassSettings]]:
+    """All classes at constant velocity, or vehicles at a constant turn rate; those that don't move stay."""
 
     def change(classes: Mapping[str, ClassSettings]) -> Mapping[str, ClassSettings]:
         found = dict(classes)
         for label, own in classes.items():
-            fading = isinstance(own.motion, ConstantAcceleration)
-            noise = getattr(own.motion, "acceleration_noise", CLASSICAL_NOISE if fading else None)
-            if noise is not None:
-                turns = turn and label in TURNING
-                motion = CoordinatedTurn(noise) if turns else ConstantVelocity(noise)
-                found[label] = replace(own, motion=motion, turn_time=0.0)
+            if isinstance(own.motion, RandomWalk):
+                continue
+            noise = class_settings(CLASSICAL_NOISE.get(family, CLASSICAL_NOISE["file"]), float, label)
+            if isinstance(own.motion, ConstantVelocity):
+                noise = own.motion.acceleration_noise
+            motion = CoordinatedTurn(noise) if turn and label in TURNING else ConstantVelocity(noise)
+            found[label] = replace(own, motion=motion)
         return found
 
     return change
 
 
-def _classical(name: str, stationary: bool, turn: bool) -> Variant:
+def _classical(family: str | Path, name: str, stationary: bool, turn: bool) -> Variant:
     prior = {"tracker.stationarity.prior": 0.5 if stationary else 0.0}
-    return Variant(name, "kf", prior | {"tracker.classes": _moving(turn)})
+    return Variant(name, "kf", prior | {"tracker.classes": _moving(family, turn)})
 
 
-CONTENDERS = {
-    variant.name: variant
-    for variant in (
+def contenders(family: str | Path) -> dict[str, Variant]:
+    """All, by name, for the settings of a kind of data."""
+    found = (
         Variant("saga"),
         Variant("kf", "kf"),
-        _classical("constant velocity", stationary=False, turn=False),
-        _classical("turn", stationary=False, turn=True),
-        _classical("stationary", stationary=True, turn=False),
-        _classical("stationary + turn", stationary=True, turn=True),
+        _classical(family, "constant velocity", stationary=False, turn=False),
+        _classical(family, "turn", stationary=False, turn=True),
+        _classical(family, "stationary", stationary=True, turn=False),
+        _classical(family, "stationary + turn", stationary=True, turn=True),
         Variant("centerpoint", "centerpoint"),
     )
-}
+    return {variant.name: variant for variant in found}
 
 
 def with_life(config: TrackConfig, life: Life) -> TrackConfig:

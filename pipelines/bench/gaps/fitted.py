@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
+from pipelines.bench.gaps.boosted import boosted_runs
+from pipelines.bench.gaps.learned import LEARNED, learn_interactions
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
-from saga_fg.types.dataset import Scene
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
+
+Fit = Literal["noise", "edges", "boosted"]
+FITS: tuple[Fit, ...] = ("noise", "edges", "boosted")
 
 
 @dataclass(frozen=True)
@@ -24,22 +28,32 @@ class Split:
 
 
 def splits_of(
-    recordings: Sequence[str], train: Sequence[str] = (), test: Sequence[str] = (), folds: int | None = None
+    recordings: Sequence[str],
+    train: Sequence[str] = (),
+    test: Sequence[str] = (),
+    folds: int | None = None,
+    unit: Mapping[str, str] | None = None,
 ) -> list[Split]:
     """Split the recordings of a set; `train` and `test` may name recordings of other sets as well.
 
     test   those that are judged; all but `train` if it is empty
-    folds  deal the judged recordings into so many, each judged after a fit to the others
+    folds  deal the judged recordings into so many, each judged after a fit to the others; 0: into units
+    unit   what recordings are dealt by: those of one unit are in one fold; each by itself where it has none
 
-    Raises `InputError` for more folds than recordings.
+    Raises `InputError` for more folds than units, and for units of which there is one.
     """
+    unit = unit or {}
     judged = [name for name in recordings if (name in test if test else name not in train)]
     if folds is None:
         return [Split(tuple(name for name in recordings if name in train), tuple(judged))] if judged else []
-    if folds > len(judged):
-        raise InputError(f"--folds {folds}: expected at most the number of recordings, {len(judged)}")
-    dealt = [tuple(judged[k::folds]) for k in range(folds)]
-    return [Split(tuple(name for name in judged if name not in fold), fold) for fold in dealt]
+    units = list(dict.fromkeys(unit.get(name, name) for name in judged))
+    if folds == 0 and len(units) == 1:
+        raise InputError(f"--folds place: expected recordings of two places or more, all are of {units[0]}")
+    if folds > len(units):
+        raise InputError(f"--folds {folds}: expected at most the number of recordings, {len(units)}")
+    dealt = [set(units[k :: folds or len(units)]) for k in range(folds or len(units))]
+    parts = [tuple(name for name in judged if unit.get(name, name) in fold) for fold in dealt]
+    return [Split(tuple(name for name in judged if name not in part), part) for part in parts]
 
 
 def bench_splits(
@@ -48,29 +62,39 @@ def bench_splits(
     contenders: Sequence[Contender],
     base: TrackConfig,
     settings: GapBenchSettings,
+    fits: Sequence[Fit] = ("noise", "edges"),
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Run]:
-    """All runs on the recordings that are judged; where there are others to fit to, with fitted contenders."""
+    """All runs on the recordings that are judged; where there are others to fit to, with fitted contenders.
+
+    Raises `InputError` where there is nothing to learn from, `MissingExtraError` for boosted trees without
+    scikit-learn.
+    """
     runs: list[Run] = []
     for split in splits:
-        teaching = [source.scene(name) for name in split.train]
-        fitted = fitted_contenders(teaching, base, progress) if teaching else []
+        fitted: list[Contender] = []
+        if split.train and "noise" in fits:
+            fitted.append(_with_fitted_noise(source, split, base))
+        if split.train and "edges" in fits:
+            fitted.append(_with_learned_edges(source, split, base, progress))
         runs += bench_gaps(source, split.test, [*contenders, *fitted], settings, workers, progress)
+        if split.train and "boosted" in fits:
+            runs += boosted_runs(source, split.train, split.test, settings, base.sensors)
     return runs
 
 
-def fitted_contenders(
-    teaching: Sequence[Scene], base: TrackConfig, progress: Progress | None = None
-) -> list[Contender]:
-    """kf with the process noise, and saga with the edges, learned from some annotated recordings.
+def _with_fitted_noise(source: RecordingSource, split: Split, base: TrackConfig) -> Contender:
+    """kf with the process noise of some annotated recordings."""
+    scenes = (source.scene(name) for name in split.train)
+    noise = fit_acceleration_noise_by_class(measured_trajectories(scenes, base.sensors))
+    return Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise))
 
-    Raises `InputError` where there is nothing to learn from.
-    """
-    noise = fit_acceleration_noise_by_class(measured_trajectories(iter(teaching), base.sensors))
-    truths = {scene.name: Trajectories.of_truth(scene) for scene in teaching}
-    learned = learn_interactions(truths, f"recordings {', '.join(truths)}", progress=progress)
-    return [
-        Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise)),
-        Contender("saga, learned edges", "saga", base.with_interactions(learned)),
-    ]
+
+def _with_learned_edges(
+    source: RecordingSource, split: Split, base: TrackConfig, progress: Progress | None
+) -> Contender:
+    """Saga with the edges of some annotated recordings."""
+    scenes = {name: source.scene(name) for name in split.train}
+    learned = learn_interactions(scenes, f"recordings {', '.join(scenes)}", base, progress=progress).interactions
+    return Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned))

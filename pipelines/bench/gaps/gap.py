@@ -7,6 +7,7 @@ it travels faster than `MOVING` over the gap.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,7 +59,19 @@ def real_gaps(labelled: LabelledScene) -> list[Gap]:
     return found
 
 
-def made_gaps(labelled: LabelledScene, passes: int, seed: int) -> list[Gap]:
+def reached(time: FloatArray, gap: Gap) -> dict[float, int]:
+    """The moments of a gap at which the lengths that it reaches end; time (K,) of all moments."""
+    period = float(np.median(np.diff(time)))
+    since = time[gap.start + 1 : gap.stop] - time[gap.start]
+    found = {}
+    for length in LENGTHS if len(since) else ():
+        k = int(np.argmin(np.abs(since - length)))
+        if abs(since[k] - length) < 0.6 * period:
+            found[length] = gap.start + 1 + k
+    return found
+
+
+def made_gaps(labelled: LabelledScene, passes: int, seed: int, lengths: Sequence[float] = LENGTHS) -> list[Gap]:
     """Windows in which objects can be hidden: well followed before, labelled throughout, detected at the end.
 
     In one pass an object may be hidden several times; objects that are hidden at the same time are `SPACING` apart.
@@ -67,25 +80,25 @@ def made_gaps(labelled: LabelledScene, passes: int, seed: int) -> list[Gap]:
     if len(time) < 3:
         return []
     rng = np.random.default_rng([seed, zlib.crc32(labelled.scene.name.encode())])
-    windows = _windows(labelled, rng)
+    possible = windows(labelled, rng, lengths)
     gaps: list[Gap] = []
     for number in range(1, passes + 1):
-        order = rng.permutation(len(windows))
-        order = order[np.argsort([not windows[k].moving for k in order], kind="stable")]  # these are fewer
+        order = rng.permutation(len(possible))
+        order = order[np.argsort([not possible[k].moving for k in order], kind="stable")]  # these are fewer
         taken = _Taken(labelled)
         for k in order[:TRIALS].tolist():
-            if taken.free(windows[k]):
-                taken.add(windows[k])
-                gaps.append(replace(windows[k], run=number))
+            if taken.free(possible[k]):
+                taken.add(possible[k])
+                gaps.append(replace(possible[k], run=number))
     return gaps
 
 
-def _windows(labelled: LabelledScene, rng: np.random.Generator) -> list[Gap]:
-    """All that are possible; a length is chosen at random for each start."""
+def windows(labelled: LabelledScene, rng: np.random.Generator, lengths: Sequence[float]) -> list[Gap]:
+    """All gaps that are possible, by row and every `STARTS` s; a length is chosen at random for each."""
     time, found = labelled.scene.timestamps, []
     period = float(np.median(np.diff(time)))
     known = np.isfinite(labelled.position[..., 0])
-    until = {length: _ends(time, length) for length in LENGTHS}
+    until = {length: _ends(time, length) for length in lengths}
     before = np.searchsorted(time, time - FOLLOWED - period / 4)
     stride = max(1, round(STARTS / period))
     counts = np.concatenate([np.zeros((1, len(labelled.id)), dtype=np.int64), labelled.detected.cumsum(axis=0)])
@@ -97,7 +110,7 @@ def _windows(labelled: LabelledScene, rng: np.random.Generator) -> list[Gap]:
         hits = counts[start + 1] - counts[first]
         followed = labelled.detected[start] & (hits >= FOLLOWED_SHARE * (start + 1 - first))
         possible: dict[int, list[tuple[float, int]]] = {}
-        for length in LENGTHS:
+        for length in lengths:
             stop = int(until[length][start]) + 1
             if stop < len(time) and abs(time[stop - 1] - time[start] - length) < 0.6 * period:
                 whole = named[stop + 1] - named[start] == stop + 1 - start

@@ -17,8 +17,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from data_tools.metrics.consistency import nees
 from data_tools.metrics.matching import match_scene
-from pipelines.bench.gaps.gap import LENGTHS, LONGEST, SHORTEST, Gap
+from pipelines.bench.gaps.gap import LONGEST, SHORTEST, Gap, reached
 from pipelines.bench.gaps.labelled import LabelledScene
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.track import Tracks
@@ -33,20 +34,35 @@ B = TypeVar("B")
 
 
 @dataclass(frozen=True)
+class Prediction:
+    """A track without detections against the label of its object.
+
+    error   m, however large;  nees: its square by the covariance of the position, chi-squared with 2 degrees of freedom
+    nll     negative logarithm of the density of the true position, nats;  NaN, as nees, without a covariance
+    """
+
+    error: float
+    nees: float
+    nll: float
+
+
+@dataclass(frozen=True)
 class GapOutcome:
     """The outcome of one gap of an object.
 
-    held, kept   whether a track had it before, and whether that track has it after
-    reported     whether that track is among the results at the last moment of the gap
+    held, kept   whether a track had it before, and whether that track has it after; kept: None without tracks
+    reported     whether that track is among the results at the last moment of the gap; None without tracks
     error        mean over the gap, m
     at           error at the end of each length that the gap reaches, m
+    predicted    where the track that had it is, at these moments, if it is among the results
     """
 
     held: bool
-    kept: bool
-    reported: bool
+    kept: bool | None
+    reported: bool | None
     error: float
     at: Mapping[float, float]
+    predicted: Mapping[float, Prediction]
 
 
 @dataclass(frozen=True)
@@ -80,19 +96,20 @@ class JudgedRun:
 
     def outcome(self, gap: Gap) -> GapOutcome:
         """Judge one gap."""
-        name = str(self._labelled.id[gap.row])
+        name, ends = str(self._labelled.id[gap.row]), reached(self._labelled.scene.timestamps, gap)
         before = self._last(self._track_of, name, gap.start, back=True)
         after = self._last(self._track_of, name, gap.stop, back=False)
         if before is None:
-            at = dict.fromkeys(self._lengths(gap), CAP)
-            return GapOutcome(False, False, False, CAP, at)
+            return GapOutcome(False, False, False, CAP, dict.fromkeys(ends, CAP), {})
         moments = range(gap.start + 1, gap.stop)
         errors = np.array([self._error(before, gap.row, k) for k in moments])
         reported = before in self._row_of[gap.stop - 1]
-        at = {length: float(errors[k - gap.start - 1]) for length, k in self._lengths(gap).items()}
+        at = {length: float(errors[k - gap.start - 1]) for length, k in ends.items()}
         known = errors[np.isfinite(errors)]
         mean = float(known.mean()) if len(known) else float("nan")
-        return GapOutcome(True, after == before, reported, mean, {h: e for h, e in at.items() if np.isfinite(e)})
+        predicted = {h: found for h, k in ends.items() if (found := self._prediction(before, gap.row, k)) is not None}
+        at = {h: e for h, e in at.items() if np.isfinite(e)}
+        return GapOutcome(True, after == before, reported, mean, at, predicted)
 
     def holders(self, gap: Gap) -> list[int | None]:
         """The detected track of the object of a gap at each moment, None where there is none."""
@@ -120,18 +137,6 @@ class JudgedRun:
                     false += 1
         return Links(right, false, unknown)
 
-    def _lengths(self, gap: Gap) -> dict[float, int]:
-        """The moments of the gap at which the lengths that it reaches end."""
-        time = self._labelled.scene.timestamps
-        period = float(np.median(np.diff(time)))
-        since = time[gap.start + 1 : gap.stop] - time[gap.start]
-        found = {}
-        for length in LENGTHS:
-            k = int(np.argmin(np.abs(since - length)))
-            if abs(since[k] - length) < 0.6 * period:
-                found[length] = gap.start + 1 + k
-        return found
-
     def _last(self, of: Sequence[Mapping[A, B]], one: A, moment: int, back: bool) -> B | None:
         """The last partner within `SETTLING` s until a moment (`back`), or from it on."""
         after = (self._labelled.scene.timestamps - self._labelled.scene.timestamps[moment]) * (-1 if back else 1)
@@ -145,6 +150,16 @@ class JudgedRun:
             return float("nan")
         there = self._position(track, moment)
         return CAP if there is None else min(float(np.hypot(*(there - truth))), CAP)
+
+    def _prediction(self, track: int, row: int, moment: int) -> Prediction | None:
+        truth, at = self._labelled.position[moment, row], self._row_of[moment].get(track)
+        if at is None or not np.isfinite(truth[0]):
+            return None
+        error = self.tracks[moment].boxes.position[at, :2] - truth
+        covariance = self.tracks[moment].position_covariance[at]
+        squared = float(nees(error[None], covariance[None])[0])
+        nll = 0.5 * (squared + float(np.linalg.slogdet(2 * np.pi * covariance)[1])) if np.isfinite(squared) else squared
+        return Prediction(float(np.hypot(*error)), squared, nll)
 
     def _position(self, track: int, moment: int) -> FloatArray | None:
         for k in range(moment, -1, -1):

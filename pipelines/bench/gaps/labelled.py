@@ -26,17 +26,20 @@ class LabelledScene:
     """N objects at the K moments of a scene, NaN where they are not labelled.
 
     id, label (N,); position (K, N, 2), m, world; detected (K, N) whether some detection is of the object
+    velocity  (K, N, 2), m/s, world, by differences of positions where the labels have none; yaw (K, N), rad
     owner     for each frame, the object (D,) that each detection is of, whatever its class; -1: none
-    place     for each frame, where its detections are (D, 2), m, world
+    boxes     for each frame, its detections in the world
     """
 
     scene: Scene
     id: StrArray
     label: StrArray
     position: FloatArray
+    velocity: FloatArray
+    yaw: FloatArray
     detected: BoolArray
     owner: tuple[IntArray, ...]
-    place: tuple[FloatArray, ...]
+    boxes: tuple[Boxes, ...]
 
     @classmethod
     def of(cls, scene: Scene, sensors: Mapping[str, Sensor]) -> LabelledScene:
@@ -47,22 +50,25 @@ class LabelledScene:
         truth = scene.ground_truth
         names = np.unique(np.concatenate([moment.id for moment in truth]))
         rows = [np.searchsorted(names, moment.id) for moment in truth]
-        position = np.full((len(truth), len(names), 2), np.nan)
+        position, velocity = np.full((2, len(truth), len(names), 2), np.nan)
+        yaw = np.full((len(truth), len(names)), np.nan)
         label = np.full(len(names), "", dtype="U64")
         detected = np.zeros((len(truth), len(names)), dtype=np.bool_)
         for k, (moment, at) in enumerate(zip(truth, rows, strict=True)):
             position[k, at], label[at] = moment.boxes.position[:, :2], moment.boxes.label
-        owners, places = [], []
+            velocity[k, at], yaw[k, at] = moment.boxes.velocity, moment.boxes.yaw
+        owners, found = [], []
         for frame in scene.frames:
             k = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
             boxes = sensor_model(sensors, frame.sensor).in_world(frame).boxes
             distance = _distances(boxes, truth[k], frame.timestamp - float(scene.timestamps[k]))
             owners.append(_nearest(distance, rows[k]))
-            places.append(boxes.position[:, :2])
+            found.append(boxes)
             distance[boxes.label[:, None] != truth[k].boxes.label] = np.inf
             same = _nearest(distance, rows[k])
             detected[k, same[same >= 0]] = True
-        return cls(scene, names, label, position, detected, tuple(owners), tuple(places))
+        velocity = np.where(np.isfinite(velocity), velocity, _differences(position, scene.timestamps))
+        return cls(scene, names, label, position, velocity, yaw, detected, tuple(owners), tuple(found))
 
     def frames_without(self, row: IntArray, start: FloatArray, stop: FloatArray) -> list[Frame]:
         """The frames without the detections of objects `row` (W,) after `start` and before `stop` (W,), s."""
@@ -72,6 +78,14 @@ class LabelledScene:
             gone = np.isin(owner, hidden)
             kept.append(replace(frame, detections=frame.detections.select(~gone)) if gone.any() else frame)
         return kept
+
+
+def _differences(position: FloatArray, time: FloatArray) -> FloatArray:
+    """(K, N, 2) m/s from the moment before, or to the one after where that is not labelled."""
+    step = np.diff(position, axis=0) / np.diff(time)[:, None, None]
+    nothing = np.full((1, *position.shape[1:]), np.nan)
+    before, after = np.concatenate([nothing, step]), np.concatenate([step, nothing])
+    return np.where(np.isfinite(before), before, after)
 
 
 def _distances(boxes: Boxes, truth: Annotations, elapsed: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -11,7 +11,8 @@ from typing import Any
 
 from data_tools.datasets.annotated import detected
 from data_tools.datasets.registry import dataset_source
-from pipelines.bench.recordings import SETS, TRAFFIC_SETS, RecordingSet, recording_set
+from data_tools.simulator.recorded_world import ABOVE
+from pipelines.bench.recordings import SETS, TRAFFIC_SETS, RecordingSet, TrueSet, recording_set
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 
@@ -27,18 +28,20 @@ class RecordingSource:
 
     data    folder of all recordings; scenes: number of simulated ones
     labels  whether the visible annotations take the place of the detector's results
+    viewpoint  of the sensors that see recorded traffic, see `data_tools.simulator.recorded_world`
     """
 
     name: str
     data: Path | None = None
     scenes: int = 10
     labels: bool = False
+    viewpoint: str = ABOVE
 
     @contextmanager
     def opened(self) -> Iterator[Dataset]:
         """The recordings, with ground truth. Raises `InputError` for an unknown set or missing recordings."""
         if self.name not in ANNOTATED:
-            yield _set(self.name, self.data, self.scenes).dataset
+            yield _set(self.name, self.data, self.scenes, self.viewpoint).dataset
             return
         if self.data is None:
             raise InputError(f"set {self.name}: expected --data DIR with {ANNOTATED[self.name]}/")
@@ -51,7 +54,17 @@ class RecordingSource:
         """The kind of settings that fit."""
         if self.name in ANNOTATED:
             return dataset_source(self.name).family
-        return _set(self.name, self.data, self.scenes).family
+        return _set(self.name, self.data, self.scenes, self.viewpoint).family
+
+    @property
+    def clusters(self) -> Mapping[str, str]:
+        """The first of the recordings that overlap in time with each, by name; empty where none can."""
+        found = _set(self.name, self.data, self.scenes, self.viewpoint) if self.name in TRAFFIC_SETS else None
+        return found.clusters if isinstance(found, TrueSet) else {}
+
+    def places(self, recordings: Sequence[str]) -> Mapping[str, str]:
+        """The site or setting of each recording of traffic; of other sets, each is a place of its own."""
+        return {name: name.partition("-")[0] for name in recordings} if self.name in TRAFFIC_SETS else {}
 
     def scene(self, recording: str) -> Scene:
         """Read a recording."""
@@ -61,9 +74,9 @@ class RecordingSource:
 
 
 @lru_cache(maxsize=4)
-def _set(name: str, data: Path | None, scenes: int) -> RecordingSet:
+def _set(name: str, data: Path | None, scenes: int, viewpoint: str) -> RecordingSet:
     """Files of detections are read once."""
-    return recording_set(name, data, scenes)
+    return recording_set(name, data, scenes, viewpoint)
 
 
 def set_names(data: Path | None) -> tuple[str, ...]:

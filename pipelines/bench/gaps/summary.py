@@ -1,4 +1,7 @@
-"""Figures of the benchmark of gaps, with intervals of a paired bootstrap over recordings."""
+"""Figures of the benchmark of gaps, with intervals of a paired bootstrap over recordings.
+
+Recordings that overlap in time count as one.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ FEWEST_RECORDINGS, FEWEST_GAPS = 3, 5  # of an interval
 Kind = Literal["real", "made"]
 KINDS: tuple[Kind, ...] = ("real", "made")
 Selection = Callable[[Gap, str], bool]
-Value = Callable[[GapOutcome], float]
+Value = Callable[[GapOutcome], float | None]
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,9 @@ def link_figures(runs: Sequence[Run]) -> list[LinkFigure]:
     """All contenders and lives."""
     figures = []
     for life, contender in _kinds_of_runs(runs):
-        links = [run.links for run in runs if (run.life, run.contender) == (life, contender)]
+        links = [run.links for run in runs if (run.life, run.contender) == (life, contender) and run.links is not None]
+        if not links:
+            continue
         right, false, unknown = (sum(getattr(of, name) for of in links) for name in ("right", "false", "unknown"))
         known = right + false
         share = false / known if known else float("nan")
@@ -91,8 +96,8 @@ def gap_figures(runs: Sequence[Run], reference: str) -> list[GapFigure]:
     """All lives, kinds, groups, lengths and contenders on the recordings of one set."""
     figures = []
     lives = list(dict.fromkeys(run.life for run in runs))
-    contenders = list(dict.fromkeys(run.contender for run in runs))
     for life in lives:
+        contenders = list(dict.fromkeys(run.contender for run in runs if run.life == life))
         mine = {name: [run for run in runs if (run.life, run.contender) == (life, name)] for name in contenders}
         for group in _groups(next(iter(mine.values()))):
             base = mine.get(reference, next(iter(mine.values())))
@@ -145,8 +150,8 @@ def _figure(runs: Sequence[Run], base: Sequence[Run], life: Life, group: _Group)
     changes: list[Interval | None] = [None, None]
     if runs[0].contender != base[0].contender:
         changes = [
-            _compared(kept, _values(base, of_length, lambda outcome: outcome.kept), difference),
-            _compared(errors, _values(base, group.has, group.error), relative_change),
+            compared(kept, _values(base, of_length, lambda outcome: outcome.kept), difference),
+            compared(errors, _values(base, group.has, group.error), relative_change),
         ]
     every = np.concatenate([each[np.isfinite(each)] for each in errors])
     return GapFigure(
@@ -157,32 +162,35 @@ def _figure(runs: Sequence[Run], base: Sequence[Run], life: Life, group: _Group)
         group.length,
         runs[0].contender,
         sum(map(len, kept)),
-        _interval(kept),
+        interval(kept),
         changes[0],
         _mean(np.concatenate(reported)),
         len(every),
-        _interval(errors),
+        interval(errors),
         changes[1],
         float(np.median(every)) if len(every) else float("nan"),
     )
 
 
 def _values(runs: Sequence[Run], chosen: Selection, value: Value) -> list[FloatArray]:
-    """The value of each chosen gap, recording by recording."""
-    return [
-        np.array(
-            [
-                value(outcome)
-                for gap, label, outcome in zip(run.gaps, run.label, run.outcomes, strict=True)
-                if chosen(gap, label)
-            ],
-            dtype=np.float64,
-        )
-        for run in runs
-    ]
+    """The value of each chosen gap, NaN where it has none, cluster by cluster."""
+
+    def of_run(run: Run) -> FloatArray:
+        every = zip(run.gaps, run.label, run.outcomes, strict=True)
+        return np.array([value(outcome) for gap, label, outcome in every if chosen(gap, label)], dtype=np.float64)
+
+    return by_cluster(runs, of_run)
 
 
-def _compared(ours: Sequence[FloatArray], theirs: Sequence[FloatArray], compare: Comparison) -> Interval | None:
+def by_cluster(runs: Sequence[Run], values: Callable[[Run], FloatArray]) -> list[FloatArray]:
+    """The values of the runs, those on recordings that overlap as one."""
+    found: dict[str, list[FloatArray]] = {}
+    for run in runs:
+        found.setdefault(run.cluster, []).append(values(run))
+    return [np.concatenate(each) for each in found.values()]
+
+
+def compared(ours: Sequence[FloatArray], theirs: Sequence[FloatArray], compare: Comparison) -> Interval | None:
     """The change of the mean over gaps that both have a value of; None where there are none."""
     a, b = [], []
     for mine, other in zip(ours, theirs, strict=True):
@@ -198,9 +206,9 @@ def _compared(ours: Sequence[FloatArray], theirs: Sequence[FloatArray], compare:
     return found
 
 
-def _interval(values: Sequence[FloatArray]) -> Interval:
+def interval(values: Sequence[FloatArray]) -> Interval:
     """The mean of the known values, NaN where there are none."""
-    found = _compared(values, values, lambda ours, _theirs: ours)
+    found = compared(values, values, lambda ours, _theirs: ours)
     return Interval(float("nan"), float("nan"), float("nan"), 0.95) if found is None else found
 
 

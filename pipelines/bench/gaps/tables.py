@@ -10,13 +10,19 @@ from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval
 from pipelines.bench.gaps.bench import Run
 from pipelines.bench.gaps.contenders import Life
+from pipelines.bench.gaps.situation_figures import situation_figures
 from pipelines.bench.gaps.summary import GapFigure, LinkFigure, gap_figures, link_figures
 
 LIVES: dict[Life, str] = {"kept": "tracks kept alive", "shipped": "tracks end as configured"}
 
 
-def tables(name: str, runs: Sequence[Run], reference: str, by_class: bool = False) -> list[FigureTable]:
-    """For people: real gaps, made gaps and links, for each life of the tracks; with rows for classes if wanted."""
+def tables(
+    name: str, runs: Sequence[Run], reference: str, by_class: bool = False, situations: bool = False
+) -> list[FigureTable]:
+    """For people: real gaps, made gaps and links, for each life of the tracks; with rows for classes if wanted.
+
+    With `situations`, a table of these for each time after the start of made gaps.
+    """
     figures, links = gap_figures(runs, reference), link_figures(runs)
     figures = [figure for figure in figures if by_class or figure.label is None]
     found = []
@@ -26,18 +32,20 @@ def tables(name: str, runs: Sequence[Run], reference: str, by_class: bool = Fals
         found += [
             _gaps([f for f in mine if f.kind == "real"], f"{title}: real gaps of 1 to 6 s", reference),
             _gaps([f for f in mine if f.kind == "made"], f"{title}: made gaps", reference),
+            *(situation_tables(runs, title, reference) if life == "kept" and situations else ()),
             _links([each for each in links if each.life == life], f"{title}: links through gaps"),
         ]
     return [table for table in found if table.rows]
 
 
-def figures(runs: Sequence[Run], reference: str) -> dict[str, Any]:
+def figures(runs: Sequence[Run], reference: str, situations: bool = False) -> dict[str, Any]:
     """For programs: what the tables show, and each gap."""
     return {
         "recordings": list(dict.fromkeys(run.recording for run in runs)),
         "reference": reference,
         "gaps": gap_figures(runs, reference),
         "links": link_figures(runs),
+        "situations": situation_figures(runs, reference) if situations else [],
         "outcomes": [
             {
                 "recording": run.recording,
@@ -54,9 +62,11 @@ def figures(runs: Sequence[Run], reference: str) -> dict[str, Any]:
                 "reported": outcome.reported,
                 "error": outcome.error,
                 "at": outcome.at,
+                "predicted": outcome.predicted,
+                "situations": {length: sorted(names) for length, names in at.items()},
             }
             for run in runs
-            for gap, label, outcome in zip(run.gaps, run.label, run.outcomes, strict=True)
+            for gap, label, at, outcome in zip(run.gaps, run.label, run.situations, run.outcomes, strict=True)
         ],
     }
 
@@ -89,11 +99,47 @@ def _gaps(figures: Sequence[GapFigure], title: str, reference: str) -> FigureTab
     return FigureTable(title, columns, tuple(rows))
 
 
-def _change(change: Interval | None) -> str:
-    """In hundredths with the interval, or "(-)" where there is none."""
+def situation_tables(runs: Sequence[Run], title: str, reference: str) -> list[FigureTable]:
+    """A table for each time after the start of made gaps, a row for each situation and contender."""
+    figures = situation_figures(runs, reference)
+    columns: tuple[str, ...] = (
+        "objects",
+        "contender",
+        "gaps",
+        "lost",
+        "error, m",
+        f"against {reference}, %",
+        "median, m",
+        "NLL, nats",
+    )
+    columns += (f"against {reference}", "in 50 %", "in 90 %")
+    found = []
+    for length in dict.fromkeys(f.length for f in figures):
+        rows: list[tuple[str, ...]] = [
+            (
+                f.situation,
+                f.contender,
+                str(f.gaps),
+                str(f.lost),
+                cell(f.error.estimate, 2),
+                _change(f.error_change),
+                cell(f.median, 2),
+                cell(f.nll.estimate, 2),
+                _change(f.nll_change, 1, 2),
+                *(cell(100 * share, 0) for share in f.coverage.values()),
+            )
+            for f in figures
+            if f.length == length
+        ]
+        found.append(FigureTable(f"{title}: made gaps, after {length:g} s, by situation", columns, tuple(rows)))
+    return found
+
+
+def _change(change: Interval | None, scale: float = 100, digits: int = 1) -> str:
+    """With the interval, or "(-)" where there is none; in hundredths if not scaled otherwise."""
     if change is None:
         return "-"
-    estimate, low, high = (f"{100 * value:+.1f}" for value in (change.estimate, change.low, change.high))
+    estimate, low, high = (f"{scale * value:+.{digits}f}" for value in (change.estimate, change.low, change.high))
     return f"{estimate} ({low} to {high})" if isfinite(change.low) else f"{estimate} (-)"
 
 

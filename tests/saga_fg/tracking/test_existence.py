@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.reporting import reported_score
 from saga_fg.tracking.track_table import TrackTable
+from tests.saga_fg.traffic_frames import frame
 
 SETTINGS = ExistenceSettings(lifetime=np.inf)
 
@@ -40,8 +42,27 @@ def test_a_detection_as_probable_as_clutter_says_nothing():
 def test_the_score_is_the_detections_unless_set_otherwise():
     assert score([0.4, 0.8], 1, 5) == pytest.approx([0.4, 0.8])
     assert score([0.4, 0.8], 1, 5, coasting=True) == pytest.approx([0.36, 0.72])
-    half = ExistenceSettings(coasting_score_factor=0.5)
-    assert score([0.4, 0.8], 1, 5, coasting=True, settings=half) == pytest.approx([0.18, 0.36])
+
+
+@pytest.mark.parametrize("family", ["kitti", "nuscenes"])
+def test_two_short_gaps_do_not_push_an_object_below_a_false_track(family):
+    config = load_config(family)
+    tracker, dt = config.new_tracker("saga"), 0.5 if family == "nuscenes" else 0.1
+    logit = {"kitti": lambda p: (np.log(p / (1 - p)) + 2.4) / 0.4, "nuscenes": lambda p: p}[family]
+    seen = [k for k in range(14) if k not in (4, 5, 9, 10)]
+    scores = {"object": [], "false": []}
+    for k in range(14):
+        places = [(0.0, 0.0)] * (k in seen) + [(40.0, 40.0)] * (k >= 9)
+        p = [0.6] * (k in seen) + [0.52] * (k >= 9)
+        detected = frame(dt * k, places)
+        detections = replace(detected.detections, score=logit(np.array(p)))
+        tracks = tracker.step(replace(detected, detections=detections))
+        near = np.hypot(*tracks.boxes.position[:, :2].T) < 10
+        scores["object"] += tracks.score[near].tolist()
+        scores["false"] += tracks.score[~near].tolist()
+    assert len(scores["object"]) == 14, "it is reported while coasting, too"
+    assert np.mean(scores["object"]) > np.mean(scores["false"])
+    assert min(scores["object"][1:]) > 0.5 * max(scores["object"]), "a gap hardly changes its rank"
 
 
 def test_a_steady_track_scores_higher_than_a_new_or_a_flickering_one():

@@ -37,7 +37,7 @@ def crossing(t):
     return (24.0, 5.0 * t - 18.0)
 
 
-def returning(after, steps=4, settings=SETTINGS, providers=()):
+def returning(after, steps=4, settings=SETTINGS, providers=(), label="car"):
     """The tracker and its tracks by step: a car seen for 3 s, hidden for 3.5 s, back at `after(t)` amid clutter."""
     tracker = Tracker(settings, providers=providers)
     run(tracker, [frame(0.1 * k, [crossing(0.1 * k)], yaw=np.pi / 2, world_T_ego=EGO) for k in range(30)])
@@ -46,7 +46,14 @@ def returning(after, steps=4, settings=SETTINGS, providers=()):
     for k in range(65, 65 + steps):
         others = CLUTTER if k == 65 else []
         frames.append(
-            frame(0.1 * k, [after(0.1 * k), *others], score=0.3 if k == 65 else 0.9, yaw=np.pi / 2, world_T_ego=EGO)
+            frame(
+                0.1 * k,
+                [after(0.1 * k), *others],
+                score=0.3 if k == 65 else 0.9,
+                label=label,
+                yaw=np.pi / 2,
+                world_T_ego=EGO,
+            )
         )
     return tracker, run(tracker, frames)
 
@@ -87,6 +94,13 @@ def test_a_look_alike_from_elsewhere_does_not_take_it():
 def test_switched_off():
     off = replace(SETTINGS, association=AssociationSettings(clutter_area=3000.0, relink_above=1.0))
     assert [detected_ids(tracks) for tracks in returning(crossing, settings=off)[1]] == [[2]] * 4
+
+
+def test_classes_that_are_mistaken_for_each_other_hand_over():
+    apart = returning(beside, label="truck")[1]
+    grouped = returning(beside, settings=replace(SETTINGS, class_groups=(("car", "truck"),)), label="truck")[1]
+    assert [detected_ids(tracks) for tracks in apart] == [[2]] * 4
+    assert [detected_ids(tracks) for tracks in grouped] == [[2], [2], [1], [1]]
 
 
 def test_an_unresolved_track_hands_nothing_over():
