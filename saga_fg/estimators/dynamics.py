@@ -120,49 +120,6 @@ class Dynamics:
         source = np.concatenate([blocks.source for blocks in self.F])
         return partition.joined(target, source)
 
-    def tie_strengths(self, x: BlockGaussian, partition: Partition) -> tuple[IntArray, IntArray, FloatArray]:
-        """Blocks F_ij between components of `partition`: labels of those of i and j, and how they would correlate.
-
-        That is the largest correlation of F_ij x_j with x_j, in deviations of x_i and x_j before the interval.
-        """
-        starts, sigma = self.layout.offsets[:-1], np.sqrt(x.variances())
-        found: list[tuple[IntArray, IntArray, FloatArray]] = []
-        for blocks, across in self._across(partition):
-            target, source, values = blocks.target[across], blocks.source[across], blocks.values[across]
-            _, d_i, d_j = values.shape
-            by_i = sigma[starts[target][:, None] + np.arange(d_i)][:, :, None]
-            by_j = sigma[starts[source][:, None] + np.arange(d_j)][:, None, :]
-            strength = np.abs(values @ x.covariances(source) / (by_i * by_j)).max(axis=(1, 2))
-            found.append((partition.label[target], partition.label[source], strength))
-        none = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0)
-        return tuple(np.concatenate(column) for column in zip(none, *found, strict=True))  # type: ignore[return-value]
-
-    def with_inputs(self, x: BlockGaussian, partition: Partition) -> Dynamics:
-        """Take nodes of other components of `partition` as independent inputs.
-
-        The mean stays exact, F_ij P_jj F_ij^T is further noise of node i, and their correlation is left out.
-        """
-        starts, F, Q, b = self.layout.offsets[:-1], list(self.F), list(self.Q), self.b.copy()
-        for blocks, across in self._across(partition):
-            target, source, values = blocks.target[across], blocks.source[across], blocks.values[across]
-            _, d_i, d_j = values.shape
-            kept = np.ones(len(blocks.target), dtype=bool)
-            kept[across] = False
-            F[self.F.index(blocks)] = Blocks(blocks.target[kept], blocks.source[kept], blocks.values[kept])
-            inputs = values @ x.mean[starts[source][:, None] + np.arange(d_j)][:, :, None]
-            np.add.at(b, starts[target][:, None] + np.arange(d_i), inputs[:, :, 0])
-            rows, index = np.unique(target, return_inverse=True)
-            noise = np.zeros((len(rows), d_i, d_i))
-            np.add.at(noise, index, values @ x.covariances(source) @ np.swapaxes(values, 1, 2))
-            Q.append(Blocks(rows, rows, noise))
-        return self if len(Q) == len(self.Q) else replace(self, F=tuple(F), b=b, Q=tuple(Q))
-
-    def _across(self, partition: Partition) -> list[tuple[Blocks, IntArray]]:
-        """Blocks between components of a partition, with which of them these are; groups of sources of one size."""
-        label = partition.label
-        found = ((blocks, np.flatnonzero(label[blocks.target] != label[blocks.source])) for blocks in self.F)
-        return [(blocks, across) for blocks, across in found if len(across)]
-
     def separated(self, x: BlockGaussian) -> BlockGaussian:
         """Separate the uncorrelated parts of components that no interaction of this interval ties."""
         tied = self.joined(Partition.apart(x.layout))
@@ -244,34 +201,12 @@ class Dynamics:
         return parts
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """What is left out of a prediction for speed.
+def predict(x: BlockGaussian, dynamics: Dynamics, partition: Partition | None = None) -> BlockGaussian:
+    """The prior after the interval. Raises `InputError` where it is not finite.
 
-    tolerance  correlation up to which nodes count as independent
-    most       largest number of nodes of a component; the strongest ties come first
+    partition: components that F does not leave; nodes that it separates lose their correlation. None: those joined by F
     """
-
-    tolerance: float
-    most: int
-
-    def joined(self, x: BlockGaussian, dynamics: Dynamics) -> Partition:
-        """The components after a prediction."""
-        parts = x.uncorrelated(self.tolerance)
-        a, b, strength = dynamics.tie_strengths(x, parts)
-        strong = np.flatnonzero(strength > self.tolerance)
-        strong = strong[np.argsort(-strength[strong], kind="stable")]
-        return parts.joined_up_to(a[strong], b[strong], self.most)
-
-
-def predict(x: BlockGaussian, dynamics: Dynamics, bounds: Bounds | None = None) -> BlockGaussian:
-    """The prior after the interval, exact or within bounds. Raises `InputError` where it is not finite."""
-    if bounds is None:
-        partition = dynamics.joined(x.partition)
-    else:
-        partition = bounds.joined(x, dynamics)
-        dynamics = dynamics.with_inputs(x, partition)
-    x = x.over(partition.packed)
+    x = x.over((dynamics.joined(x.partition) if partition is None else partition).packed)
     partition = x.partition
     mean, blocks = dynamics.propagated(x)
     mean += dynamics.b

@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.bounds import Bounds
 from saga_fg.estimators.correction import correct
-from saga_fg.estimators.dynamics import Bounds, predict
+from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
@@ -114,8 +115,11 @@ class JointKalmanFilter(LatestMarginals):
 
     def predict(self, transition: Transition) -> None:
         dynamics = self._auxiliary.dynamics(transition, self._state)
-        look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1 and self.bounds is None
-        self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics, self.bounds)
+        look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
+        if self.bounds is None:
+            self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
+        else:
+            self._state = predict(self._state, *self.bounds.applied(self._state, dynamics))
         self._predictions += 1
         self._time += transition.dt
 
