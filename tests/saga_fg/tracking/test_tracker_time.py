@@ -164,7 +164,7 @@ def test_no_delay_is_allowed_if_so_set():
 
 
 def test_looking_ahead_moves_tracks_by_their_velocity_and_makes_them_less_certain():
-    t = tracker(report_coasting=2.0)
+    t = tracker()
     now = run(t, seen(np.random.default_rng(0), FAST, np.arange(0, 2, 0.1)))[-1]
     ahead = t.tracks(now.timestamp + 0.5)
     assert ahead.timestamp == now.timestamp + 0.5

@@ -14,9 +14,7 @@ from tests.saga_fg.traffic_frames import frame
 DT, RATE, SPEED = 0.1, 0.3, 8.0
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.03)})}
 MOTION = ConstantVelocity(1.0)
-TURNS = TrackerSettings(
-    classes={"default": ClassSettings(motion=MOTION, turn_time=2.0, max_coasting=3.0)}, edges=(), report_coasting=3.0
-)
+TURNS = TrackerSettings(classes={"default": ClassSettings(motion=MOTION, turn_time=2.0, max_deviation=20.0)}, edges=())
 STRAIGHT = replace(TURNS, classes={"default": replace(TURNS.classes["default"], turn_time=0.0)})
 
 
