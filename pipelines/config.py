@@ -12,6 +12,7 @@ from typing import Literal, get_args
 from data_tools.files.error_messages import unknown_name
 from pipelines.configuration import load_settings, read_settings
 from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.model.sensor import Sensor
@@ -41,7 +42,7 @@ class TrackConfig:
     """Configuration of tracking."""
 
     tracker: TrackerSettings = settings_group(
-        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges)"
+        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges and trails)"
     )
     greedy: GreedySettings = settings_group(GreedySettings, "the tracker of the method centerpoint")
     sensors: Mapping[str, Sensor] = settings_group(
@@ -70,13 +71,16 @@ class TrackConfig:
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
     def with_interactions(self, learned: LearnedInteractions) -> TrackConfig:
-        """Return a copy with learned edge rules; process noise stays, as association needs more than prediction."""
-        return replace(
-            self, tracker=replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
-        )
+        """Return a copy with learned edge rules in place of those that can be learned, and with their explained noise.
+
+        Process noise stays, as association needs more of it than prediction; so do signals, lanes, lines and walls.
+        """
+        others = tuple(rule for rule in self.tracker.edges if not isinstance(rule, Following | Neighbours))
+        edges, explained = learned.edges + others, learned.explained_noise
+        return replace(self, tracker=replace(self.tracker, edges=edges, explained_noise=explained))
 
     def new_tracker(self, method: Method, observer: Observer | None = None) -> Tracker | GreedyTracker:
-        """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre).
+        """A fresh tracker: `saga`, `kf` (the same without edges and trails) or `centerpoint` (greedy nearest centre).
 
         The `observer` watches the first two; `centerpoint` tells nothing.
         """
@@ -86,7 +90,10 @@ class TrackConfig:
 
     def of_method(self, method: Method) -> TrackConfig:
         """Return a copy for a method: without edges, unless it is `saga`."""
-        return self if method == "saga" else replace(self, tracker=replace(self.tracker, edges=()))
+        if method == "saga":
+            return self
+        alone = replace(self.tracker, edges=(), trails=replace(self.tracker.trails, memory=0.0))
+        return replace(self, tracker=alone)
 
 
 def load_interactions(path: Path) -> LearnedInteractions:

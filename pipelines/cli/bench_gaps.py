@@ -16,6 +16,10 @@ from pipelines.cli.tables import JsonFile, MarkdownFile, PictureFile, report, wr
 from pipelines.cli.tracking_options import InteractionsOption, with_interactions
 from saga_fg.errors import InputError
 
+LengthsOption = Annotated[
+    str | None, typer.Option("--lengths", help="Of made gaps, s, with commas: of 1, 2, 3, 5.  [default: all of them]")
+]
+
 if TYPE_CHECKING:
     from pipelines.bench.gaps.bench import Contender, Run
     from pipelines.bench.gaps.fitted import Fit
@@ -95,10 +99,7 @@ def gaps(
         bool,
         typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
     ] = False,
-    lengths: Annotated[
-        str | None,
-        typer.Option("--lengths", help="Of made gaps, s, with commas: of 1, 2, 3, 5.  [default: all of them]"),
-    ] = None,
+    lengths: LengthsOption = None,
     viewpoint: Annotated[
         str,
         typer.Option(
@@ -120,6 +121,10 @@ def gaps(
             callback=writable,
         ),
     ] = None,
+    of: Annotated[
+        str | None,
+        typer.Option("--of", help="Draw a gap of an object in this situation, such as 'at red'.", metavar="SITUATION"),
+    ] = None,
     json_file: JsonFile = None,
     markdown: MarkdownFile = None,
     verbose: Verbose = False,
@@ -139,6 +144,7 @@ def gaps(
       saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
       saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
       saga-fg bench gaps --data data --sets ngsim --life kept --folds place --fit edges,boosted --situations
+      saga-fg bench gaps --data data --sets ngsim --test USA_Lanker-2_6_T-1 --life kept --picture gap.png --of 'at red'
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -146,6 +152,7 @@ def gaps(
     from pipelines.bench.gaps.fitted import bench_splits, splits_of
     from pipelines.bench.gaps.picture import write_telling_picture
     from pipelines.bench.gaps.plot import write_plot
+    from pipelines.bench.gaps.situations import SITUATIONS
     from pipelines.bench.gaps.sources import KNOWN, RecordingSource, set_names
     from pipelines.bench.gaps.tables import figures, tables
     from pipelines.config import load_config
@@ -172,9 +179,11 @@ def gaps(
             raise InputError(f"set {name}: expected recordings to judge, {why}")
     if plot is not None and passes == 0:
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), _lengths(lengths))
+    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths))
     if situations and (life == "shipped" or passes == 0):
         raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
+    if of is not None and (picture is None or of not in SITUATIONS):
+        raise InputError(f"--of: expected --picture, and one of {', '.join(SITUATIONS)}")
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
         for source in sources:
@@ -198,7 +207,19 @@ def gaps(
         compared = _contenders(contenders, own or [], interactions, source.family, load_config(source.family, config))
         better = next((each for each in compared if each.name != against), compared[0])
         pair = [next(each for each in compared if each.name == against), better]
-        write_telling_picture(picture, source, runs[source.name], pair)
+        write_telling_picture(picture, source, runs[source.name], pair, of)
+
+
+def chosen_lengths(text: str | None) -> tuple[float, ...]:
+    """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
+    from pipelines.bench.gaps.gap import LENGTHS
+
+    known = {f"{length:g}": length for length in LENGTHS}
+    wanted = names("--lengths", text) if text else tuple(known)
+    for each in wanted:
+        if each not in known:
+            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {each!r:.40}")
+    return tuple(known[each] for each in known if each in wanted)
 
 
 def _recordings(source: RecordingSource) -> tuple[str, ...]:
@@ -222,18 +243,6 @@ def _folds(text: str | None) -> int | None:
     if not (text.isascii() and text.isdecimal() and int(text) >= 2):
         raise InputError(f"--folds: expected a number of 2 or more, or place, got {text!r:.40}")
     return int(text)
-
-
-def _lengths(text: str | None) -> tuple[float, ...]:
-    """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
-    from pipelines.bench.gaps.gap import LENGTHS
-
-    known = {f"{length:g}": length for length in LENGTHS}
-    wanted = names("--lengths", text) if text else tuple(known)
-    for each in wanted:
-        if each not in known:
-            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {each!r:.40}")
-    return tuple(known[each] for each in known if each in wanted)
 
 
 def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str], judged: Sequence[str]) -> None:

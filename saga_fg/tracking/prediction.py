@@ -11,17 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.model.edge_rules import build_graph
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.known_turn import KnownTurns, turns_as_known
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.deletion import untrackable
+from saga_fg.tracking.known_courses import known_courses
 from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
 
-LEAST_TURN = 0.01  # rad/s; less is straight on: 0.2 m aside in 2 s at 10 m/s, within the noise of a detection
 MOST_STEPS = 100  # that an interval is predicted in
 
 
@@ -36,24 +34,27 @@ def predict(state: TrackerState, time: float, ahead: bool = False) -> None:
         steps = max(1, math.ceil(min(wanted, MOST_STEPS) - 1e-9))
         if wanted > MOST_STEPS:
             log.warning("%g s are predicted in %d steps, max_step asks for %.3g", dt, steps, wanted)
-        for _ in range(steps):
-            _predict_step(state, dt / steps, ahead)
+        for number in range(steps):
+            _predict_step(state, dt / steps, ahead, watched=number == 0 and not ahead)
         state.table.box.predict(dt, state.class_values(state.table.label, "yaw_drift")[0])
     state.time = time
 
 
-def _predict_step(state: TrackerState, dt: float, ahead: bool) -> None:
-    """Predict by `dt` s with the edges of the present estimates."""
+def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) -> None:
+    """Predict by `dt` s with the edges of the present estimates; from vehicles `watched` now lights are inferred."""
     table = state.table
     unseen = ahead | (table.last_detected < state.time)
     noise = _predict_stationarity(state, dt)
-    explained = state.settings.explained_noise
-    state.graph = build_graph(node_table(state), state.rules, explained_noise=explained, noise_scale=noise)
+    explained, nodes, lights = state.settings.explained_noise, node_table(state), state.map_nodes
+    if watched and lights.infers:
+        lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
+    state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
-    state.graph = replace(state.graph, modes=_known_turns(state))
+    courses, heading = known_courses(state, dt, unseen)
+    state.graph = replace(state.graph, modes=courses)
     state.joint.predict(state.graph, dt)
-    table.turn.predict(dt, state.class_values(table.label, "turn_time")[0])
     table.box.turn_with(before, state.kinematics().velocity, unseen)
+    table.box.yaw = np.where(np.isfinite(heading), heading, table.box.yaw)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
 
@@ -65,21 +66,6 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
         return None
     stationarity.predict(dt, state.kinematics(), settings)
     return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
-
-
-def _known_turns(state: TrackerState) -> tuple[KnownTurns, ...]:
-    """The turns of moving tracks whose classes turn, by motion and time constant."""
-    table = state.table
-    fading_time, rate = state.class_values(table.label, "turn_time")[0], table.turn.known()
-    turning = (fading_time > 0) & (np.abs(rate) > LEAST_TURN) & (np.hypot(*state.kinematics().velocity.T) > MOVING)
-    found = []
-    for node_type, rows in state.joint.rows_by_type(table.label[turning], moving=True) if turning.any() else []:
-        rows = np.flatnonzero(turning)[rows]
-        if turns_as_known(node_type):
-            for time in np.unique(fading_time[rows]).tolist():
-                same = rows[fading_time[rows] == time]
-                found.append(KnownTurns(node_type, table.id[same], rate[same], time))
-    return tuple(found)
 
 
 def node_table(state: TrackerState) -> NodeTable:

@@ -10,11 +10,12 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
@@ -32,6 +33,7 @@ from saga_fg.settings import (
 from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName, EstimatorName
 from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.trails import TrailSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.road_map import RoadMap
 from saga_fg.types.signal import SignalSettings
@@ -41,9 +43,12 @@ from saga_fg.types.signal import SignalSettings
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
-    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
-        lambda: ConstantVelocity(acceleration_noise=2.0),
-        "motion model of the class; random_walk for objects that never move, such as cones",
+    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Bicycle | Mixture = (
+        settings_group(
+            lambda: ConstantVelocity(acceleration_noise=2.0),
+            "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
+            "never move, such as cones",
+        )
     )
     initial_speed_deviation: Positive = setting(
         5.0, "standard deviation of the velocity of a new track along its heading, m/s; usual 1 (pedestrians) to 8"
@@ -84,10 +89,6 @@ class ClassSettings(Settings):
         1.5,
         "keep and report a track without detections while the standard deviation of its position is below this in "
         "every direction, m; usual 1 to 4; higher: hidden objects are reported for longer, at less certain places",
-    )
-    turn_time: NonNegative = setting(
-        0.0,
-        "time constant with which a turn seen in the headings fades, s; usual 1 to 3, 0: none; higher: longer curves",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
@@ -231,9 +232,11 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | RedLight | InLane | ConeLine | Attached, ...] = settings_group(
-        traffic_rules,
-        "edge rules of the scene graph: who interacts with whom; []: no interactions",
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | GreenLight | InLane | ConeLine | Attached, ...] = (
+        settings_group(
+            traffic_rules,
+            "edge rules of the scene graph: who interacts with whom; []: no interactions",
+        )
     )
     class_groups: tuple[tuple[str, ...], ...] = setting(
         (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"
@@ -267,6 +270,7 @@ class TrackerSettings(Settings):
     traffic_flow_prior: TrafficFlowSettings = settings_group(
         TrafficFlowSettings, "speed of new tracks from the traffic around them"
     )
+    trails: TrailSettings = settings_group(TrailSettings, "paths of undetected objects from those of earlier traffic")
     stationarity: StationaritySettings = settings_group(
         StationaritySettings, "estimation of which objects are stationary"
     )

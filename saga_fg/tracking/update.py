@@ -8,16 +8,18 @@ from __future__ import annotations
 import numpy as np
 
 from factors import RangeRate
+from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
+from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.tracking.retrodiction import past_positions
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic_flow import Passages
+from saga_fg.tracking.trails import TrailPoints
 
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
@@ -45,9 +47,21 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         moves = (speed > MOVING) & (speed > 3 * now.speed_deviation)
         table.box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
         table.has_moved[t] |= moves[t]
+        seen = t[moves[t]]
+        heading, time = np.arctan2(*now.velocity[seen, ::-1].T), np.full(len(seen), state.time)
+        state.trails.update(TrailPoints(table.id[seen], now.position[seen] + state.origin, heading, time))
     if state.settings.traffic_flow_prior.weight > 0:
         passing, now = table.select(t), state.kinematics().select(t)
         state.traffic.update(Passages.of(passing, now.position + state.origin, now, state.time))
+
+
+def infer_signals(state: TrackerState, matching: Matching) -> None:
+    """Update the states of traffic lights by the tracks that have just been detected."""
+    if state.map_nodes.infers and len(state.map_nodes.drivers):
+        t, now = matching.track, state.reported_kinematics()
+        P = now.P_velocity[t]
+        variance = (P[:, 0, 0] + P[:, 1, 1]) / 2
+        state.map_nodes.infer(state.table.id[t], now.velocity[t], variance, state.time)
 
 
 def _update_class(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> None:
