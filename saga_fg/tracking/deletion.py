@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
+
 from saga_fg.numerics.arrays import BoolArray
 from saga_fg.tracking.relinking import relinkable
 from saga_fg.tracking.reporting import known_places
@@ -20,9 +22,9 @@ log = logging.getLogger(__name__)
 def delete_tracks(state: TrackerState) -> None:
     """Delete the tracks that have come to their end at the state's time."""
     table, settings = state.table, state.settings
-    coasting = table.coasting(state.time)
-    deleted = (coasting > 0) & ~(known_places(state) | relinkable(state))
-    deleted |= coasting > settings.max_coasting
+    detected = np.isin(table.id, state.assignment.id)  # perhaps by a late frame
+    deleted = ~(detected | known_places(state) | relinkable(state))
+    deleted |= table.coasting(state.time) > settings.max_coasting
     deleted |= ~table.confirmed & (table.existence < settings.existence.delete_below)
     deleted |= untrackable(state)
     state.remove(deleted)
