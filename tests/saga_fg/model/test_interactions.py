@@ -160,3 +160,11 @@ def test_interactions_say_which_types_they_act_on():
         )
     assert applies(SharedVelocity.needs, CAR, rider)
     assert not applies(CarFollowing.needs, CAR, rider)
+
+
+def test_shared_velocity_takes_the_acceleration_of_the_follower_not_that_of_the_leader():
+    nodes = node_table(np.random.default_rng(1), (TRAM, TRAM))
+    triples = SharedVelocity().triples(nodes, np.array([0]), np.array([1]))
+    at = TRAM.index(("ax", "ay"))
+    assert triples.A_self[0][np.ix_(at, at)] == pytest.approx(-np.eye(2))
+    assert not triples.A_other[0][at].any()
