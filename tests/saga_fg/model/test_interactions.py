@@ -63,6 +63,9 @@ def test_triples_are_the_derivatives_of_the_law(interaction, types, seed):
         p_j, v_j = (x_j[types[1].index(names)] for names in (("x", "y"), ("vx", "vy")))
         change = np.zeros(types[0].dim)
         change[types[0].index(("vx", "vy"))] = acceleration(interaction, nodes, 0, 1, p_i, v_i, p_j, v_j)
+        if isinstance(interaction, SharedVelocity) and types[0].has(("ax", "ay")):
+            at = types[0].index(("ax", "ay"))
+            change[at] = -x_i[at]
         return change
 
     zero_i, zero_j = np.zeros(types[0].dim), np.zeros(types[1].dim)
