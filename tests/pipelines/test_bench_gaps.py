@@ -288,7 +288,7 @@ def test_places_are_sites_and_settings() -> None:
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
     config = load_config("simulated")
-    fitted = config.with_acceleration_noise({"default": 0.5, "truck": 0.25})
+    fitted = config.with_motions({"default": ConstantVelocity(0.5), "truck": ConstantVelocity(0.25)})
     classes = fitted.tracker.classes
     assert classes["truck"].motion.acceleration_noise == 0.25
     assert classes["default"].motion.acceleration_noise == 0.5
@@ -387,6 +387,7 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--train", "scene-0001", "--plot", "gaps.png"], "set simulated: expected recordings to judge"),
         (["--passes", "0", "--plot", "gaps.png"], "--plot: expected --passes of 1 or more"),
         (["--fit", "edge"], "--fit: expected some of noise, edges, boosted, got 'edge'"),
+        (["--of", "red"], "--of: expected --picture, and one of all, moving,"),
         (["--folds", "1"], "--folds: expected a number of 2 or more, or place, got '1'"),
         (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),
         (["--situations", "--life", "shipped"], "--situations: expected --life kept or both"),
