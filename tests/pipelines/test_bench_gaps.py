@@ -30,6 +30,7 @@ from pipelines.config import Family, load_config
 from saga_fg import Annotations, Boxes, Detections, Frame, InputError, Scene, Tracks
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.turning import CoordinatedTurn
 
 SHORT = replace(SimulatorSettings(), duration=12.0, warm_up=5.0)
@@ -247,6 +248,14 @@ def test_classical_contenders_differ_in_motion_alone() -> None:
     assert alone.classes["default"].max_coasting == base.tracker.classes["default"].max_coasting
     assert Contender.of(contenders("kitti")["kf"], base).same_as(Contender("classical", "kf", base))
     assert not Contender.of(contenders("kitti")["saga"], base).same_as(Contender("classical", "kf", base))
+
+
+def test_parts_of_the_graph_are_contenders_where_they_are_configured() -> None:
+    base = load_config("heterogeneous")
+    rules = contenders("heterogeneous")["without lights"].config(base).tracker.edges
+    assert {type(rule) for rule in base.tracker.edges} - {type(rule) for rule in rules} == {RedLight}
+    assert contenders("traffic")["without trails"].config(load_config("traffic")).tracker.trails.memory == 0
+    assert load_config("traffic").tracker.trails.memory > 0
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
