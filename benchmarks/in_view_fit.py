@@ -1,6 +1,6 @@
 """Rates, kernel widths and process noise of edge rules by the likelihood of objects in view.
 
-The likelihood is that of the joint filter (`joint_gaps`), with all correlations between the objects: of every position,
+The likelihood is that of the joint filter (`joint_view`), with all correlations between the objects: of every position,
 given all before. Neither unknown velocities nor neighbours that react bias it, as they do that of places where objects
 reappear (`interaction_fit`). But it is Gaussian, costs a run of the filter for each trial, and weighs the next
 moment, not the next seconds. The parameters are those of `interaction_fit`, with independent normal priors about the
@@ -19,19 +19,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
 
+from benchmarks.independent_filter import filter_independently
+from benchmarks.joint_view import JointView
+from benchmarks.trajectories import Trajectories
 from saga_fg.errors import InputError
-from saga_fg.learning.independent_filter import filter_independently
-from saga_fg.learning.interaction_fit import EXPLAINED_BOUNDS, NOISE_BOUNDS, FittedInteractions, Rule, RuleParameters
-from saga_fg.learning.joint_gaps import JointGaps
-from saga_fg.learning.trajectories import Trajectories
+from saga_fg.learning.interaction_fit import Rule, RuleParameters
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
+
+NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
+EXPLAINED_BOUNDS = (0.0, 3.0)  # s
+
+
+@dataclass(frozen=True)
+class FittedInView:
+    """rules with their values; acceleration_noise by class, m^2/s^3; explained_noise, s; loss by position."""
+
+    rules: tuple[Rule, ...]
+    acceleration_noise: dict[str, float]
+    explained_noise: float
+    loss: float
 
 
 def fit_interactions_in_view(
@@ -41,7 +54,7 @@ def fit_interactions_in_view(
     template: Sequence[Rule],
     degrees: Sequence[int] = (),
     iterations: int = 15,
-) -> FittedInteractions:
+) -> FittedInView:
     """The most likely values of the template's rules, from how objects in view move; no rules if they explain nothing.
 
     position_noise      standard deviation of the positions, m
@@ -66,7 +79,7 @@ def fit_interactions_in_view(
     if explained - views.log_likelihood(alone, x_alone)[0] <= by_chance:
         chosen, x = alone, x_alone
     rules = tuple(chosen.valued(x[: len(chosen.start)]))
-    return FittedInteractions(rules, views.noise(chosen, x), float(x[-1]), views.loss(chosen, x))
+    return FittedInView(rules, views.noise(chosen, x), float(x[-1]), views.loss(chosen, x))
 
 
 class _Views:
@@ -95,7 +108,7 @@ class _Views:
         rules, q = parameters.valued(x[: len(parameters.start)]), self.noise(parameters, x)
         total, count = 0.0, 0
         for trajectories, alone in self._recordings:
-            gaps = JointGaps(trajectories, alone, q, self._position_noise, rules, float(x[-1]))
+            gaps = JointView(trajectories, alone, q, self._position_noise, rules, float(x[-1]))
             log, positions = gaps.log_likelihood()
             total, count = total + log, count + positions
         if count == 0:

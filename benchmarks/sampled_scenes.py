@@ -14,7 +14,6 @@ import numpy as np
 from pipelines.bench.flocks import sample_step
 from pipelines.config import TrackConfig
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours, build_graph
 from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
@@ -74,9 +73,7 @@ class SceneSettings:
         )
 
 
-def sampled_config(
-    settings: SceneSettings, edges: tuple[Following | Neighbours | EdgeNetwork, ...] | None = None
-) -> TrackConfig:
+def sampled_config(settings: SceneSettings, edges: tuple[Following | Neighbours, ...] | None = None) -> TrackConfig:
     """Settings of trackers that know the true parameters; the edges are the true ones if left out.
 
     Objects come from anywhere, are hidden for any time, and a miss says little: they may be hidden.

@@ -22,6 +22,7 @@ import typer
 
 from benchmarks.in_view_fit import fit_interactions_in_view
 from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sampled_config
+from benchmarks.trajectories import Trajectories
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
@@ -31,7 +32,7 @@ from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT

@@ -16,15 +16,14 @@ import numpy as np
 
 from data_tools.evaluation.hota import HotaRow
 from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
+from pipelines.bench.gaps.learned import learn_interactions
 from pipelines.bench.predictions import PredictionErrors, PredictionRecorder
 from pipelines.bench.recordings import RecordingSet, Score
 from pipelines.bench.variants import Variant, variants
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Dataset
@@ -120,7 +119,7 @@ def bench_set(
     compared = variants(base, settings.components, settings.contenders)
     learned: dict[str, LearnedInteractions] = {}
     if settings.contenders:
-        learned = learn_by_folds(recordings.dataset, progress)
+        learned = learn_by_folds(recordings.dataset, base, progress)
         compared += (LEARNED,)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
@@ -158,20 +157,21 @@ def _in_space(score: Score) -> list[HotaRow]:
     return [row for row in score.hota() if row.label == "car" and row.overlap == "3D"]
 
 
-def learn_by_folds(dataset: Dataset, progress: Progress | None = None) -> dict[str, LearnedInteractions]:
+def learn_by_folds(
+    dataset: Dataset, base: TrackConfig, progress: Progress | None = None
+) -> dict[str, LearnedInteractions]:
     """Interactions for every scene, learned from the truth of the scenes of the other fold.
 
     Raises `InputError` for a single scene.
     """
     if len(dataset.scenes) < FOLDS:
         raise InputError(f"{', '.join(dataset.scenes)}: expected scenes to learn from beside it")
-    trajectories = {name: Trajectories.of_truth(dataset.scene(name)) for name in dataset.scenes}
     learned: dict[str, LearnedInteractions] = {}
     for fold in range(FOLDS):
         tested = dataset.scenes[fold::FOLDS]
-        others = {name: found for name, found in trajectories.items() if name not in tested}
-        found = learn_interactions(others, f"scenes {', '.join(others)}", progress=progress)
-        learned |= dict.fromkeys(tested, found)
+        others = {name: dataset.scene(name) for name in dataset.scenes if name not in tested}
+        found = learn_interactions(others, f"scenes {', '.join(others)}", base, progress=progress)
+        learned |= dict.fromkeys(tested, found.interactions)
     return learned
 
 

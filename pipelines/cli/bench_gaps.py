@@ -18,6 +18,7 @@ from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.bench.gaps.bench import Contender, Run
+    from pipelines.bench.gaps.fitted import Fit
     from pipelines.bench.gaps.sources import RecordingSource
     from pipelines.config import TrackConfig
 
@@ -56,7 +57,7 @@ def gaps(
     interactions: InteractionsOption = None,
     train: Annotated[
         str | None,
-        typer.Option("--train", help="Fit noise and edges to these recordings, with commas: two contenders more."),
+        typer.Option("--train", help="Fit contenders to these recordings, with commas; see --fit."),
     ] = None,
     test: Annotated[
         str | None,
@@ -71,6 +72,14 @@ def gaps(
             metavar="N|place",
         ),
     ] = None,
+    fit: Annotated[
+        str,
+        typer.Option(
+            "--fit",
+            help="To --train or the other folds, with commas: the noise of kf, the edges of saga, boosted trees as an "
+            "outside judge (needs the extra [bench]).",
+        ),
+    ] = "noise,edges",
     labels: Annotated[
         bool, typer.Option("--labels", help="Take the visible annotations for detections, in all sets.")
     ] = False,
@@ -129,7 +138,7 @@ def gaps(
       saga-fg bench gaps --data data --sets kitti --contenders saga,kf --contender trial=trial.yaml
       saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
       saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
-      saga-fg bench gaps --data data --sets ngsim --life kept --folds place --situations
+      saga-fg bench gaps --data data --sets ngsim --life kept --folds place --fit edges,boosted --situations
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -151,7 +160,7 @@ def gaps(
     _check_names(recordings, taught, judged)
     if taught and folds is not None:
         raise InputError("--folds: goes without --train")
-    number = _folds(folds)
+    number, fits = _folds(folds), _fits(fit)
     splits = {}
     for source in sources:
         found = recordings[source.name]
@@ -175,7 +184,7 @@ def gaps(
                 raise InputError(f"--against: {unknown_name('contender', against, known)}")
             if splits[source.name]:
                 runs[source.name] = bench_splits(
-                    source, splits[source.name], compared, base, settings, workers, progress
+                    source, splits[source.name], compared, base, settings, fits, workers, progress
                 )
     if not any(run.gaps for found in runs.values() for run in found):
         raise InputError("expected recordings with gaps, there is none: longer ones are needed, or more --passes")
@@ -195,6 +204,15 @@ def gaps(
 def _recordings(source: RecordingSource) -> tuple[str, ...]:
     with source.opened() as dataset:
         return dataset.scenes
+
+
+def _fits(text: str) -> list[Fit]:
+    from pipelines.bench.gaps.fitted import FITS
+
+    for name in (wanted := names("--fit", text)):
+        if name not in FITS:
+            raise InputError(f"--fit: expected some of {', '.join(FITS)}, got {name!r:.40}")
+    return [name for name in FITS if name in wanted]
 
 
 def _folds(text: str | None) -> int | None:

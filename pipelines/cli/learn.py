@@ -11,6 +11,7 @@ from pipelines.cli import options
 from pipelines.cli.console import ReportingGroup, progress_bar
 from pipelines.cli.datasets import Source, dataset_commands
 from pipelines.cli.summary import counted
+from pipelines.cli.tables import JsonFile, MarkdownFile, report
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource
@@ -19,32 +20,47 @@ if TYPE_CHECKING:
 def _interactions(
     source: DatasetSource,
     output: Annotated[Path, typer.Option("--output", "-o", help="YAML file to write, for `--interactions`.")],
-    network: Annotated[
-        bool, typer.Option("--network", help="Train networks with JAX (extra [learn]) in place of kernels.")
-    ] = False,
+    config: options.Config = None,
+    start: Annotated[
+        Path | None,
+        typer.Option("--start", help="File of an earlier result, from which the search begins.", metavar="FILE"),
+    ] = None,
+    passes: Annotated[
+        int, typer.Option("--passes", min=1, help="Runs with made gaps over each recording that is held out.")
+    ] = 2,
+    json_file: JsonFile = None,
+    markdown: MarkdownFile = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Learn who follows whom, how strongly, and what noise is left: edge rules for `saga-fg track --interactions`.
+    """Learn who follows whom, and how strongly: edge rules for `saga-fg track --interactions`.
 
-    Learned is from the ground truth or, where detections are given, from a tracker's view of these. Objects are hidden
-    for up to 3 s while their neighbours stay in view; learned is what makes the places at which they reappear most
-    likely.
+    Objects are hidden for up to 5 s while their neighbours stay in view; learned is what makes the places at which they
+    reappear most likely. Which form of the edges is written is decided on recordings held out, whose gaps are shown: by
+    the base motion alone, with the edges of the configuration and with learned ones. Truth is the ground truth or,
+    where detections are given, the tracks of a tracker.
     """
     from data_tools.files.atomic_files import check_writable, write_text
+    from pipelines.bench.gaps.learned import LearningSettings, learn_interactions
+    from pipelines.bench.gaps.learned_tables import learned_figures, learned_tables
+    from pipelines.config import load_config, load_interactions
     from pipelines.configuration import write_settings
-    from pipelines.learning import learn_interactions, trajectories
+    from pipelines.learning import scenes_to_learn_from
 
     check_writable(output)
-    options.apart(output, *source.input_files())
+    options.apart(output, *source.input_files(), *(() if start is None else (start,)))
+    settings = load_config(source.family, config)
+    begin = None if start is None else load_interactions(start)
     with_truth = source.has_truth and getattr(source, "detections", None) is None
-    found = trajectories(source, with_truth)
-    learned_from = "trajectories" if with_truth else "tracks"
+    found = scenes_to_learn_from(source, settings, with_truth)
+    learned_from = "ground truth" if with_truth else "tracks"
     origin = f"{learned_from} of {counted(len(found), 'recording')}, {source.name}: {', '.join(found)}"
-    with progress_bar(unit="recordings") as progress:
-        learned = learn_interactions(found, origin, network, progress)
-    write_text(output, write_settings(learned))
-    why = "" if learned.edges else "; no interaction that was tried lowered errors on what was held out"
-    typer.echo(f"{output}: {counted(len(learned.edges), 'edge rule')} learned from {origin}{why}")
+    with progress_bar(unit="runs") as progress:
+        learned = learn_interactions(found, origin, settings, begin, LearningSettings(passes), progress)
+    write_text(output, write_settings(learned.interactions))
+    report(learned_tables(learned), learned_figures(learned), json_file, markdown)
+    edges = learned.interactions.edges
+    why = "" if edges else "; no form that was tried lowered errors on what was held out"
+    typer.echo(f"{output}: {counted(len(edges), 'edge rule')} learned from {origin}{why}")
 
 
 def _noise(
@@ -124,7 +140,7 @@ def learn() -> None:
 
 @interactions_app.callback()
 def interactions() -> None:
-    """Learn who follows whom, how strongly, and what noise is left: edge rules for a tracker."""
+    """Learn who follows whom, and how strongly: edge rules for a tracker."""
 
 
 @noise_app.callback()

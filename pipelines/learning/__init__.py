@@ -1,8 +1,7 @@
 """Settings learned from recordings."""
 
 from pipelines.learning.fragment import learned_fragment
-from pipelines.learning.interactions import learn_interactions
 from pipelines.learning.noise import LearnedNoise, learn_noise
-from pipelines.learning.trajectories import trajectories
+from pipelines.learning.scenes import scenes_to_learn_from
 
-__all__ = ["LearnedNoise", "learn_interactions", "learn_noise", "learned_fragment", "trajectories"]
+__all__ = ["LearnedNoise", "learn_noise", "learned_fragment", "scenes_to_learn_from"]

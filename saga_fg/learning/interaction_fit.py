@@ -1,34 +1,36 @@
-"""Rates, kernel widths and process noise of edge rules by the likelihood of innovations after gaps.
+r"""Rates and kernel widths of edge rules by the likelihood of the places at which hidden objects reappear.
 
-The parameters are the logarithms of rates and widths within fixed bounds, so that rates stay positive and the dynamics
-stable, the logarithm of each class's acceleration noise, and the explained noise. The objective (`gap_prediction`) is
-maximised by L-BFGS-B with differences for derivatives; a weak Gaussian prior about the template decides where the
-recordings do not.
+    theta* = argmin_theta   mean over gaps and steps of  -log t_3( p - p_theta ; 0, c (P_theta + R) )  +  prior
+
+p_theta and P_theta are the tracker's own prediction (`saga_fg.learning.hidden_objects`) on the base motion of its
+configuration. Innovations after gaps have heavy tails, hence Student's t. How wide they are is a matter of the process
+noise, which serves association as well and is left as it is: the scale c of each class is the most likely one, and is
+not kept. The parameters are the logarithms of rates and widths within bounds, so that rates stay positive. The
+objective is minimised by L-BFGS-B with differences for derivatives: one prediction of all gaps takes a fraction of a
+second, and rules may be anybody's. A weak Gaussian prior about the template decides where the recordings do not.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
 from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
-from saga_fg.learning.gap_prediction import Coupling, GapPrediction, negative_log_likelihood, predict_gaps
-from saga_fg.learning.gaps import GapSample
-from saga_fg.model.edge_features import EdgeFeatures
-from saga_fg.model.edge_network import EdgeNetwork
+from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects
 from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.types.by_class import DEFAULT, class_numbers
+from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.tracking import TrackerSettings
 
-Rule = Following | Neighbours
-BOUNDS: Mapping[str, tuple[float, float]] = {
+Rule = Any
+"""An edge rule whose settings `rate` and `..._scale` are learned where they are finite."""
+
+BOUNDS: dict[str, tuple[float, float]] = {
     "rate": (1e-3, 5.0),
     "distance_scale": (0.5, 100.0),
     "gap_scale": (3.0, 100.0),
@@ -36,40 +38,39 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "heading_scale": (0.05, 3.0),
     "speed_scale": (0.1, 10.0),
 }
-"""Bounds of the rates and widths of rules; an infinite width stays infinite."""
-NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
-EXPLAINED_BOUNDS = (0.0, 3.0)  # s
+"""Bounds of rates and widths; an infinite width stays infinite. Others: a tenth to ten times the template's value."""
 PRIOR = 2e-2  # weight of a unit of squared difference from the template, against the mean over the gaps
-FEWEST_GAPS = 30  # a class with fewer shares the noise of all that have fewer
-MOST_GAPS = 500  # a random sample to learn from; more only take longer
+TAILS = 3.0  # degrees of freedom of the innovations
+PLACE_DEVIATION = 0.1  # m, of labels
+FEWEST = 30  # places of a class; classes with fewer share a scale
+MOVED = 0.01  # m; edges that move a prediction by less do not reach it
+MOST_GAPS = 300  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
-_LED = Following(SharedVelocity(), rate=1.0, gap_scale=18.0, lateral_scale=1.2, classes=ROAD_USERS, leaders="moving")
+_LED = Following(
+    SharedVelocity(),
+    rate=1.5,
+    max_gap=60.0,
+    gap_scale=18.0,
+    lateral_scale=1.2,
+    min_separation=0.8,
+    classes=ROAD_USERS,
+    leaders="moving",
+)
 TEMPLATE: tuple[Rule, ...] = (
     _LED,
-    replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.2, leaders="stationary"),
+    replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.5, leaders="stationary"),
     Neighbours(
-        rate=1.0,
-        distance_scale=25.0,
-        heading_scale=math.inf,
-        speed_scale=1.0,
-        max_distance=50.0,
-        max_degree=8,
-        parked=True,
-        classes=ROAD_USERS,
-    ),
-    Neighbours(
-        rate=0.1,
+        rate=0.5,
         distance_scale=1.5,
         heading_scale=math.inf,
-        speed_scale=0.5,
+        speed_scale=1.0,
         max_distance=6.0,
         min_speed=0.2,
         classes=("pedestrian",),
     ),
 )
-"""Following a moving leader in speed and course; halting behind a stationary one; parked objects, which share errors of
-the pose; groups of people."""
+"""Following a moving leader in speed and course; halting behind a stationary one; groups of people."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,114 +84,87 @@ class RuleParameters:
 
     @classmethod
     def of(cls, rules: Sequence[Rule]) -> Self:
-        """All rates and widths that are finite, clipped to their bounds."""
-        names = tuple(
-            (k, name) for k, rule in enumerate(rules) for name in BOUNDS if math.isfinite(getattr(rule, name, math.inf))
-        )
-        bounds = tuple((math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for _, name in names)
-        values = [math.log(max(getattr(rules[k], name), 1e-9)) for k, name in names]
-        return cls(tuple(rules), names, np.clip(values, *np.array(bounds).reshape(-1, 2).T), bounds)
+        """All rates and widths that are finite and above 0, clipped to their bounds."""
+        names, values, bounds = [], [], []
+        for k, rule in enumerate(rules):
+            for name in (field.name for field in fields(rule)):
+                value = getattr(rule, name)
+                if (name == "rate" or name.endswith("_scale")) and isinstance(value, float) and 0 < value < math.inf:
+                    low, high = BOUNDS.get(name, (value / 10, value * 10))
+                    names.append((k, name))
+                    values.append(min(max(value, low), high))
+                    bounds.append((math.log(low), math.log(high)))
+        return cls(tuple(rules), tuple(names), np.log(values), tuple(bounds))
 
-    def valued(self, x: FloatArray) -> list[Rule]:
+    def valued(self, x: FloatArray) -> tuple[Rule, ...]:
         """The rules with parameters x (n,)."""
         values: list[dict[str, Any]] = [{} for _ in self.rules]
         for (k, name), value in zip(self.names, np.exp(x), strict=True):
             values[k][name] = float(value)
-        return [replace(rule, **changes) for rule, changes in zip(self.rules, values, strict=True)]
+        return tuple(replace(rule, **changes) for rule, changes in zip(self.rules, values, strict=True))
 
 
 @dataclass(frozen=True)
 class FittedInteractions:
-    """rules with their values; acceleration_noise by class, m^2/s^3; explained_noise, s; loss per moment."""
+    """rules with their values; loss per place."""
 
-    rules: tuple[Following | Neighbours | EdgeNetwork, ...]
-    acceleration_noise: dict[str, float]
-    explained_noise: float
+    rules: tuple[Rule, ...]
     loss: float
 
 
-def couple_rules(
-    rules: Sequence[Rule | EdgeNetwork], sample: GapSample
-) -> Callable[[EdgeFeatures, FloatArray], list[Coupling]]:
-    """The rates of rules for the neighbours of a sample, as `predict_gaps` takes them."""
-    able = [acting_classes(rule.classes, sample) for rule in rules]
-
-    def couple(features: EdgeFeatures, seen: FloatArray) -> list[Coupling]:
-        found = []
-        for rule, mask in zip(rules, able, strict=True):
-            if isinstance(rule, EdgeNetwork):
-                found.append(
-                    Coupling(rule.interaction, rule.candidate_rates(rule.weights(), features, mask & (seen > 0)))
-                )
-                continue
-            if isinstance(rule.interaction, AccelerationLaw):
-                raise InputError("edges: expected linear interactions to be learned, got nonlinear ones")
-            there = mask & (seen > 0)
-            rate = np.where(there, rule.strength(features), 0.0)
-            if isinstance(rule, Following):
-                remoteness = np.where(there & rule.in_lane(features), rule.remoteness(features), np.inf)
-                rate = np.where(remoteness <= remoteness.min(axis=1, keepdims=True), rate, 0.0)
-            found.append(Coupling(rule.interaction, rate))
-        return found
-
-    return couple
-
-
-def predict_with(sample: GapSample, fitted: FittedInteractions) -> GapPrediction:
-    """Coast through gaps with fitted interactions."""
-    noise = class_numbers(fitted.acceleration_noise, float, sample.label)
-    return predict_gaps(sample, couple_rules(fitted.rules, sample), noise, fitted.explained_noise)
-
-
 def fit_interactions(
-    sample: GapSample,
-    position_noise: float,
-    acceleration_noise: Mapping[str, float],
-    template: Sequence[Rule] = TEMPLATE,
-    iterations: int = 15,
+    sample: HiddenObjects, settings: TrackerSettings, template: Sequence[Rule] = TEMPLATE, iterations: int = 8
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
-    position_noise      standard deviation of the measured positions, m
-    acceleration_noise  by class, with `default`: where the search begins
+    settings   of the tracker, with its base motion; template: where the search begins
 
-    Rules whose classes do not occur are left out. Raises `InputError` for a sample without gaps.
+    Rules whose classes do not occur are left out. Rules that reach no gap stay as they are, with a loss of NaN. Raises
+    `InputError` for a sample without gaps.
     """
     if len(sample) == 0:
         raise InputError("sample: expected at least one object that is followed for long enough")
-    sample = thinned(sample)
-    rules = [rule for rule in template if acting_classes(rule.classes, sample).any()]
-    parameters = RuleParameters.of(rules)
-    m = len(parameters.start)
-    labels, count = np.unique(sample.label, return_counts=True)
-    own = [str(label) for label in labels[count >= FEWEST_GAPS]]
-    classes = [*own, DEFAULT]
-    class_of = np.array([classes.index(c) if c in own else len(own) for c in sample.label.tolist()])
-    noise = [acceleration_noise.get(c, acceleration_noise[DEFAULT]) for c in classes]
-    bounds = [*parameters.bounds, *[tuple(np.log(NOISE_BOUNDS))] * len(classes), EXPLAINED_BOUNDS]
-    start = np.clip(np.concatenate([parameters.start, np.log(noise), [0.0]]), *np.array(bounds).T)
+    occurring = set(np.unique(sample.label).tolist())
+    parameters = RuleParameters.of([rule for rule in template if occurring & set(rule.classes)])
+    start = parameters.start
+    sample = reached(sample, settings, parameters).sampled(MOST_GAPS, seed=0)
+    if len(sample) == 0:
+        return FittedInteractions(parameters.rules, math.nan)
 
     def loss(x: FloatArray) -> float:
-        q = np.exp(x[m:-1])[class_of]
-        prediction = predict_gaps(sample, couple_rules(parameters.valued(x[:m]), sample), q, x[-1])
-        prior = PRIOR * ((x[:m] - start[:m]) ** 2).sum()
-        return float(negative_log_likelihood(sample, prediction, position_noise) + prior)
+        prediction = sample.predict(settings, parameters.valued(x))
+        return negative_log_likelihood(sample, prediction) + PRIOR * float(((x - start) ** 2).sum())
 
-    found = minimize(loss, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations, "eps": 1e-3})
-    q = np.exp(found.x[m:-1])
-    return FittedInteractions(
-        tuple(parameters.valued(found.x[:m])),
-        {label: float(value) for label, value in zip(classes, q, strict=True)},
-        float(found.x[-1]),
-        float(found.fun),
-    )
+    options = {"maxiter": iterations, "eps": 1e-3}
+    found = minimize(loss, start, method="L-BFGS-B", bounds=parameters.bounds, options=options)
+    return FittedInteractions(parameters.valued(found.x), float(found.fun))
 
 
-def acting_classes(classes: tuple[str, ...], sample: GapSample) -> BoolArray:
-    """(W, M) whether both ends of an edge are of these classes."""
-    return np.asarray(np.isin(sample.label, classes)[:, None] & np.isin(sample.other_label, classes))
+def reached(sample: HiddenObjects, settings: TrackerSettings, parameters: RuleParameters) -> HiddenObjects:
+    """The gaps in which edges act where rates and widths are at their upper bounds; others say nothing about them."""
+    widest = parameters.valued(np.array([high for _, high in parameters.bounds]))
+    alone, acted = (sample.predict(settings, rules).position for rules in ((), widest))
+    return sample.select(np.flatnonzero((np.abs(acted - alone) > MOVED).any(axis=(1, 2))))
 
 
-def thinned(sample: GapSample) -> GapSample:
-    """At most `MOST_GAPS` gaps, a reproducible choice."""
-    return sample.sampled(MOST_GAPS, seed=0)
+def negative_log_likelihood(sample: HiddenObjects, prediction: GapPrediction) -> float:
+    """Mean over all known places at the ends of all steps, without constants, at the likeliest scale of each class."""
+    known = sample.known
+    e, S = (sample.place - prediction.position)[known], prediction.P[known] + PLACE_DEVIATION**2 * np.eye(2)
+    square = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[..., 0])
+    label = np.broadcast_to(sample.label[:, None], known.shape)[known]
+    scale = _scales(square, label)
+    loss = 0.5 * np.log(np.linalg.det(S)) + np.log(scale) + (TAILS + 2) / 2 * np.log1p(square / (scale * TAILS))
+    return float(loss.mean())
+
+
+def _scales(square: FloatArray, label: StrArray) -> FloatArray:
+    """The likeliest scale (n,) of the covariance by class, for squared distances (n,), by fixed-point iteration."""
+    classes, of_class, count = np.unique(label, return_inverse=True, return_counts=True)
+    group = np.where(count >= FEWEST, np.arange(len(classes)), len(classes))[of_class]
+    total = np.maximum(np.bincount(group, minlength=len(classes) + 1), 1)
+    c = np.ones(len(classes) + 1)
+    for _ in range(20):
+        weighted = (TAILS + 2) * square / (TAILS + square / c[group])
+        c = np.maximum(np.bincount(group, weighted, minlength=len(c)) / total / 2, 1e-6)
+    return np.asarray(c[group])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -50,7 +50,10 @@ class Pairs(NamedTuple):
 
 
 class EdgeRule(Protocol):
-    """Chooses edges from the estimates at the start of an interval."""
+    """Chooses edges from the estimates at the start of an interval.
+
+    A rule that has `map_classes` reads nodes of the map of these classes alone; nodes that no rule reads are left out.
+    """
 
     @property
     def interaction(self) -> Interaction | AccelerationLaw: ...
@@ -62,6 +65,7 @@ class EdgeRule(Protocol):
 class Neighbours(Settings):
     """Edges between moving objects that are close and head the same way; by default they share their velocity."""
 
+    map_classes: ClassVar[tuple[str, ...]] = ()
     interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
         SharedVelocity, "interaction function of the edges"
     )
@@ -121,6 +125,7 @@ class Following(Settings):
     All vehicles count there: one that is not among `leaders` leads nobody, but blocks those ahead of it.
     """
 
+    map_classes: ClassVar[tuple[str, ...]] = ()
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
@@ -207,6 +212,11 @@ class Repulsion(Settings):
     )
     classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
     sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """Classes of nodes of the map that push."""
+        return self.sources
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         pushed, pushing = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.classes, self.sources))

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from saga_fg.settings import (
     Settings,
     setting,
 )
+from saga_fg.types.road_map import LaneAcross
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
@@ -44,7 +45,9 @@ class NodeTable:
     unknown; closed (n,) the weight in [0, 1] with which a stop line is closed, by the belief on its light, None
     where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
     or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
-    unknown; existence (n,) probability that a node is a real object, None: all are
+    unknown; existence (n,) probability that a node is a real object, None: all are; open (n,) the weight with which a
+    stop line lets waiting vehicles go; lanes: by row of a stop line, the lanes that cross it; derived: values that
+    rules share, kept with the table
     """
 
     id: IntArray
@@ -61,6 +64,9 @@ class NodeTable:
     width: Mapping[int, float] = field(default_factory=dict)
     unseen: FloatArray | None = None
     existence: FloatArray | None = None
+    open: FloatArray | None = None
+    lanes: Mapping[int, tuple[LaneAcross, ...]] = field(default_factory=dict)
+    derived: dict[object, Any] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.id)

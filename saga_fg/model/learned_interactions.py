@@ -5,15 +5,13 @@ Learned dynamics must be stable: construction checks them by `saga_fg.model.stab
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from saga_fg.errors import InputError
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.stability import require_stable
-from saga_fg.settings import Positive, Range, Settings, setting, settings_group
+from saga_fg.settings import Range, Settings, setting, settings_group
 
 FORMAT = "saga-fg interactions"
 VERSION = 1
@@ -22,7 +20,7 @@ HIGHEST_RATE = 20.0  # 1/s, of an edge: beyond, an interaction is a rigid bond
 
 @dataclass(frozen=True)
 class LearnedInteractions(Settings):
-    """Edge rules with the noise that is left beside them.
+    """Edge rules, and how much of the process noise they explain.
 
     Raises `InputError` for another format or version, and for rules that would make the dynamics, or a step, unstable.
     """
@@ -30,12 +28,9 @@ class LearnedInteractions(Settings):
     format: Literal["saga-fg interactions"] = setting("saga-fg interactions", "format of this file")
     version: int = setting(VERSION, "version of the format")
     learned_from: str = setting("", "data it was learned from")
-    edges: tuple[Following | Neighbours | EdgeNetwork, ...] = settings_group(tuple, "edge rules of the scene graph")
+    edges: tuple[Following | Neighbours, ...] = settings_group(tuple, "edge rules of the scene graph")
     explained_noise: Annotated[float, Range(0, 10)] = setting(
         0.0, "process noise is scaled by exp(-explained_noise K) at the total rate K of interactions, s; usual 0 to 2"
-    )
-    acceleration_noise: Mapping[str, Positive] = settings_group(
-        dict, "spectral density of the acceleration by class, m^2/s^3; default serves all others"
     )
 
     def __post_init__(self) -> None:
@@ -43,7 +38,6 @@ class LearnedInteractions(Settings):
         if self.version != VERSION:
             raise InputError(f"version: expected {VERSION}, the one this program writes, got {self.version}")
         for k, rule in enumerate(self.edges):
-            rate = rule.max_rate if isinstance(rule, EdgeNetwork) else rule.rate
-            if rate > HIGHEST_RATE:
-                raise InputError(f"edges[{k}].rate: expected at most {HIGHEST_RATE:g} 1/s, got {rate:g}")
+            if rule.rate > HIGHEST_RATE:
+                raise InputError(f"edges[{k}].rate: expected at most {HIGHEST_RATE:g} 1/s, got {rule.rate:g}")
         require_stable(self.edges)

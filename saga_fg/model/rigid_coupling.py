@@ -47,6 +47,7 @@ class RigidCoupling(Settings):
 class Attached(Settings):
     """Every object of some classes is attached to the nearest of some others that touches it and moves as it does."""
 
+    map_classes: ClassVar[tuple[str, ...]] = ()
     interaction: RigidCoupling = settings_group(RigidCoupling, "interaction function of the edges, which go both ways")
     attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects")
     carriers: tuple[str, ...] = setting(("truck",), "classes of the objects they are attached to")

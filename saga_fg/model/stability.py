@@ -16,14 +16,12 @@ acceleration, which are bounded in themselves.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.model.discretisation import discretise, joint_generator
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
 from saga_fg.model.interactions import NodeTable, applies, unit
 from saga_fg.model.motion import ConstantVelocity, NodeType
@@ -38,7 +36,7 @@ _TURNS = np.radians([0.0, 15.0, 45.0, 90.0, 135.0, 180.0])  # between the headin
 _ROUNDING = 1e-6  # 1/s; the double eigenvalue zero of constant velocity is found to half the digits
 _GROWTH = 1e-4  # of an eigenvalue of a step beyond 1, for the same reason
 
-MovingRule = Following | Neighbours | EdgeNetwork | Attached
+MovingRule = Following | Neighbours | Attached
 
 
 def require_stable(rules: Sequence[EdgeRule], longest_step: float = LONGEST_STEP) -> None:
@@ -72,8 +70,6 @@ def highest_rate(rule: MovingRule) -> float:
     match rule:
         case Neighbours():
             return rule.rate * rule.max_degree
-        case EdgeNetwork():
-            return rule.max_rate * rule.max_degree
         case _:
             return rule.rate
 
@@ -116,10 +112,9 @@ def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[Sce
     first, second = np.arange(0, n, 2), np.arange(1, n, 2)
     groups, total = [], 0.0
     for rule in rules:
-        led = isinstance(rule, Following) or (isinstance(rule, EdgeNetwork) and rule.ahead_only)
+        led = isinstance(rule, Following)
         target, source = (first, second) if led else (np.concatenate([first, second]), np.concatenate([second, first]))
-        scale = math.inf if isinstance(rule, EdgeNetwork) else rule.heading_scale
-        rate = highest_rate(rule) * np.exp(-((turns[target // 2] / scale) ** 2) / 2)
+        rate = highest_rate(rule) * np.exp(-((turns[target // 2] / rule.heading_scale) ** 2) / 2)
         law = rule.interaction
         if not isinstance(law, AccelerationLaw) and applies(law.needs, node_type, node_type):
             total += float(rate.max())

@@ -1,4 +1,6 @@
-"""Lights, stop lines, lanes and walls of a map as nodes of the joint state, with the colours of the lights.
+"""Lights, stop lines, lanes and walls of a map as nodes of the joint state, with the states of the lights.
+
+Nodes are the elements of those classes that some edge rule reads: others would cost time alone.
 
 Nodes of the map are stationary; their positions start at those of the map, as uncertain as the map, and are corrected
 by detections of lights and through the interactions of vehicles that stop at a line or keep a lane. Ids count down from
@@ -8,11 +10,12 @@ colour of the nearest known light within reach.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import Motion, RandomWalk
 from saga_fg.model.sensor import Sensor
@@ -21,10 +24,11 @@ from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.tracking.signal_inference import FirstVehicles
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
-from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, RoadMap
-from saga_fg.types.signal import COLOUR_LABELS, COLOURS, SignalSettings, colour_updated
+from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, Lane, LaneAcross, RoadMap, StopLine
+from saga_fg.types.signal import COLOUR_LABELS, COLOURS, STATES, SignalSettings, colour_updated, colours, updated
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
@@ -32,6 +36,12 @@ def motion_of(settings: TrackerSettings, label: str) -> Motion:
     if label in MAP_CLASSES and label not in settings.classes:
         return RandomWalk()
     return class_settings(settings.classes, ClassSettings, label).motion
+
+
+def classes_read(rules: Sequence[EdgeRule]) -> tuple[str, ...]:
+    """Classes of nodes of the map that edge rules read; all, where a rule does not say."""
+    read = {label for rule in rules for label in getattr(rule, "map_classes", MAP_CLASSES)}
+    return tuple(label for label in MAP_CLASSES if label in read)
 
 
 GATE = 0.999  # gate probability of the detections of a light
@@ -52,29 +62,41 @@ class MapNodes:
     """Nodes of the map.
 
     settings  how lights change
+    classes   of elements that become nodes
     id, label, name, place  (n,) of the nodes
     light     (n,) name of the light that governs each, "" for none
-    beliefs   by light, the probabilities of its colours
+    across    by name of a stop line of the map, the lanes that cross it, world
+    beliefs   by light, the probabilities of its states
+    drivers   first vehicles before the lines, from which the states are inferred
     """
 
     settings: SignalSettings
+    classes: tuple[str, ...] = MAP_CLASSES
     id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     label: StrArray = field(default_factory=lambda: np.empty(0, dtype="<U16"))
     name: tuple[str, ...] = ()
     place: tuple[Place, ...] = ()
     light: tuple[str, ...] = ()
+    across: Mapping[str, tuple[LaneAcross, ...]] = field(default_factory=dict)
     beliefs: Mapping[str, FloatArray] = field(default_factory=dict)
+    drivers: FirstVehicles = field(default_factory=FirstVehicles.none)
+    _roads: Mapping[str, Lane | StopLine] = field(default_factory=dict)
+    _latest: RoadMap | None = None
 
     def __len__(self) -> int:
         return len(self.id)
 
     def belief(self, light: str) -> Mapping[str, float]:
-        """Probabilities of the colours of a light, by colour; raises `KeyError` for one that no map has."""
-        return dict(zip(COLOURS, self.beliefs[light].tolist(), strict=True))
+        """Probabilities of the colours of a light, by colour; raises `KeyError` for one that is no node."""
+        return dict(zip(COLOURS, colours(self.beliefs[light]).tolist(), strict=True))
 
     def add(self, road_map: RoadMap, origin: FloatArray, joint: JointTrackState) -> None:
         """Add the new elements of a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
-        new = [(name, *rest) for name, *rest in _elements(road_map) if name not in self.name]
+        if road_map is self._latest:
+            return
+        self._latest = road_map
+        self._add_roads(road_map)
+        new = [each for each in _elements(road_map) if each[1] in self.classes and each[0] not in self.name]
         if not new:
             return
         names, labels, places, lights = zip(*new, strict=True)
@@ -90,11 +112,39 @@ class MapNodes:
         still = np.zeros((n, 2)), np.zeros((n, 2, 2))
         joint.add(ids, np.array(labels), Kinematics(middle, still[0], np.tile(P, (n, 1, 1)), still[1]))
 
+    def _add_roads(self, road_map: RoadMap) -> None:
+        """Find out which known lanes cross which known stop lines, where the map brings new ones."""
+        lanes_and_lines: tuple[Lane | StopLine, ...] = (*road_map.lanes, *road_map.stop_lines)
+        roads = {each.name: each for each in lanes_and_lines}
+        if STOP_LINE not in self.classes or roads.keys() <= self._roads.keys():
+            return
+        self._roads = {**roads, **self._roads}
+        lanes = [each for each in self._roads.values() if isinstance(each, Lane)]
+        lines = [each for each in self._roads.values() if isinstance(each, StopLine)]
+        pairs = {line.name: [LaneAcross.of(lane, line) for lane in lanes] for line in lines}
+        self.across = {name: tuple(lane for lane in found if lane is not None) for name, found in pairs.items()}
+
     def predict(self, dt: float) -> None:
-        """Predict the colours of the lights by `dt` s."""
+        """Predict the states of the lights by `dt` s."""
         if self.beliefs and dt > 0:
             later = self.settings.predicted(np.array(list(self.beliefs.values())), dt)
             self.beliefs = dict(zip(self.beliefs, later, strict=True))
+
+    @property
+    def infers(self) -> bool:
+        """Whether states of lights are inferred from traffic."""
+        return bool(self.beliefs) and self.settings.heedless < 1
+
+    def infer(self, ids: IntArray, velocity: FloatArray, variance: FloatArray, time: float) -> None:
+        """Update the states of the lights by tracks (k,) detected at `time`, s, with velocities (k, 2) of variances
+        (k,)."""
+        before, belief = self.drivers.told, dict(self.beliefs)
+        self.drivers = self.drivers.updated(ids, velocity, variance, time, self.settings)
+        change = self.drivers.told - before
+        for k in np.flatnonzero(change.any(axis=1)).tolist():
+            light = self.light[-1 - int(self.drivers.line[k])]  # ids count down from -1
+            belief[light] = updated(belief[light], change[k])
+        self.beliefs = belief
 
     def update(self, frame: Frame, sensor: Sensor, origin: FloatArray, joint: JointTrackState, delay: float) -> None:
         """Take in the colours and positions of lights in a frame taken `delay` s ago."""
@@ -133,10 +183,15 @@ class MapNodes:
         position = joint.kinematics_of(self.id, self.label).position
         moved, existence = tracks.has_moved, tracks.existence
         beliefs = [self.beliefs[light] for light in self.light if light]
-        closed = self.settings.closed(np.array(beliefs).reshape(-1, len(COLOURS)))
-        governed = np.array([bool(light) for light in self.light])
-        weight = np.zeros(n + m)
-        weight[n:][governed] = closed
+        states = np.array(beliefs).reshape(-1, len(STATES))
+        governed = n + np.flatnonzero([bool(light) for light in self.light])
+        closed, opened = np.zeros(n + m), np.zeros(n + m)
+        closed[governed], opened[governed] = self.settings.closed(states), self.settings.open(states)
+        lanes = {
+            n + k: tuple(lane._replace(centre=lane.centre - origin) for lane in self.across[name])
+            for k, name in enumerate(self.name)
+            if name in self.across
+        }
         outline = {n + k: place.outline + position[k] for k, place in enumerate(self.place) if len(place.outline)}
         width = {n + k: place.width for k, place in enumerate(self.place) if place.width > 0}
         return NodeTable(
@@ -149,11 +204,13 @@ class MapNodes:
             np.concatenate([tracks.length, np.zeros(m)]),
             np.concatenate([tracks.velocity_variance, np.zeros(m)]),
             None if moved is None else np.concatenate([moved, np.zeros(m, dtype=bool)]),
-            weight,
+            closed,
             outline,
             width,
             None if tracks.unseen is None else np.concatenate([tracks.unseen, np.zeros(m)]),
             None if existence is None else np.concatenate([existence, np.ones(m)]),
+            opened,
+            lanes,
         )
 
 

@@ -36,19 +36,21 @@ def predict(state: TrackerState, time: float, ahead: bool = False) -> None:
         steps = max(1, math.ceil(min(wanted, MOST_STEPS) - 1e-9))
         if wanted > MOST_STEPS:
             log.warning("%g s are predicted in %d steps, max_step asks for %.3g", dt, steps, wanted)
-        for _ in range(steps):
-            _predict_step(state, dt / steps, ahead)
+        for number in range(steps):
+            _predict_step(state, dt / steps, ahead, watched=number == 0 and not ahead)
         state.table.box.predict(dt, state.class_values(state.table.label, "yaw_drift")[0])
     state.time = time
 
 
-def _predict_step(state: TrackerState, dt: float, ahead: bool) -> None:
-    """Predict by `dt` s with the edges of the present estimates."""
+def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) -> None:
+    """Predict by `dt` s with the edges of the present estimates; from vehicles `watched` now lights are inferred."""
     table = state.table
     unseen = ahead | (table.last_detected < state.time)
     noise = _predict_stationarity(state, dt)
-    explained = state.settings.explained_noise
-    state.graph = build_graph(node_table(state), state.rules, explained_noise=explained, noise_scale=noise)
+    explained, nodes, lights = state.settings.explained_noise, node_table(state), state.map_nodes
+    if watched and lights.infers:
+        lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
+    state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
     state.graph = replace(state.graph, modes=_known_turns(state))
     state.joint.predict(state.graph, dt)

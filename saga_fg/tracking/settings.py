@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_network import EdgeNetwork
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
@@ -16,6 +15,7 @@ from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
@@ -236,7 +236,7 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | EdgeNetwork | RedLight | InLane | ConeLine | Attached, ...] = (
+    edges: tuple[Following | Neighbours | Repulsion | RedLight | GreenLight | InLane | ConeLine | Attached, ...] = (
         settings_group(
             traffic_rules,
             "edge rules of the scene graph: who interacts with whom; []: no interactions",

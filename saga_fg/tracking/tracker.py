@@ -41,7 +41,7 @@ from saga_fg.tracking.reporting import report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
 from saga_fg.tracking.unresolved import resolve_tracks
-from saga_fg.tracking.update import update_tracks
+from saga_fg.tracking.update import infer_signals, update_tracks
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.predicted_tracks import PredictedTracks, checked_horizons
 from saga_fg.types.track import Tracks
@@ -152,6 +152,8 @@ class Tracker:
         self._notify("associate", state, frame.sensor, measurements, matching)
 
         update_tracks(state, measurements, matching)
+        if delay == 0:
+            infer_signals(state, matching)
         self._notify("update", state, frame.sensor, measurements, matching)
 
         update_existence(state, measurements, matching, state.time - before)

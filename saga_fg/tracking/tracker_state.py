@@ -29,13 +29,14 @@ from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.tracking.ego_node import EgoNode
 from saga_fg.tracking.joint_state import JointTrackState, new_estimator
 from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.tracking.map_nodes import MapNodes, motion_of
+from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic_flow import TrafficFlowPrior
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
+from saga_fg.types.road_map import MAP_CLASSES
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -103,7 +104,8 @@ class TrackerState:
         estimator = new_estimator(settings.estimator, settings.lag, self.providers, settings.nonlinear(self.rules))
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
         self.table = TrackTable.empty(len(self.class_groups))
-        self.map_nodes, self.ego = MapNodes(settings.signals), EgoNode.of(settings)
+        read = MAP_CLASSES if self.providers else classes_read(self.rules)
+        self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.of(settings)
         self.traffic = TrafficFlowPrior(settings.traffic_flow_prior)
 
     def __len__(self) -> int:

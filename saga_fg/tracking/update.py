@@ -50,6 +50,15 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         state.traffic.update(Passages.of(passing, now.position + state.origin, now, state.time))
 
 
+def infer_signals(state: TrackerState, matching: Matching) -> None:
+    """Update the states of traffic lights by the tracks that have just been detected."""
+    if state.map_nodes.infers and len(state.map_nodes.drivers):
+        t, now = matching.track, state.reported_kinematics()
+        P = now.P_velocity[t]
+        variance = (P[:, 0, 0] + P[:, 1, 1]) / 2
+        state.map_nodes.infer(state.table.id[t], now.velocity[t], variance, state.time)
+
+
 def _update_class(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> None:
     groups, table = state.class_groups, state.table
     if len(groups):

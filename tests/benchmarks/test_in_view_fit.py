@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.in_view_fit import fit_interactions_in_view
+from benchmarks.trajectories import Trajectories
 from saga_fg import InputError
-from saga_fg.learning import Trajectories
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from tests.saga_fg.following_pairs import RATE, following_pairs
@@ -17,7 +17,7 @@ FOLLOW = Following(CarFollowing(time_constant=math.inf), rate=0.3)
 
 
 def test_the_rate_of_objects_in_view_is_found_again():
-    trajectories = following_pairs(pairs=4, moments=30, seed=4)
+    trajectories = Trajectories.of_truth(following_pairs(pairs=4, moments=30, seed=4))
     labels = np.where(np.arange(8) >= 4, "car", "bus")
     trajectories = dataclasses.replace(trajectories, label=labels)
     template = dataclasses.replace(FOLLOW, gap_scale=math.inf, lateral_scale=math.inf, heading_scale=math.inf)

@@ -19,6 +19,7 @@ from pipelines.bench.gaps.fitted import Split, splits_of
 from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.learned import LearnedForms
 from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
@@ -301,9 +302,9 @@ def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.
     """Learning finds no interactions here: then saga is kf."""
     taught_by = []
 
-    def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
+    def learn(recordings, origin, base, progress=None):  # type: ignore[no-untyped-def]
         taught_by.append(origin)
-        return LearnedInteractions(learned_from=origin)
+        return LearnedForms(LearnedInteractions(learned_from=origin), {}, {}, (), {})
 
     monkeypatch.setattr(fitted, "learn_interactions", learn)
     base = load_config("simulated")
@@ -385,6 +386,7 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--train", "scene-0001", "--test", "scene-0001"], "in one of them only"),
         (["--train", "scene-0001", "--plot", "gaps.png"], "set simulated: expected recordings to judge"),
         (["--passes", "0", "--plot", "gaps.png"], "--plot: expected --passes of 1 or more"),
+        (["--fit", "edge"], "--fit: expected some of noise, edges, boosted, got 'edge'"),
         (["--folds", "1"], "--folds: expected a number of 2 or more, or place, got '1'"),
         (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),
         (["--situations", "--life", "shipped"], "--situations: expected --life kept or both"),

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from data_tools.metrics import Interval, LabelErrors
 from data_tools.simulator import SimulatorSettings
 from pipelines.bench import tracking
+from pipelines.bench.gaps.learned import LearnedForms
 from pipelines.bench.recordings import NuScenesSet, Score, simulated_set
 from pipelines.bench.tracking import TrackingBenchSettings, bench_set, graph_differences, verdict
 from pipelines.bench.variants import COMPONENTS, METHODS, changed, variants
@@ -95,24 +96,25 @@ def test_a_set_is_tracked_by_every_variant() -> None:
 def test_a_scene_is_tracked_by_what_other_scenes_taught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Learning finds no interactions here: then saga is kf."""
 
-    def learn(recordings, origin, progress=None):  # type: ignore[no-untyped-def]
-        return LearnedInteractions(learned_from=" ".join(recordings))
+    def learn(recordings, origin, base, progress=None):  # type: ignore[no-untyped-def]
+        return LearnedForms(LearnedInteractions(learned_from=" ".join(recordings)), {}, {}, (), {})
 
     monkeypatch.setattr(tracking, "learn_interactions", learn)
     recordings = simulated_set(3, settings=replace(SHORT, duration=1.0))
     first, second, third = recordings.dataset.scenes
-    learned = tracking.learn_by_folds(recordings.dataset)
+    base = load_config("simulated")
+    learned = tracking.learn_by_folds(recordings.dataset, base)
     assert {name: found.learned_from for name, found in learned.items()} == {
         first: second,
         second: f"{first} {third}",
         third: second,
     }
     settings = TrackingBenchSettings(components=False, contenders=True, draws=0)
-    result = bench_set(recordings, load_config("simulated"), settings)
+    result = bench_set(recordings, base, settings)
     assert list(result.variants) == ["saga", "kf", "centerpoint", "graph matching", "learned interactions"]
     assert result.variants["learned interactions"].figures == pytest.approx(result.variants["kf"].figures, nan_ok=True)
     with pytest.raises(InputError, match="scenes to learn from beside it"):
-        tracking.learn_by_folds(simulated_set(1, settings=SHORT).dataset)
+        tracking.learn_by_folds(simulated_set(1, settings=SHORT).dataset, base)
 
 
 def test_hota_is_judged_in_the_nuscenes_layout(tmp_path: Path) -> None:

@@ -1,23 +1,136 @@
-"""`saga-fg learn interactions`, and what tracking does with its file."""
+"""`saga-fg learn interactions`: which form is written, and what tracking does with its file."""
 
+import json
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import pipelines.learning.interactions
+import pipelines.bench.gaps.learned as learned_module
+from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps
+from pipelines.bench.gaps.learned import (
+    BASE,
+    HIDDEN,
+    LEARNED,
+    NOWHERE,
+    SHIPPED,
+    LearningSettings,
+    coupled_classes,
+    held_out_parts,
+    learn_interactions,
+)
 from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
-from saga_fg.learning import fit_interactions
+from pipelines.configuration import read_settings, write_settings
+from saga_fg.errors import InputError
+from saga_fg.learning import FittedInteractions, GapSettings, fit_interactions
 from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.interactions import CarFollowing
+from saga_fg.model.learned_interactions import LearnedInteractions
+from tests.saga_fg.following_pairs import RATE, following_pairs
 
 run = CliRunner().invoke
+FOLLOW = Following(CarFollowing(time_constant=float("inf")), rate=RATE, gap_scale=100.0)
+QUICK = LearningSettings(passes=1, gaps=GapSettings(longest=1.5))
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return {
+        name: following_pairs(pairs=2, moments=70, seed=seed, name=name, apart=40.0)
+        for seed, name in enumerate(("one", "two"))
+    }
+
+
+def with_template(monkeypatch, *rules, fit=None):
+    """Learning finds these rules, whatever the recordings say."""
+    monkeypatch.setattr(learned_module, "TEMPLATE", rules)
+    found = fit or (lambda sample, settings, template: FittedInteractions(tuple(template), 0.0))
+    monkeypatch.setattr(learned_module, "fit_interactions", found)
+
+
+def test_the_form_that_does_best_on_recordings_held_out_is_the_form_that_is_written(monkeypatch, scenes):
+    with_template(monkeypatch, FOLLOW, fit=partial(fit_interactions, iterations=2))
+    config = load_config("file")
+    found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
+    (group,) = (group for group in found.forms if "car" in group)
+    ratios = found.ratios[group]
+    assert set(ratios) == {"everywhere", "hidden", SHIPPED}
+    assert found.forms[group] == min(ratios, key=ratios.__getitem__) != NOWHERE
+    assert ratios[found.forms[group]] < 1
+    cars = [rule for rule in found.interactions.edges if "car" in rule.classes]
+    gain = {"everywhere": None, "hidden": HIDDEN, SHIPPED: config.tracker.edges[0].information_gain}
+    assert {rule.information_gain for rule in cars} == {gain[found.forms[group]]}
+    assert {run.contender for run in found.runs} == {BASE, SHIPPED, LEARNED}
+    for name, scene in scenes.items():
+        text = write_settings(found.held_out[name])
+        read = config.with_interactions(read_settings(LearnedInteractions, text, "learned.yaml"))
+        source = learned_module._HeldScenes("again", {name: scene}, {})
+        (again,) = bench_gaps(source, (name,), [Contender("again", "saga", read)], GapBenchSettings(1, lives=("kept",)))
+        (tried,) = (run for run in found.runs if (run.contender, run.recording) == (LEARNED, name))
+        assert len(again.outcomes) >= 2
+        assert again.outcomes == tried.outcomes
+    assert type(found.held_out["one"].edges[0]) is type(found.interactions.edges[0])
+
+
+def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkeypatch, scenes):
+    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
+    config = load_config("file")
+    config = replace(config, tracker=replace(config.tracker, edges=()))
+    found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
+    assert set(found.forms.values()) == {NOWHERE}
+    assert found.interactions.edges == ()
+
+
+def test_a_search_begins_with_the_rules_of_an_earlier_result(monkeypatch, scenes):
+    begun = []
+
+    def fit(sample, settings, template):
+        begun.append(tuple(template))
+        return FittedInteractions(tuple(template), 0.0)
+
+    with_template(monkeypatch, fit=fit)
+    start = LearnedInteractions(edges=(replace(FOLLOW, information_gain=HIDDEN),))
+    found = learn_interactions(scenes, "two scenes", load_config("file"), start, QUICK)
+    assert set(begun) == {start.edges}
+    assert set(found.ratios[found_group(found)]) == {"refitted", SHIPPED}
+
+
+def found_group(found):
+    return next(group for group in found.forms if "car" in group)
+
+
+def test_halves_are_held_out_in_order_and_a_single_recording_by_time():
+    three = {name: following_pairs(pairs=1, moments=11, name=name) for name in "cab"}
+    assert [list(part) for part in held_out_parts(three)] == [["c", "a"], ["b"]]
+    first, second = held_out_parts({"c": three["c"]})
+    assert [len(part["c"]) for part in (first, second)] == [5, 6]
+    assert first["c"].frames[-1].timestamp < second["c"].timestamps[0] == second["c"].frames[0].timestamp
+
+
+def test_nothing_to_learn_from_is_an_error():
+    short = {name: following_pairs(pairs=1, moments=6, name=name) for name in "ab"}
+    with pytest.raises(InputError, match=r"nothing: expected objects that are followed for 1\.5 s and more"):
+        learn_interactions(short, "nothing", load_config("file"), settings=QUICK)
+
+
+@pytest.mark.parametrize(
+    ("classes", "groups"),
+    [
+        ([("car", "bus"), ("pedestrian",)], [("bus", "car"), ("pedestrian",)]),
+        ([("car",), ("bus",), ("bus", "car")], [("bus", "car")]),
+        ([], []),
+    ],
+)
+def test_classes_between_which_there_are_edges_are_one_group(classes, groups):
+    assert coupled_classes([Neighbours(classes=each) for each in classes]) == groups
 
 
 @pytest.fixture(scope="module")
 def detections(tmp_path_factory):
-    """Two queues of four cars and a row of parked ones, as a table of detections."""
+    """Two queues of four cars, as a table of detections."""
     rng = np.random.default_rng(0)
     path = tmp_path_factory.mktemp("queue") / "detections.csv"
     lines = ["timestamp,x,y,yaw,label,score"]
@@ -26,8 +139,6 @@ def detections(tmp_path_factory):
     for k in range(36):
         for i in range(8):
             lines.append(f"{0.25 * k:.2f},{x[i] + rng.normal(0, 0.05):.3f},{lane[i]:.3f},0.0,car,0.9")
-        for i in range(3):
-            lines.append(f"{0.25 * k:.2f},{8 * i + rng.normal(0, 0.05):.3f},{8 + rng.normal(0, 0.05):.3f},0.0,car,0.9")
         leaders = [0, 4]
         speed[leaders] += rng.normal(0, 0.4, 2)
         for lead in leaders:
@@ -41,25 +152,30 @@ def detections(tmp_path_factory):
 @pytest.fixture(scope="module")
 def learned(detections):
     output = detections.parent / "interactions.yaml"
+    arguments = ["learn", "interactions", "file", str(detections), "--output", str(output), "--passes", "1"]
     with pytest.MonkeyPatch.context() as patch:  # the way to the file is tested here, not how good the fit is
-        patch.setattr(pipelines.learning.interactions, "fit_interactions", partial(fit_interactions, iterations=3))
-        result = run(app, ["learn", "interactions", "file", str(detections), "--output", str(output)])
+        patch.setattr(learned_module, "fit_interactions", partial(fit_interactions, iterations=1))
+        result = run(app, [*arguments, "--json", str(detections.parent / "figures.json")])
     assert result.exit_code == 0, result.output
-    return output
+    return output, result.output
 
 
-def test_edges_are_learned_from_unlabelled_detections(learned):
-    interactions = load_interactions(learned)
-    assert {type(rule) for rule in interactions.edges} == {Following, Neighbours}
-    assert interactions.acceleration_noise["default"] > 0
-    assert "1 recording" in interactions.learned_from
+def test_edges_are_learned_from_unlabelled_detections(learned, detections):
+    path, shown = learned
+    assert "1 recording" in load_interactions(path).learned_from
+    for text in ("forms of the edges", "base motion", "shipped edges", "learned edges", "visible leader"):
+        assert text in shown
+    figures = json.loads((detections.parent / "figures.json").read_text(encoding="utf-8"))
+    assert {row["contender"] for row in figures["situations"]} == {BASE, SHIPPED, LEARNED}
+    assert all(row["form"] in (*row["ratios"], NOWHERE) for row in figures["forms"])
 
 
 def test_a_tracker_takes_them_over(learned, detections):
-    config = load_config("file").with_interactions(load_interactions(learned))
-    assert config.tracker.edges == load_interactions(learned).edges
+    path, _ = learned
+    config = load_config("file").with_interactions(load_interactions(path))
+    assert config.tracker.edges == load_interactions(path).edges
     tracks = detections.parent / "tracks.csv"
-    arguments = ["track", "file", str(detections), "--interactions", str(learned), "--output", str(tracks)]
+    arguments = ["track", "file", str(detections), "--interactions", str(path), "--output", str(tracks)]
     assert run(app, arguments).exit_code == 0
     assert len(tracks.read_text(encoding="utf-8").splitlines()) > 200
 
@@ -71,14 +187,15 @@ def test_mistakes_are_answered_with_one_line(learned, detections):
     result = run(app, [*track, "--interactions", str(wrong)])
     assert result.exit_code == 2
     assert "wrong.yaml: version: expected 1" in result.output
-    result = run(app, [*track, "--interactions", str(learned), "--method", "kf"])
+    result = run(app, [*track, "--interactions", str(learned[0]), "--method", "kf"])
     assert result.exit_code == 2
     assert "goes with --method saga" in result.output
 
 
-def test_the_detections_are_not_overwritten(detections):
-    before = detections.read_bytes()
-    result = run(app, ["learn", "interactions", "file", str(detections), "--output", str(detections)])
-    assert result.exit_code == 2
-    assert "expected another file than those that are read" in result.output
-    assert detections.read_bytes() == before
+def test_the_files_that_are_read_are_not_overwritten(learned, detections):
+    for path, others in ((detections, []), (learned[0], ["--start", str(learned[0])])):
+        before = path.read_bytes()
+        result = run(app, ["learn", "interactions", "file", str(detections), "--output", str(path), *others])
+        assert result.exit_code == 2
+        assert "expected another file than those that are read" in result.output
+        assert path.read_bytes() == before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -13,7 +12,7 @@ from data_tools.simulator.recorded_source import NgsimSource
 from pipelines.bench.recordings import recording_set
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.learning import trajectories
+from pipelines.learning import scenes_to_learn_from
 from pipelines.tracking import track_scene
 from tests.data_tools.ngsim_example import crossing, rows, write_ngsim
 
@@ -35,10 +34,14 @@ def test_track_and_evaluate(data: Path) -> None:
     assert "MOTA" in run.output
 
 
-def test_trajectories_to_learn_from_have_the_carrier_as_well(data: Path) -> None:
-    found = trajectories(NgsimSource(dataroot=str(data / "ngsim"), viewpoint="1"), with_truth=True)["A"]
-    assert found.id.tolist() == ["1", "2", "3"]
-    assert np.isfinite(found.position[..., 0]).sum(axis=0).tolist() == [20, 20, 15]
+def test_scenes_to_learn_from_have_the_carrier_as_well(data: Path) -> None:
+    source = NgsimSource(dataroot=str(data / "ngsim"), viewpoint="1")
+    scene = scenes_to_learn_from(source, load_config("traffic"), with_truth=True)["A"]
+    assert scene.ground_truth is not None
+    ids = [name for moment in scene.ground_truth for name in moment.id.tolist()]
+    assert [ids.count(name) for name in ("1", "2", "3")] == [20, 20, 15]
+    assert [len(frame) for frame in scene.frames] == [len(moment) for moment in scene.ground_truth]
+    assert {frame.sensor for frame in scene.frames} == {"lidar"}
 
 
 def test_a_set_of_the_benchmarks_is_scored_at_every_moment(data: Path) -> None:

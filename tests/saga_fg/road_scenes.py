@@ -13,6 +13,7 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stopping import RedLight
 from tests.saga_fg.estimator_programs import Add, Marginalise, Predict, Update
 
@@ -69,7 +70,7 @@ def bent_lane(turn=0.0, shift=(0.0, 0.0)):
     return table(moved, np.zeros(2), {1: points @ R.T + shift}, {1: 3.5})
 
 
-RULES = (RedLight(), InLane(), ConeLine(), Attached(), Following(cones=ConeGeometry()))
+RULES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), Following(cones=ConeGeometry()))
 
 
 def crossing(closed):
@@ -79,7 +80,7 @@ def crossing(closed):
     rows += [("traffic_cone", -30 + 4 * k, -5.5 + k, 0, 0, 0.4) for k in range(4)]
     weight = np.where(np.arange(len(rows)) == 4, closed, 0.0)
     outline = {4: np.array([[0.0, 1.75], [0.0, -1.75]]), 5: np.array([[-100.0, 0.0], [-40.0, 0.0], [40.0, 0.3]])}
-    return table(rows, weight, outline, {5: 3.5})
+    return replace(table(rows, weight, outline, {5: 3.5}), open=np.where(np.arange(len(rows)) == 4, 1 - closed, 0.0))
 
 
 def road_program(rng, moments=6):
@@ -110,5 +111,5 @@ def road_program(rng, moments=6):
         if moment == moments // 2:
             program.append(Marginalise(present[-1:]))
             present = present[:-1]
-    assert kinds >= {"Stopping", "KeepLane", "PassCones", "RigidCoupling"}
+    assert kinds >= {"Stopping", "Starting", "KeepLane", "PassCones", "RigidCoupling"}
     return program

@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from multiprocessing import get_context
+from typing import Protocol
 
 import numpy as np
 
@@ -15,12 +16,28 @@ from pipelines.bench.gaps.gap import LENGTHS, Gap, made_gaps, real_gaps
 from pipelines.bench.gaps.judging import GapOutcome, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
 from pipelines.bench.gaps.situations import situations_of
-from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.variants import Variant
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.model.sensor import Sensor
+from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
+
+
+class SceneSource(Protocol):
+    """Recordings by name, with ground truth and detections."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def clusters(self) -> Mapping[str, str]:
+        """The first of the recordings that overlap in time with each, by name; empty where none can."""
+        ...
+
+    def scene(self, recording: str) -> Scene:
+        """Read a recording."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,7 @@ class Contender:
 class Run:
     """A contender's outcomes in the gaps of one recording, and its links in the run without made gaps.
 
+    links       None of a contender that does not track
     cluster     the first of the recordings that overlap with this one, or itself
     situations  of the object of each gap, by the length until which; none for real gaps
     """
@@ -67,19 +85,19 @@ class Run:
     label: tuple[str, ...]
     situations: tuple[Mapping[float, frozenset[str]], ...]
     outcomes: tuple[GapOutcome, ...]
-    links: Links
+    links: Links | None
 
 
 @dataclass(frozen=True)
 class _Job:
-    source: RecordingSource
+    source: SceneSource
     recording: str
     contender: Contender
     settings: GapBenchSettings
 
 
 def bench_gaps(
-    source: RecordingSource,
+    source: SceneSource,
     recordings: Sequence[str],
     contenders: Sequence[Contender],
     settings: GapBenchSettings | None = None,
@@ -110,15 +128,22 @@ def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
 class _Preparation:
     """Everything that the gaps of a recording depend on; sensors place detections alike for all contenders."""
 
-    source: RecordingSource
+    source: SceneSource
     recording: str
     settings: GapBenchSettings
     sensors: Mapping[str, Sensor] = field(compare=False)
 
 
 def _perform(job: _Job) -> list[Run]:
-    labelled, gaps = _prepared(_Preparation(job.source, job.recording, job.settings, job.contender.config.sensors))
+    labelled, gaps = prepared(job.source, job.recording, job.settings, job.contender.config.sensors)
     return [run_of(labelled, gaps, job.contender, life) for life in job.settings.lives]
+
+
+def prepared(
+    source: SceneSource, recording: str, settings: GapBenchSettings, sensors: Mapping[str, Sensor]
+) -> tuple[LabelledScene, list[Gap]]:
+    """A recording and its gaps; the latest one is kept, for the next contender."""
+    return _prepared(_Preparation(source, recording, settings, sensors))
 
 
 @lru_cache(maxsize=1)

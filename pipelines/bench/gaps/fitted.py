@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
+from pipelines.bench.gaps.boosted import boosted_runs
+from pipelines.bench.gaps.learned import LEARNED, learn_interactions
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
-from pipelines.learning import learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learning import Trajectories, fit_acceleration_noise_by_class, measured_trajectories
-from saga_fg.types.dataset import Scene
+from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
+
+Fit = Literal["noise", "edges", "boosted"]
+FITS: tuple[Fit, ...] = ("noise", "edges", "boosted")
 
 
 @dataclass(frozen=True)
@@ -58,29 +62,39 @@ def bench_splits(
     contenders: Sequence[Contender],
     base: TrackConfig,
     settings: GapBenchSettings,
+    fits: Sequence[Fit] = ("noise", "edges"),
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Run]:
-    """All runs on the recordings that are judged; where there are others to fit to, with fitted contenders."""
+    """All runs on the recordings that are judged; where there are others to fit to, with fitted contenders.
+
+    Raises `InputError` where there is nothing to learn from, `MissingExtraError` for boosted trees without
+    scikit-learn.
+    """
     runs: list[Run] = []
     for split in splits:
-        teaching = [source.scene(name) for name in split.train]
-        fitted = fitted_contenders(teaching, base, progress) if teaching else []
+        fitted: list[Contender] = []
+        if split.train and "noise" in fits:
+            fitted.append(_with_fitted_noise(source, split, base))
+        if split.train and "edges" in fits:
+            fitted.append(_with_learned_edges(source, split, base, progress))
         runs += bench_gaps(source, split.test, [*contenders, *fitted], settings, workers, progress)
+        if split.train and "boosted" in fits:
+            runs += boosted_runs(source, split.train, split.test, settings, base.sensors)
     return runs
 
 
-def fitted_contenders(
-    teaching: Sequence[Scene], base: TrackConfig, progress: Progress | None = None
-) -> list[Contender]:
-    """kf with the process noise, and saga with the edges, learned from some annotated recordings.
+def _with_fitted_noise(source: RecordingSource, split: Split, base: TrackConfig) -> Contender:
+    """kf with the process noise of some annotated recordings."""
+    scenes = (source.scene(name) for name in split.train)
+    noise = fit_acceleration_noise_by_class(measured_trajectories(scenes, base.sensors))
+    return Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise))
 
-    Raises `InputError` where there is nothing to learn from.
-    """
-    noise = fit_acceleration_noise_by_class(measured_trajectories(iter(teaching), base.sensors))
-    truths = {scene.name: Trajectories.of_truth(scene) for scene in teaching}
-    learned = learn_interactions(truths, f"recordings {', '.join(truths)}", progress=progress)
-    return [
-        Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise)),
-        Contender("saga, learned edges", "saga", base.with_interactions(learned)),
-    ]
+
+def _with_learned_edges(
+    source: RecordingSource, split: Split, base: TrackConfig, progress: Progress | None
+) -> Contender:
+    """Saga with the edges of some annotated recordings."""
+    scenes = {name: source.scene(name) for name in split.train}
+    learned = learn_interactions(scenes, f"recordings {', '.join(scenes)}", base, progress=progress).interactions
+    return Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned))

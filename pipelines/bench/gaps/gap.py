@@ -80,21 +80,21 @@ def made_gaps(labelled: LabelledScene, passes: int, seed: int, lengths: Sequence
     if len(time) < 3:
         return []
     rng = np.random.default_rng([seed, zlib.crc32(labelled.scene.name.encode())])
-    windows = _windows(labelled, rng, lengths)
+    possible = windows(labelled, rng, lengths)
     gaps: list[Gap] = []
     for number in range(1, passes + 1):
-        order = rng.permutation(len(windows))
-        order = order[np.argsort([not windows[k].moving for k in order], kind="stable")]  # these are fewer
+        order = rng.permutation(len(possible))
+        order = order[np.argsort([not possible[k].moving for k in order], kind="stable")]  # these are fewer
         taken = _Taken(labelled)
         for k in order[:TRIALS].tolist():
-            if taken.free(windows[k]):
-                taken.add(windows[k])
-                gaps.append(replace(windows[k], run=number))
+            if taken.free(possible[k]):
+                taken.add(possible[k])
+                gaps.append(replace(possible[k], run=number))
     return gaps
 
 
-def _windows(labelled: LabelledScene, rng: np.random.Generator, lengths: Sequence[float]) -> list[Gap]:
-    """All that are possible; a length is chosen at random for each start."""
+def windows(labelled: LabelledScene, rng: np.random.Generator, lengths: Sequence[float]) -> list[Gap]:
+    """All gaps that are possible, by row and every `STARTS` s; a length is chosen at random for each."""
     time, found = labelled.scene.timestamps, []
     period = float(np.median(np.diff(time)))
     known = np.isfinite(labelled.position[..., 0])

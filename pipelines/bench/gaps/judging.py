@@ -50,16 +50,16 @@ class Prediction:
 class GapOutcome:
     """The outcome of one gap of an object.
 
-    held, kept   whether a track had it before, and whether that track has it after
-    reported     whether that track is among the results at the last moment of the gap
+    held, kept   whether a track had it before, and whether that track has it after; kept: None without tracks
+    reported     whether that track is among the results at the last moment of the gap; None without tracks
     error        mean over the gap, m
     at           error at the end of each length that the gap reaches, m
     predicted    where the track that had it is, at these moments, if it is among the results
     """
 
     held: bool
-    kept: bool
-    reported: bool
+    kept: bool | None
+    reported: bool | None
     error: float
     at: Mapping[float, float]
     predicted: Mapping[float, Prediction]

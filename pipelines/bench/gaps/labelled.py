@@ -28,7 +28,7 @@ class LabelledScene:
     id, label (N,); position (K, N, 2), m, world; detected (K, N) whether some detection is of the object
     velocity  (K, N, 2), m/s, world, by differences of positions where the labels have none; yaw (K, N), rad
     owner     for each frame, the object (D,) that each detection is of, whatever its class; -1: none
-    place     for each frame, where its detections are (D, 2), m, world
+    boxes     for each frame, its detections in the world
     """
 
     scene: Scene
@@ -39,7 +39,7 @@ class LabelledScene:
     yaw: FloatArray
     detected: BoolArray
     owner: tuple[IntArray, ...]
-    place: tuple[FloatArray, ...]
+    boxes: tuple[Boxes, ...]
 
     @classmethod
     def of(cls, scene: Scene, sensors: Mapping[str, Sensor]) -> LabelledScene:
@@ -57,18 +57,18 @@ class LabelledScene:
         for k, (moment, at) in enumerate(zip(truth, rows, strict=True)):
             position[k, at], label[at] = moment.boxes.position[:, :2], moment.boxes.label
             velocity[k, at], yaw[k, at] = moment.boxes.velocity, moment.boxes.yaw
-        owners, places = [], []
+        owners, found = [], []
         for frame in scene.frames:
             k = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
             boxes = sensor_model(sensors, frame.sensor).in_world(frame).boxes
             distance = _distances(boxes, truth[k], frame.timestamp - float(scene.timestamps[k]))
             owners.append(_nearest(distance, rows[k]))
-            places.append(boxes.position[:, :2])
+            found.append(boxes)
             distance[boxes.label[:, None] != truth[k].boxes.label] = np.inf
             same = _nearest(distance, rows[k])
             detected[k, same[same >= 0]] = True
         velocity = np.where(np.isfinite(velocity), velocity, _differences(position, scene.timestamps))
-        return cls(scene, names, label, position, velocity, yaw, detected, tuple(owners), tuple(places))
+        return cls(scene, names, label, position, velocity, yaw, detected, tuple(owners), tuple(found))
 
     def frames_without(self, row: IntArray, start: FloatArray, stop: FloatArray) -> list[Frame]:
         """The frames without the detections of objects `row` (W,) after `start` and before `stop` (W,), s."""

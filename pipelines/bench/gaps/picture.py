@@ -52,7 +52,7 @@ def telling_gap(first: Sequence[Run], second: Sequence[Run]) -> tuple[str, Gap]:
     for ours, theirs in zip(first, second, strict=True):
         for gap, mine, other in zip(ours.gaps, ours.outcomes, theirs.outcomes, strict=True):
             gain = min(other.error, CAP) - mine.error
-            worth = (int(mine.kept) - int(other.kept), gain if np.isfinite(gain) else 0.0)
+            worth = (int(mine.kept is True) - int(other.kept is True), gain if np.isfinite(gain) else 0.0)
             if best is None or worth > best[0]:
                 best = worth, ours.recording, gap
     if best is None:
@@ -139,7 +139,7 @@ def _draw_scene(ax: Any, labelled: LabelledScene, gap: Gap, origin: FloatArray, 
             style = {"facecolor": "#f3dcc4", "edgecolor": "#b5651d"} if mine else {"facecolor": "#d8d8d8"}
             ax.fill(*((corners - origin) @ turn).T, linewidth=0.8, zorder=1, **style)
     times = np.array([frame.timestamp for frame in labelled.scene.frames])
-    there = labelled.place[int(np.argmin(np.abs(times - labelled.scene.timestamps[k])))]
+    there = labelled.boxes[int(np.argmin(np.abs(times - labelled.scene.timestamps[k])))].position[:, :2]
     ax.plot(*((there - origin) @ turn).T, "x", color="black", markersize=4, zorder=3)
 
 

@@ -38,7 +38,11 @@ class Route:
         length = float(np.hypot(*onward))
         if length == 0:
             return None
-        ends = np.array([*points, points[-1] + ONWARD / length * onward])
+        return cls.through(np.array([*points, points[-1] + ONWARD / length * onward]))
+
+    @classmethod
+    def through(cls, ends: FloatArray) -> Self:
+        """The route through points (S + 1, 2), neighbours apart."""
         step = np.diff(ends, axis=0)
         way = np.append(0.0, np.cumsum(np.hypot(step[:, 0], step[:, 1])))
         return cls(ends, way, np.arctan2(step[:, 1], step[:, 0]))

@@ -23,8 +23,8 @@ from pipelines.bench.gaps.gap import MOVING, Gap, reached
 from pipelines.bench.gaps.labelled import LabelledScene
 from pipelines.bench.gaps.route import Route
 from saga_fg.learning.interaction_fit import ROAD_USERS
-from saga_fg.numerics.arrays import BoolArray
 from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.road_map import RoadMap, StopLine
 
 SITUATIONS = ("all", "moving", "stationary", "visible leader", "free", "halting", "starting", "turning", "at red")
@@ -46,10 +46,12 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
     always = {"all", "moving" if gap.moving else "stationary"}
     leader: int | None = None
     if labelled.label[row] in ROAD_USERS and (route := Route.of(labelled, row, start)) is not None:
-        leader = _leader(labelled, row, start, route)
+        leader = leader_on(labelled, row, start, route)
         if leader is None:
             always.add("free")
-        if _at_red(labelled, start, route):
+        road, closed = lights_at(labelled, float(labelled.scene.timestamps[start]))
+        line = first_line(road, route)
+        if line is not None and line[1].light in closed:
             always.add("at red")
     found = {}
     for length, end in reached(labelled.scene.timestamps, gap).items():
@@ -66,27 +68,22 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
     return found
 
 
-def _leader(labelled: LabelledScene, row: int, start: int, route: Route) -> int | None:
-    """The row of the nearest vehicle ahead, None where there is none."""
+def leader_on(labelled: LabelledScene, row: int, start: int, route: Route) -> int | None:
+    """The row of the nearest vehicle ahead of an object, None where there is none."""
     along, aside, direction = route.project(labelled.position[start])
     ahead = (along > TOUCHING) & (along <= LEADER_REACH) & (np.abs(aside) <= PATH_HALF_WIDTH)
     ahead &= ~(np.cos(labelled.yaw[start] - direction) < 0.5)  # a heading that is not known is none against it
-    ahead &= _vehicles(labelled)
+    ahead &= np.isin(labelled.label, ROAD_USERS)
     ahead[row] = False
     rows = np.flatnonzero(ahead)
     return int(rows[np.argmin(along[rows])]) if len(rows) else None
 
 
-def _vehicles(labelled: LabelledScene) -> BoolArray:
-    return np.isin(labelled.label, ROAD_USERS)
-
-
-def _at_red(labelled: LabelledScene, start: int, route: Route) -> bool:
-    road, closed = _closed_lights(labelled, float(labelled.scene.timestamps[start]))
-    if road is None or not closed:
-        return False
-    crossed = [(way, line) for line in road.stop_lines if (way := _way_to(line, route)) <= LINE_REACH]
-    return bool(crossed) and min(crossed, key=lambda each: each[0])[1].light in closed
+def first_line(road: RoadMap | None, route: Route) -> tuple[float, StopLine] | None:
+    """The first stop line that a route comes to within `LINE_REACH`, and the way to it, m."""
+    lines = road.stop_lines if road is not None else ()
+    crossed = [(way, line) for line in lines if (way := _way_to(line, route)) <= LINE_REACH]
+    return min(crossed, key=lambda each: each[0]) if crossed else None
 
 
 def _way_to(line: StopLine, route: Route) -> float:
@@ -95,21 +92,24 @@ def _way_to(line: StopLine, route: Route) -> float:
     return way if np.cos(direction - line.heading) > 0 else float("inf")
 
 
-def _closed_lights(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, frozenset[str]]:
+def lights_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, frozenset[str]]:
     """The road map at a time, and the names of its lights that were last reported closed."""
+    road: RoadMap | None = None
     shown: dict[str, str] = {}
-    frames = labelled.scene.frames
-    road = next((f.road_map for f in reversed(frames) if f.timestamp <= time + 1e-6 and f.road_map is not None), None)
+    recent: list[Boxes] = []
+    for frame, boxes in zip(labelled.scene.frames, labelled.boxes, strict=True):
+        if frame.timestamp > time + 1e-6:
+            break
+        road = road if frame.road_map is None else frame.road_map
+        if frame.timestamp >= time - REPORT_AGE:
+            recent.append(boxes)
     if road is None or not road.lights:
         return road, frozenset()
     lights = np.array([light.position for light in road.lights])
-    for frame, place in zip(reversed(frames), reversed(labelled.place), strict=True):
-        if not time - REPORT_AGE <= frame.timestamp <= time + 1e-6:
-            continue
-        label = frame.detections.boxes.label
-        for k in np.flatnonzero(np.char.startswith(label, "traffic_light_")).tolist():
-            away = np.hypot(*(lights - place[k]).T)
+    for boxes in recent:
+        for k in np.flatnonzero(np.char.startswith(boxes.label, "traffic_light_")).tolist():
+            away = np.hypot(*(lights - boxes.position[k, :2]).T)
             nearest = int(away.argmin())
             if away[nearest] <= LIGHT_REACH:
-                shown.setdefault(road.lights[nearest].name, str(label[k]))
+                shown[road.lights[nearest].name] = str(boxes.label[k])
     return road, frozenset(name for name, label in shown.items() if label in CLOSED)

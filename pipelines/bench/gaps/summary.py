@@ -25,7 +25,7 @@ FEWEST_RECORDINGS, FEWEST_GAPS = 3, 5  # of an interval
 Kind = Literal["real", "made"]
 KINDS: tuple[Kind, ...] = ("real", "made")
 Selection = Callable[[Gap, str], bool]
-Value = Callable[[GapOutcome], float]
+Value = Callable[[GapOutcome], float | None]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,9 @@ def link_figures(runs: Sequence[Run]) -> list[LinkFigure]:
     """All contenders and lives."""
     figures = []
     for life, contender in _kinds_of_runs(runs):
-        links = [run.links for run in runs if (run.life, run.contender) == (life, contender)]
+        links = [run.links for run in runs if (run.life, run.contender) == (life, contender) and run.links is not None]
+        if not links:
+            continue
         right, false, unknown = (sum(getattr(of, name) for of in links) for name in ("right", "false", "unknown"))
         known = right + false
         share = false / known if known else float("nan")
@@ -94,8 +96,8 @@ def gap_figures(runs: Sequence[Run], reference: str) -> list[GapFigure]:
     """All lives, kinds, groups, lengths and contenders on the recordings of one set."""
     figures = []
     lives = list(dict.fromkeys(run.life for run in runs))
-    contenders = list(dict.fromkeys(run.contender for run in runs))
     for life in lives:
+        contenders = list(dict.fromkeys(run.contender for run in runs if run.life == life))
         mine = {name: [run for run in runs if (run.life, run.contender) == (life, name)] for name in contenders}
         for group in _groups(next(iter(mine.values()))):
             base = mine.get(reference, next(iter(mine.values())))
@@ -171,7 +173,7 @@ def _figure(runs: Sequence[Run], base: Sequence[Run], life: Life, group: _Group)
 
 
 def _values(runs: Sequence[Run], chosen: Selection, value: Value) -> list[FloatArray]:
-    """The value of each chosen gap, cluster by cluster."""
+    """The value of each chosen gap, NaN where it has none, cluster by cluster."""
 
     def of_run(run: Run) -> FloatArray:
         every = zip(run.gaps, run.label, run.outcomes, strict=True)

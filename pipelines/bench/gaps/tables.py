@@ -10,7 +10,7 @@ from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval
 from pipelines.bench.gaps.bench import Run
 from pipelines.bench.gaps.contenders import Life
-from pipelines.bench.gaps.situation_figures import SituationFigure, situation_figures
+from pipelines.bench.gaps.situation_figures import situation_figures
 from pipelines.bench.gaps.summary import GapFigure, LinkFigure, gap_figures, link_figures
 
 LIVES: dict[Life, str] = {"kept": "tracks kept alive", "shipped": "tracks end as configured"}
@@ -32,11 +32,7 @@ def tables(
         found += [
             _gaps([f for f in mine if f.kind == "real"], f"{title}: real gaps of 1 to 6 s", reference),
             _gaps([f for f in mine if f.kind == "made"], f"{title}: made gaps", reference),
-            *(
-                _situations(situation_figures(runs, reference), title, reference)
-                if life == "kept" and situations
-                else ()
-            ),
+            *(situation_tables(runs, title, reference) if life == "kept" and situations else ()),
             _links([each for each in links if each.life == life], f"{title}: links through gaps"),
         ]
     return [table for table in found if table.rows]
@@ -103,8 +99,9 @@ def _gaps(figures: Sequence[GapFigure], title: str, reference: str) -> FigureTab
     return FigureTable(title, columns, tuple(rows))
 
 
-def _situations(figures: Sequence[SituationFigure], title: str, reference: str) -> list[FigureTable]:
-    """A table for each time after the start of the gaps, a row for each situation and contender."""
+def situation_tables(runs: Sequence[Run], title: str, reference: str) -> list[FigureTable]:
+    """A table for each time after the start of made gaps, a row for each situation and contender."""
+    figures = situation_figures(runs, reference)
     columns: tuple[str, ...] = (
         "objects",
         "contender",

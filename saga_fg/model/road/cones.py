@@ -53,6 +53,7 @@ class ConeLine:
     """Vehicles ahead of which cones form a line pass it on its free side."""
 
     cones: ConeGeometry = settings_group(ConeGeometry, "which cones concern a vehicle, and how it passes them")
+    map_classes: ClassVar[tuple[str, ...]] = ()
     rate: NonNegative = setting(
         3.0,
         "strength of an edge of a vehicle that has to move aside, 1/s; usual 1 to 5; higher: pushed aside more firmly",

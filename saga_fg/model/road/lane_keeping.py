@@ -65,6 +65,7 @@ class KeepLane(Settings):
 class InLane(Settings):
     """A vehicle that drives along a lane of the map, within its borders, keeps it."""
 
+    map_classes: ClassVar[tuple[str, ...]] = (LANE,)
     interaction: KeepLane = settings_group(KeepLane, "interaction function of the edges")
     rate: NonNegative = setting(2.0, "strength of an edge, 1/s; higher: vehicles keep their lane more strictly")
     lateral_speed_scale: PositiveOrInf = setting(

@@ -13,67 +13,29 @@ The rule: of the vehicles that come to a line, the first of each lane that can s
     rate = rate  closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
 
 since drivers do not brake for a line far away; a vehicle that would have to brake harder than `max_deceleration` goes
-on. Those behind follow by other interactions. A vehicle approaches a line along its lane of the map, or without lanes
-straight along its heading. Alternatively the line is a stationary leader of the Intelligent Driver Model
+on. A slow one near the line comes to rest where it is: dv_i/dt += -rate tau v / stop_time. Those behind follow by other
+interactions. Alternatively the line is a stationary leader of the Intelligent Driver Model
 (`saga_fg.model.intelligent_driver`): the vehicle brakes later and harder, and a slow one creeps up to the line.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from saga_fg.model.edge_rules import VEHICLES, Pairs
 from saga_fg.model.intelligent_driver import LEAST_GAP, IntelligentDriver, Linearised, accelerated, speed_along
-from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples
 from saga_fg.model.nonlinear_interactions import Accelerations, smooth_acceleration
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.numerics.polyline import feet, on_it
+from saga_fg.model.road.stop_lines import ComingVehicles, approach, coming_vehicles
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
-from saga_fg.types.road_map import LANE, STOP_LINE
+from saga_fg.types.road_map import LIGHT, STOP_LINE
 
-SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
-
-
-class Approach(NamedTuple):
-    """E pairs of a vehicle and a stop line: whether it comes to it, the way to it (from the centre, along the lane),
-    m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m to the left of its middle.
-    """
-
-    comes: BoolArray
-    way: FloatArray
-    direction: FloatArray
-    crossing: FloatArray
-
-
-def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
-    """The approaches of vehicles `target` (E,) to stop lines `source` (E,)."""
-    offset = nodes.position[source] - nodes.position[target]
-    u = facing = unit(nodes.heading[target])
-    way = np.einsum("ei,ei->e", offset, u)
-    left, right = (np.array([nodes.outline[j][end] for j in source.tolist()]).reshape(-1, 2) for end in (0, 1))
-    aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
-    half = np.hypot(*(left - right).T) / 2
-    aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
-    comes = (np.abs(aside) < half) & aligned & (way > 0)
-    crossing = -aside
-    (vehicles, of_vehicle), (lines, of_line) = (np.unique(rows, return_inverse=True) for rows in (target, source))
-    for lane in np.flatnonzero(nodes.label == LANE).tolist() if len(target) else ():
-        centre, width = nodes.outline[lane], nodes.width[lane]
-        mine = feet(centre, nodes.position[vehicles]).select(of_vehicle)
-        its = feet(centre, nodes.position[lines]).select(of_line)
-        in_lane = (np.abs(mine.e) <= width / 2) & (np.einsum("ei,ei->e", mine.direction, facing) > 0)
-        in_lane &= on_it(centre, mine.s)
-        crossed = (np.abs(its.e) <= half) & (np.cos(np.arctan2(*its.direction.T[::-1]) - nodes.heading[source]) > 0)
-        way = np.where(in_lane & crossed, its.s - mine.s, way)
-        comes = np.where(in_lane, crossed & (its.s > mine.s), comes)
-        crossing = np.where(in_lane & crossed, mine.e - its.e, crossing)
-        u = np.where(in_lane[:, None], mine.direction, u)
-    return Approach(comes, way, u, crossing)
+HALTING_SPEED = 2.0  # m/s; slower vehicles near a closed line come to rest where they are
+HALTING_GAP = 10.0  # m from the front of the vehicle to the line
 
 
 @dataclass(frozen=True)
@@ -85,16 +47,35 @@ class Stopping(Settings):
     margin: NonNegative = setting(
         3.0, "distance left between the front of a stopped vehicle and the line, m; usual 1 to 5"
     )
+    hardest: Positive = setting(
+        4.5, "limit of the deceleration, m/s^2; usual 3 to 6; higher: harder braking is predicted"
+    )
+    stop_time: Positive = setting(
+        1.0, "time constant with which the last of the speed fades, s; usual 0.5 to 2; higher: slower stops"
+    )
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """g (E,), m, for ways (E,) from the centres to the line."""
         return np.maximum(way - nodes.length[target] / 2 - self.margin, LEAST_GAP)
 
+    def law(self, v: FloatArray, g: FloatArray) -> Linearised:
+        """The deceleration (E,) at speeds and remaining ways g (E,)."""
+        g = np.maximum(g, v**2 / (2 * self.hardest))
+        none = np.zeros_like(v)
+        even = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), none)
+        return Linearised(-v / self.stop_time, none - 1 / self.stop_time, none, none).where(
+            halting(v, g + self.margin), even
+        )
+
+    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
+        """Accelerations (E,), m/s^2, at speeds and remaining ways g (E,)."""
+        return self.law(v, g).value
+
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         ways = approach(nodes, target, source)
-        g, v = self.gap(nodes, target, ways.way), speed_along(nodes, target, ways.direction)
-        braking = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), np.zeros_like(v))
-        return accelerated(nodes, target, source, ways.direction, v, braking, self.time_constant)
+        v = speed_along(nodes, target, ways.direction)
+        law = self.law(v, self.gap(nodes, target, ways.way))
+        return accelerated(nodes, target, source, ways.direction, v, law, self.time_constant)
 
 
 @dataclass(frozen=True)
@@ -109,6 +90,10 @@ class DriverStopping:
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
         """Gap (E,), m, for ways (E,) from the centres to the line."""
         return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
+
+    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
+        """Accelerations (E,), m/s^2, at speeds and gaps g (E,)."""
+        return self.driver.stopping(v, g).value
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         ways = approach(nodes, target, source)
@@ -138,6 +123,10 @@ class SmoothStopping:
         """Gap (E,), m, for ways (E,) from the centres to the line."""
         return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
 
+    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
+        """Accelerations (E,), m/s^2, at speeds and gaps g (E,)."""
+        return smooth_acceleration(self.driver, v, g, np.zeros_like(v)).value
+
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E, 3) direction of the lane, and the gap less the distance to the line along it."""
         ways = approach(nodes, target, source)
@@ -158,6 +147,7 @@ class SmoothStopping:
 class RedLight(Settings):
     """The first vehicle that comes to a closed stop line, and can stop, does."""
 
+    map_classes: ClassVar[tuple[str, ...]] = (LIGHT, STOP_LINE)
     interaction: Stopping | DriverStopping | SmoothStopping = settings_group(
         Stopping, "interaction function of the edges"
     )
@@ -180,31 +170,25 @@ class RedLight(Settings):
     )
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
+    def able(self, coming: ComingVehicles) -> ComingVehicles:
+        """Those that can stop before the line, or halt at it."""
+        can = (coming.front > 0) & (coming.speed**2 <= 2 * self.max_deceleration * coming.front)
+        return coming.select(can | halting(coming.speed, coming.front))
+
+    def brakes(self, nodes: NodeTable, coming: ComingVehicles) -> tuple[FloatArray, FloatArray]:
+        """How surely each driver brakes for a closed line (E,), and the acceleration then (E,), m/s^2."""
+        g = self.interaction.gap(nodes, coming.target, coming.approach.way)
+        needed = coming.speed**2 / (2 * g) - self.reaction_deceleration
+        ramp = np.clip(needed / max(self.full_deceleration - self.reaction_deceleration, 1e-9), 0.0, 1.0)
+        ramp = np.where(halting(coming.speed, coming.front), 1.0, ramp)
+        return ramp, self.interaction.acceleration(coming.speed, g)
+
     def pairs(self, nodes: NodeTable) -> Pairs:
-        lines = np.flatnonzero(nodes.label == STOP_LINE)
-        vehicles = np.flatnonzero(of_classes(nodes.label, self.classes))
-        if len(lines) == 0 or len(vehicles) == 0 or nodes.closed is None:
-            return Pairs(vehicles[:0], lines[:0], np.empty(0))
-        target, source = np.repeat(vehicles, len(lines)), np.tile(lines, len(vehicles))
-        near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= self.max_distance
-        target, source = target[near], source[near]
-        ways = approach(nodes, target, source)
-        v = speed_along(nodes, target, ways.direction)
-        front = ways.way - nodes.length[target] / 2  # of the vehicle, before the line
-        stops = np.flatnonzero(ways.comes & (front > 0) & (v**2 <= 2 * self.max_deceleration * front))
-        preceded = _in_one_lane(source[stops], ways.crossing[stops]) & (ways.way[stops] < ways.way[stops, None])
-        first = stops[~preceded.any(axis=1)]
-        target, source, v = target[first], source[first], v[first]
-        g = self.interaction.gap(nodes, target, ways.way[first])
-        ramp = np.clip(
-            (v**2 / (2 * g) - self.reaction_deceleration)
-            / max(self.full_deceleration - self.reaction_deceleration, 1e-9),
-            0.0,
-            1.0,
-        )
-        return Pairs(target, source, self.rate * nodes.closed[source] * ramp)
+        first = self.able(coming_vehicles(nodes, self.classes, self.max_distance)).first()
+        weight = np.zeros(len(first.source)) if nodes.closed is None else nodes.closed[first.source]
+        return Pairs(first.target, first.source, self.rate * weight * self.brakes(nodes, first)[0])
 
 
-def _in_one_lane(line: IntArray, crossing: FloatArray) -> BoolArray:
-    """(E, E) which pairs are of one line and cross it within a metre or two of each other."""
-    return np.asarray((line[:, None] == line) & (np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE))
+def halting(speed: FloatArray, front: FloatArray) -> BoolArray:
+    """Which vehicles of these speeds, m/s, so far before the line, m, come to rest where they are."""
+    return np.asarray((speed < HALTING_SPEED) & (front < HALTING_GAP))

@@ -11,7 +11,6 @@ from data_tools.datasets.ngsim.windows import NgsimWindows
 from data_tools.datasets.openacc import OpenAccPlatoons
 from data_tools.datasets.recorded_traffic import RecordedTraffic
 from data_tools.simulator.recorded_world import sensed_scene, true_scene
-from saga_fg.learning import Trajectories
 from saga_fg.numerics.polyline import feet, on_it
 
 
@@ -101,9 +100,10 @@ def test_platoons_keep_their_order_and_plausible_gaps(openacc: OpenAccPlatoons) 
     assert np.quantile(np.abs(moved - speed)[both], 0.99) < 1.5
 
 
-def test_trajectories_to_learn_from_have_every_vehicle(ngsim: NgsimWindows) -> None:
+def test_the_truth_to_learn_from_has_every_vehicle(ngsim: NgsimWindows) -> None:
     traffic = ngsim.recording("USA_Lanker-1_15_T-1")
-    found = Trajectories.of_truth(true_scene(traffic))
-    assert len(found) == len(traffic)
-    assert sorted(found.id.tolist()) == sorted(traffic.id.tolist())
-    assert (np.isfinite(found.position[..., 0]).sum() == traffic.present.sum()).all()
+    truth = true_scene(traffic).ground_truth
+    assert truth is not None
+    assert len(truth) == len(traffic)
+    assert {name for moment in truth for name in moment.id.tolist()} == set(traffic.id.tolist())
+    assert sum(map(len, truth)) == traffic.present.sum()

@@ -17,6 +17,8 @@ from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.tracking import track_scene
 from saga_fg.errors import InputError
+from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.stopping import RedLight
 from saga_fg.types.dataset import Scene
 from tests.data_tools.ngsim_example import crossing, rows, write_ngsim
 
@@ -113,7 +115,9 @@ def test_colours_are_reported_at_first_and_when_they_change(traffic: RecordedTra
 
 def test_a_tracker_believes_the_colours_and_knows_the_map(traffic: RecordedTraffic) -> None:
     scene = sensed_scene(traffic, "mast", perfect(), seed=0)
-    tracker = load_config("traffic").new_tracker("saga")
+    config = load_config("traffic")
+    rules = RedLight(), InLane()
+    tracker = replace(config, tracker=replace(config.tracker, edges=rules)).new_tracker("saga")
     for frame in scene.frames:
         tracker.step(frame)
     assert tracker.map_nodes.belief("light-7")["green"] > 0.75  # type: ignore[union-attr]

@@ -15,10 +15,11 @@ from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.rigid_coupling import Attached, RigidCoupling
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane, KeepLane
+from saga_fg.model.road.starting import GreenLight, Starting
 from saga_fg.model.road.stopping import RedLight, Stopping
 from saga_fg.numerics.polyline import direction_at, feet
-from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
-from saga_fg.types.signal import COLOURS, SignalSettings, colour_updated
+from saga_fg.types.road_map import Lane, LaneAcross, RoadMap, StopLine, TrafficLight
+from saga_fg.types.signal import STATES, SignalSettings, colour_updated, colours
 from tests.saga_fg.road_scenes import bent_lane, queue, table, taper
 
 
@@ -45,7 +46,7 @@ def state(nodes, row):
 # the light
 
 
-@given(belief=st.lists(st.floats(0.01, 1), min_size=3, max_size=3), dt=st.floats(0, 50), parts=st.integers(1, 5))
+@given(belief=st.lists(st.floats(0.01, 1), min_size=4, max_size=4), dt=st.floats(0, 50), parts=st.integers(1, 5))
 def test_a_belief_is_predicted_over_any_interval_alike(belief, dt, parts):
     """Chapman and Kolmogorov: in one step or in several; it stays a distribution and forgets what was seen."""
     signals, p = SignalSettings(), np.array([belief]) / sum(belief)
@@ -59,42 +60,45 @@ def test_a_belief_is_predicted_over_any_interval_alike(belief, dt, parts):
 
 
 def test_colours_change_in_their_order():
-    signals = SignalSettings(red_duration=10, amber_duration=3, green_duration=12)
-    red = signals.predicted(np.array([[1.0, 0, 0]]), 0.01)[0]
-    assert red[COLOURS.index("green")] == pytest.approx(0.001, rel=0.01)
-    assert red[COLOURS.index("amber")] < 1e-5
-    assert np.allclose(signals.stationary, np.array([10, 3, 12]) / 25)
+    signals = SignalSettings(red_duration=10, amber_duration=3, green_duration=12, start_delay=1.5)
+    red = signals.predicted(np.array([[1.0, 0, 0, 0]]), 0.01)[0]
+    assert red[STATES.index("starting")] == pytest.approx(0.001, rel=0.01)
+    assert red[STATES.index("amber")] + red[STATES.index("green")] < 1e-5
+    assert np.allclose(signals.stationary, np.array([10, 3, 1.5, 12]) / 26.5)
+    assert np.allclose(colours(signals.stationary), np.array([10, 3, 13.5]) / 26.5)
 
 
 @given(accuracy=st.floats(0.4, 0.999), colour=st.sampled_from(range(3)))
 def test_reports_of_a_colour_persuade_as_bayes_says(accuracy, colour):
-    belief = np.full(3, 1 / 3)
+    belief = np.array([1 / 3, 1 / 3, 1 / 6, 1 / 6])
     belief = colour_updated(belief, colour, accuracy)
-    assert belief[colour] == pytest.approx(accuracy)
-    again = colour_updated(belief, colour, accuracy)
+    assert colours(belief)[colour] == pytest.approx(accuracy)
+    again = colours(colour_updated(belief, colour, accuracy))
     assert again[colour] == pytest.approx(accuracy**2 / (accuracy**2 + (1 - accuracy) ** 2 / 2), rel=1e-5)
     for _ in range(100):
         belief = colour_updated(belief, colour, accuracy)
     other = (colour + 1) % 3
     for _ in range(100):  # whatever was believed, another colour can still be learnt
         belief = colour_updated(belief, other, accuracy)
-    assert belief.argmax() == other
+    assert colours(belief).argmax() == other
 
 
 def test_the_belief_mixes_or_selects():
-    beliefs = np.array([[0.3, 0.1, 0.6], [0.5, 0.2, 0.3]])
-    assert np.allclose(SignalSettings().closed(beliefs), [0.4, 0.7])
-    assert SignalSettings(belief="likeliest").closed(beliefs).tolist() == [0, 1]
+    beliefs = np.array([[0.3, 0.1, 0.2, 0.4], [0.5, 0.2, 0.0, 0.3], [0.1, 0.1, 0.1, 0.7]])
+    assert np.allclose(SignalSettings().closed(beliefs), [0.4, 0.7, 0.2])
+    assert np.allclose(SignalSettings().open(beliefs), [0.4, 0.3, 0.7])
+    assert SignalSettings(belief="likeliest").closed(beliefs).tolist() == [0, 1, 0]
+    assert SignalSettings(belief="likeliest").open(beliefs).tolist() == [0, 0, 1]
 
 
 # the stop line
 
 
-@given(turn=st.floats(-3, 3), speed=st.floats(2, 14), gap=st.floats(8, 60))
+@given(turn=st.floats(-3, 3), speed=st.floats(3, 14), gap=st.floats(8, 60))
 def test_stopping_is_the_even_deceleration_to_the_line(turn, speed, gap):
     """The linearised law at its estimate, in any direction; and its derivatives against finite differences."""
     u = np.array([np.cos(turn), np.sin(turn)])
-    law = Stopping(margin=1.0)
+    law = Stopping(margin=1.0, hardest=20.0)
     place = -(gap + 2 + 1.0) * u
     ends = np.stack([[-u[1], u[0]], [u[1], -u[0]]]) * 2
     rows = [("car", *place, speed, turn, 4.0), ("stop_line", 0, 0, 0, turn, 0)]
@@ -142,6 +146,52 @@ def test_who_does_not_come_to_the_line_is_not_stopped(row):
     assert len(RedLight().pairs(nodes).target) == 0
 
 
+@pytest.mark.parametrize(("front", "speed"), [(4.0, 0.3), (9.0, 1.5), (-1.5, 0.5)])
+def test_a_slow_vehicle_near_a_closed_line_comes_to_rest(front, speed):
+    """It does not creep up to the line, and may stand a little beyond."""
+    rows = [("car", -front - 2, 0, speed, 0, 4), ("stop_line", 0, 0, 0, 0, 0)]
+    nodes = table(rows, np.array([0, 1.0]), {1: np.array([[0, 1.75], [0, -1.75]])})
+    assert pull(nodes, RedLight())[0, 0] == pytest.approx(-speed)
+
+
+def open_line(rows, weight=1.0):
+    nodes = table([*rows, ("stop_line", 0, 0, 0, 0, 0)], None, {len(rows): np.array([[0, 1.75], [0, -1.75]])})
+    return replace(nodes, open=np.append(np.zeros(len(rows)), weight))
+
+
+def test_an_open_line_lets_the_first_vehicle_go():
+    rule = GreenLight(interaction=Starting(speed=10.0), rate=0.2)
+    queue = [("car", -5, 0, 0, 0, 4), ("car", -12, 0, 0, 0, 4)]
+    assert pull(open_line(queue), rule)[:2, 0] == pytest.approx([2.0, 0.0])
+    assert pull(open_line(queue, 0.3), rule)[0, 0] == pytest.approx(0.6)
+    assert pull(open_line([("car", -5, 0, 6, 0, 4)]), rule)[0, 0] == pytest.approx(0.8)
+    assert len(rule.pairs(open_line([("car", -5, 0, 12, 0, 4)])).target) == 0  # nobody is slowed down
+
+
+def test_who_has_crossed_an_open_line_still_speeds_up():
+    rule = GreenLight(interaction=Starting(speed=10.0), rate=0.2)
+    rows = [("car", 6, 0, 5, 0, 4), ("car", -3, 0, 4, 0, 4)]
+    assert pull(open_line(rows), rule)[:2, 0] == pytest.approx([1.0, 1.2])
+    assert len(rule.pairs(open_line([("car", 30, 0, 5, 0, 4)])).target) == 0
+    assert len(rule.pairs(open_line([("car", 6, 0, 5, math.pi, 4)])).target) == 0
+
+
+def test_where_a_lane_ends_vehicles_go_straight_on_to_the_line():
+    """The lane that crosses the line begins 10 m before it; a vehicle in the lane before comes to it all the same."""
+    nodes = table(
+        [("car", -30, 0, 10, 0, 4), ("stop_line", 0, 0, 0, 0, 0)],
+        np.array([0, 1.0]),
+        {1: np.array([[0, 1.75], [0, -1.75]])},
+    )
+    line = StopLine("line", (0.0, 1.75), (0.0, -1.75), "light")
+    short = LaneAcross.of(Lane("short", ((-10.0, 0.0), (5.0, 0.0))), line)
+    before = LaneAcross.of(Lane("before", ((-100.0, 0.2), (-10.0, 0.2))), line)
+    assert short is not None
+    assert before is not None
+    for lanes in ((), (short,), (short, before)):
+        assert RedLight().pairs(replace(nodes, lanes={1: lanes}, derived={})).target.tolist() == [0]
+
+
 def test_the_queue_brakes_through_following():
     """The second car has no edge to the line; it slows down because the first one does."""
     nodes = queue()
@@ -171,6 +221,11 @@ def test_the_way_to_a_line_is_along_the_lane():
         {1: lane, 2: np.stack([end - t + 1.75 * across, end - t - 1.75 * across])},
         {1: 3.5},
     )
+    left, right = (tuple(point) for point in with_line.outline[2].tolist())
+    crossing = LaneAcross.of(Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light"))
+    assert crossing is not None
+    assert len(RedLight().pairs(with_line).target) == 0  # straight on it would miss the line
+    with_line = replace(with_line, lanes={2: (crossing,)}, derived={})
     assert RedLight().pairs(with_line).target.tolist() == [0]
     at = feet(lane, nodes.position[:1])
     arc, speed = 50 * 1.2 - 1 - at.s[0], 8.0 * (at.direction[0] @ (np.cos(0.2), np.sin(0.2)))

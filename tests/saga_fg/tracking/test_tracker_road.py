@@ -1,5 +1,6 @@
 """The tracker on scenes of more than cars: what nodes of other kinds are worth, and that they keep to the rules."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -7,16 +8,19 @@ import pytest
 
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.model.cone_geometry import ConeGeometry
-from saga_fg.model.edge_rules import Following
+from saga_fg.model.edge_rules import Following, Pairs
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
 from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stopping import RedLight, SmoothStopping
 from saga_fg.tracking import ClassSettings
+from saga_fg.tracking.prediction import node_table
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
+from saga_fg.types.signal import COLOURS, colours
 
 MAP = RoadMap(
     (TrafficLight("light", (12.0, 0.0)),),
@@ -24,7 +28,7 @@ MAP = RoadMap(
     (Lane("lane", ((-200.0, 0.0), (50.0, 0.0))),),
 )
 FOLLOW = Following(interaction=SharedVelocity(), rate=1.0, max_gap=40)
-EDGES = (RedLight(), InLane(), ConeLine(), Attached(), replace(FOLLOW, cones=ConeGeometry()))
+EDGES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), replace(FOLLOW, cones=ConeGeometry()))
 SETTINGS = TrackerSettings(
     classes={
         "default": ClassSettings(motion=ConstantVelocity(acceleration_noise=0.5), max_coasting=5.0),
@@ -91,6 +95,103 @@ def test_the_light_is_believed_by_noisy_reports():
     assert tracker.map_nodes.belief("light")["red"] < 0.6
     tracker.restore(far)
     assert tracker.map_nodes.belief("light")["red"] > 0.95
+
+
+def light_frames(move, duration=3.0, seed=0, road_map=MAP, hidden_from=np.inf, width=1):
+    """Cars whose fronts are `move(time)` m before the line, side by side; nobody reports the light."""
+    rng = np.random.default_rng(seed)
+    for time in np.arange(0, duration, 0.1):
+        places = [(-move(time) - 2.25 + rng.normal(0, 0.05), 3.5 * k + rng.normal(0, 0.05), 0.8) for k in range(width)]
+        cars = [Detection("car", place, (4.5, 1.8, 1.5), 0.0) for place in places]
+        yield Frame(float(time), "lidar", Detections.of(cars if time < hidden_from else []), road_map=road_map)
+
+
+def brakes(time):
+    return 40 - 10 * min(time, 3.0) + 5 * max(0, min(time, 3.0)) ** 2 / 3
+
+
+def believed(frames, light="light", settings=SETTINGS):
+    return tracked(frames, settings).map_nodes.belief(light)
+
+
+def test_an_unreported_light_is_believed_by_who_stops_and_who_goes():
+    before = dict(zip(COLOURS, colours(SETTINGS.signals.stationary), strict=True))
+    halted = believed(light_frames(lambda time: 3.0))
+    braking = believed(light_frames(lambda time: 30 - 10 * time + 2.0 * time**2 / 2, 2.5))
+    passing = believed(light_frames(lambda time: 32 - 12 * time, 2.5))
+    starting = believed(light_frames(lambda time: 3.0 - max(0, time - 2) ** 2, 4.0))
+    assert halted["red"] > 0.7 > before["red"]
+    assert braking["red"] > 0.7
+    assert passing["green"] > before["green"] + 0.15
+    assert starting["green"] > before["green"] + 0.15
+
+
+def test_two_vehicles_tell_more_than_one_and_heedless_drivers_nothing():
+    one, two = (believed(light_frames(lambda time: 3.0, road_map=wide(width), width=width)) for width in (1, 2))
+    assert two["red"] + two["amber"] > one["red"] + one["amber"]
+    off = replace(SETTINGS, signals=replace(SETTINGS.signals, heedless=1.0))
+    untold = believed(light_frames(lambda time: 3.0), settings=off)
+    assert untold["red"] == pytest.approx(SETTINGS.signals.stationary[0], abs=1e-6)
+
+
+def wide(lanes):
+    line = StopLine("line", (0.0, 3.5 * lanes - 1.75), (0.0, -1.75), "light")
+    return RoadMap(MAP.lights, (line,))
+
+
+def test_all_lines_of_a_light_gain_and_those_of_others_do_not():
+    lights = (*MAP.lights, TrafficLight("other", (40.0, 40.0)))
+    lines = (
+        *MAP.stop_lines,
+        StopLine("across", (12.0, -1.75), (12.0, 1.75), "light"),
+        StopLine("far", (80.0, 1.75), (80.0, -1.75), "other"),
+    )
+    tracker = tracked(light_frames(lambda time: 3.0, road_map=RoadMap(lights, lines)))
+    nodes = tracker.map_nodes.appended_to(node_table(tracker._state), np.zeros(2), tracker._state.joint)
+    closed = dict(zip(tracker.map_nodes.name, nodes.closed[-len(tracker.map_nodes) :], strict=True))
+    assert closed["line"] == closed["across"] > 0.75 > closed["far"]
+
+
+def test_hidden_vehicles_tell_nothing():
+    """A car that is no longer seen is expected to brake for what may be red; that is no evidence of red."""
+    seen = believed(light_frames(lambda time: 45 - 8 * time, 1.0))
+    hidden = believed(light_frames(lambda time: 45 - 8 * time, 3.0, hidden_from=1.0))
+    later = SETTINGS.signals.predicted(np.array([[seen["red"], seen["amber"], 0.0, seen["green"]]]), 2.0)[0]
+    assert hidden["red"] == pytest.approx(later[0], abs=0.05)
+
+
+def test_colours_are_inferred_alike_by_every_estimator_and_after_a_restart():
+    frames = list(light_frames(brakes, 2.0))
+    one = tracked(frames)
+    for name in ("isam2", "fixed-lag"):
+        other = tracked(frames, replace(SETTINGS, estimator=name))
+        assert other.map_nodes.belief("light") == pytest.approx(one.map_nodes.belief("light"), abs=1e-6)
+    first = tracked(frames[:10])
+    continued = pickle.loads(pickle.dumps(first))
+    for frame in frames[10:]:
+        continued.step(frame)
+    assert continued.map_nodes.belief("light") == one.map_nodes.belief("light")
+
+
+def test_elements_of_the_map_that_no_rule_reads_are_no_nodes():
+    frames = list(queue_frames(duration=0.5))
+    for edges, labels in (
+        ((FOLLOW,), set()),
+        ((RedLight(),), {"traffic_light", "stop_line"}),
+        ((InLane(),), {"lane"}),
+        ((OwnRule(),), {"traffic_light", "stop_line", "lane"}),
+    ):
+        tracker = Tracker(replace(SETTINGS, edges=()), SENSORS, rules=edges)
+        for frame in frames:
+            tracker.step(frame)
+        assert set(tracker.map_nodes.label.tolist()) == labels
+
+
+class OwnRule:
+    interaction = SharedVelocity()
+
+    def pairs(self, nodes):
+        return Pairs(np.empty(0, dtype=int), np.empty(0, dtype=int), np.empty(0))
 
 
 def test_colours_are_no_tracks_and_without_a_map_no_nodes():

@@ -1,7 +1,6 @@
 """Independent Kalman filters of the objects of a recording: constant velocity, measured positions.
 
-An object that was out of sight for a moment is initialised anew. Gaps start from these estimates, and neighbours of a
-hidden object are represented by them.
+An object that was out of sight for a moment is initialised anew.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.learning.trajectories import Trajectories
+from benchmarks.trajectories import Trajectories
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.box_filter import MOVING

@@ -1,0 +1,228 @@
+r"""Objects of recordings that are hidden for some seconds while the tracks around them go on, predicted by the tracker.
+
+A tracker without edges goes through a recording. Each of its tracks that holds a labelled object begins a gap at many
+moments: from there on its object is hidden, and the track is predicted by the tracker's own step
+(`saga_fg.tracking.prediction`), with the motion, the turn, the stationarity and the edges of the configuration. At the
+beginning of each step the tracks around it are set to what the tracker knew of them then. So they are taken as known:
+the hidden track depends on them, and not the other way round. All gaps are predicted side by side, as one large scene
+in which they are kilometres apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.learning.marginals import Marginals
+from saga_fg.learning.recorded_tracks import LabelledPlaces, RecordedTracks, recorded_tracks
+from saga_fg.model.edge_rules import EdgeRule, Pairs
+from saga_fg.model.interactions import Interaction, NodeTable
+from saga_fg.model.nonlinear_interactions import AccelerationLaw
+from saga_fg.model.sensor import Sensor
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.tracking import TrackerSettings
+from saga_fg.tracking.joint_state import JointTrackState
+from saga_fg.tracking.map_nodes import motion_of
+from saga_fg.tracking.prediction import predict
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.dataset import Scene
+
+APART = 5000.0  # m between gaps: no edge reaches as far
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """longest gap and time between its steps, s; how long an object is tracked before; how often gaps start, s;
+
+    neighbours: at most so many, within `reach` m
+    """
+
+    longest: float = 5.0
+    step: float = 0.5
+    followed: float = 1.5
+    spacing: float = 1.0
+    neighbours: int = 8
+    reach: float = 60.0
+
+
+class _Onto(NamedTuple):
+    """A rule with its edges into the first `wanted` nodes alone."""
+
+    rule: EdgeRule
+    wanted: int
+
+    @property
+    def interaction(self) -> Interaction | AccelerationLaw:
+        return self.rule.interaction
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        """The edges into the first nodes."""
+        pairs = self.rule.pairs(nodes)
+        mine = pairs.target < self.wanted
+        return Pairs(pairs.target[mine], pairs.source[mine], pairs.rate[mine])
+
+
+class GapPrediction(NamedTuple):
+    """At the end of S steps: position (W, S, 2) and its covariance (W, S, 2, 2); NaN where nothing is to be compared"""
+
+    position: FloatArray
+    P: FloatArray
+
+
+class _Shared(NamedTuple):
+    """Shared by all gaps: the tracks of the recordings, and the step, s."""
+
+    tracks: RecordedTracks
+    step: float
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenObjects(Columns):
+    """W gaps of S steps, each with at most M tracks around.
+
+    start       (W,) row of the hidden track in `recorded`; label (W,) of the object
+    neighbours  (W, S, M) rows when a step starts, -1: none; lag (W, S), s, from their moment to the start of the step
+    place       (W, S, 2) of the object at the end of each step, NaN where unknown
+    recorded    the tracks of the recordings, and the step
+    """
+
+    start: IntArray
+    label: StrArray
+    neighbours: IntArray
+    lag: FloatArray
+    place: FloatArray
+    recorded: _Shared
+
+    @property
+    def known(self) -> BoolArray:
+        """(W, S) whether the place is known."""
+        return np.asarray(np.isfinite(self.place[..., 0]))
+
+    def sampled(self, most: int, seed: int) -> Self:
+        """At most `most` of the gaps, chosen at random."""
+        if len(self) <= most:
+            return self
+        return self.select(np.sort(np.random.default_rng(seed).choice(len(self), most, replace=False)))
+
+    @classmethod
+    def pooled(cls, parts: Sequence[HiddenObjects]) -> HiddenObjects:
+        """The gaps of several recordings."""
+        recorded = RecordedTracks.concatenate([part.recorded.tracks for part in parts])
+        first = np.cumsum([0, *(len(part.recorded.tracks.mean) for part in parts)])
+        moved = [
+            replace(
+                part,
+                start=part.start + n,
+                neighbours=np.where(part.neighbours >= 0, part.neighbours + n, -1),
+                recorded=_Shared(recorded, part.recorded.step),
+            )
+            for part, n in zip(parts, first, strict=False)
+        ]
+        return cls.concatenate(moved)
+
+    def predict(self, settings: TrackerSettings, rules: Sequence[EdgeRule]) -> GapPrediction:
+        """Predict all hidden tracks by a tracker's settings and these rules.
+
+        Raises `InputError` for classes that move nonlinearly, and for rules that act on accelerations nonlinearly.
+        """
+        if settings.nonlinear(rules):
+            raise InputError("expected linear motions and interactions to learn with, got nonlinear ones")
+        W, S = self.place.shape[:2]
+        found = GapPrediction(np.full((W, S, 2), np.nan), np.full((W, S, 2, 2), np.nan))
+        last = S - self.known[:, ::-1].argmax(axis=1)
+        order = np.argsort(np.where(self.known.any(axis=1), -last, 1), kind="stable")
+        active = [int((last[self.known.any(axis=1)] > s).sum()) for s in range(S)]
+        recorded, step = self.recorded
+        side = int(np.ceil(np.sqrt(max(W, 1))))
+        shift = APART * np.stack(np.divmod(np.arange(W), side), axis=1) - recorded.mean[self.start, :2]
+        hidden = _placed(recorded.select(self.start[order]), np.arange(W), shift[order], 0.0)
+        state = TrackerState(settings, ())
+        for s in range(S):
+            n = active[s]
+            if n == 0:
+                break
+            hidden, rows = hidden.select(slice(0, n)), order[:n]
+            parts = [hidden]
+            if rules:
+                gap, column = np.nonzero(self.neighbours[rows, s] >= 0)
+                around = recorded.select(self.neighbours[rows[gap], s, column])
+                around.mean[:, :2] += around.mean[:, 2:4] * self.lag[rows[gap], s, None]
+                ids = n + np.arange(len(gap))
+                parts.append(_placed(around, ids, shift[rows[gap]], s * step))
+            scene = RecordedTracks.concatenate(parts)
+            marginals: Any = Marginals(scene.mean, scene.P, wanted=n)
+            state.rules = tuple(_Onto(rule, n) for rule in rules)
+            state.time, state.table = s * step, scene.table
+            state.joint = JointTrackState(marginals, partial(motion_of, settings))
+            predict(state, (s + 1) * step)
+            now = state.reported_kinematics()
+            found.position[rows, s], found.P[rows, s] = now.position[:n] - shift[rows], now.P[:n]
+            hidden = RecordedTracks(state.table.select(slice(0, n)), marginals.means[:n], marginals.covariances[:n])
+        return found
+
+
+def _placed(tracks: RecordedTracks, ids: IntArray, shift: FloatArray, time: float) -> RecordedTracks:
+    """Rows with other ids, shifted, their times counted from `time` before."""
+    table = tracks.table
+    table.id = ids
+    table.stationarity.position = table.stationarity.position + shift
+    for name in ("initiated", "last_detected", "last_in_view"):
+        setattr(table, name, getattr(table, name) + time)
+    mean = tracks.mean.copy()
+    mean[:, :2] += shift
+    return RecordedTracks(table, mean, tracks.P)
+
+
+def hidden_objects(
+    scene: Scene,
+    tracker: TrackerSettings,
+    sensors: Mapping[str, Sensor],
+    settings: GapSettings | None = None,
+) -> HiddenObjects | None:
+    """All gaps of the labelled objects of a scene that a tracker without edges follows; None where there are none.
+
+    Raises `InputError` for a scene without ground truth.
+    """
+    settings = settings or GapSettings()
+    labels = LabelledPlaces.of(scene)
+    parts, moments, held = recorded_tracks(scene, tracker, sensors, labels)
+    if not parts:
+        return None
+    recorded = RecordedTracks.concatenate(parts)
+    first = np.cumsum([0, *map(len, (part.mean for part in parts))])
+    steps = max(1, round(settings.longest / settings.step))
+    starts, latest = [], -np.inf
+    for k, time in enumerate(moments):
+        if time - latest >= settings.spacing - 1e-6:
+            latest = time
+            starts.append(k)
+    columns: list[tuple[IntArray, StrArray, IntArray, FloatArray, FloatArray]] = []
+    for k in starts:
+        times = moments[k] + settings.step * np.arange(steps + 1)
+        followed = -parts[k].table.initiated >= settings.followed - 1e-6
+        rows = np.flatnonzero((held[k] >= 0) & followed)
+        place = np.stack([labels.at(t)[held[k][rows]] for t in times[1:]], axis=1)
+        rows, place = rows[np.isfinite(place[..., 0]).any(axis=1)], place[np.isfinite(place[..., 0]).any(axis=1)]
+        near, lag = np.full((len(rows), steps, settings.neighbours), -1), np.zeros((len(rows), steps))
+        for s in range(steps):
+            m = int(np.argmin(np.abs(moments - times[s])))
+            if abs(moments[m] - times[s]) > settings.step:
+                continue
+            lag[:, s] = times[s] - moments[m]
+            expected = parts[k].mean[rows, :2] + parts[k].mean[rows, 2:4] * (times[s] - times[0])
+            apart = np.hypot(*np.moveaxis(parts[m].mean[None, :, :2] - expected[:, None], -1, 0))
+            same = parts[m].table.id[None] == parts[k].table.id[rows][:, None]
+            apart[same | (apart > settings.reach)] = np.inf
+            nearest = np.argsort(apart, axis=1)[:, : settings.neighbours]
+            there = np.isfinite(np.take_along_axis(apart, nearest, axis=1))
+            near[:, s, : nearest.shape[1]] = np.where(there, first[m] + nearest, -1)
+        columns.append((first[k] + rows, parts[k].table.label[rows], near, lag, place))
+    start, label, near, lag, place = (np.concatenate(column) for column in zip(*columns, strict=True))
+    found = HiddenObjects(start, label, near, lag, place, _Shared(recorded, settings.step))
+    return found if len(found) else None

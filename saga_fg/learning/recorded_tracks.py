@@ -1,0 +1,108 @@
+"""The tracks of a tracker without edges along a recording, frame by frame, and the labelled objects that they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.model.sensor import Sensor
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.assignment import assign
+from saga_fg.numerics.columns import Columns
+from saga_fg.tracking import Tracker, TrackerSettings
+from saga_fg.tracking.sensor_evidence import SensorEvidence
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.dataset import Scene
+
+GATE = 2.0  # m, from a track to its object
+
+
+@dataclass(eq=False)
+class RecordedTracks(Columns):
+    """n tracks at some moments of a recording, as the tracker had them.
+
+    table         their rows; without the evidence of sensors, with times counted from the moment
+    mean, P       (n, D), (n, D, D) of their states, padded to the largest
+    """
+
+    table: TrackTable
+    mean: FloatArray
+    P: FloatArray
+
+
+class LabelledPlaces(NamedTuple):
+    """K labelled moments of N objects: time (K,), label (N,), position (K, N, 2), m, world, NaN where not labelled."""
+
+    time: FloatArray
+    label: StrArray
+    position: FloatArray
+
+    @classmethod
+    def of(cls, scene: Scene) -> Self:
+        if scene.ground_truth is None:
+            raise InputError(f"scene {scene.name}: expected ground truth, there is none")
+        names = np.unique(np.concatenate([moment.id for moment in scene.ground_truth]))
+        position, label = np.full((len(scene), len(names), 2), np.nan), np.full(len(names), "", dtype="U64")
+        for k, moment in enumerate(scene.ground_truth):
+            rows = np.searchsorted(names, moment.id)
+            position[k, rows], label[rows] = moment.boxes.position[:, :2], moment.boxes.label
+        return cls(scene.timestamps, label, position)
+
+    def at(self, time: float) -> FloatArray:
+        """(N, 2) interpolated between the moments before and after; NaN beyond the recording."""
+        k = int(np.searchsorted(self.time, time - 1e-6))
+        if k == len(self.time) or (k == 0 and time < self.time[0] - 1e-6):
+            return np.full(self.position.shape[1:], np.nan)
+        if k == 0 or abs(self.time[k] - time) < 1e-6:
+            return np.asarray(self.position[k])
+        share = (self.time[k] - time) / (self.time[k] - self.time[k - 1])
+        return np.asarray(share * self.position[k - 1] + (1 - share) * self.position[k])
+
+
+def recorded_tracks(
+    scene: Scene, settings: TrackerSettings, sensors: Mapping[str, Sensor], labels: LabelledPlaces
+) -> tuple[list[RecordedTracks], FloatArray, list[IntArray]]:
+    """The tracks after each frame, in world coordinates; the times of the frames; the object of each track, -1: none.
+
+    Only tracks that were just detected hold an object.
+    """
+    settings = replace(settings, edges=(), providers=(), estimator="kalman")
+    tracker = Tracker(settings, sensors)
+    state = TrackerState(settings, ())
+    parts, times, held = [], [], []
+    for frame in scene.frames:
+        tracker.step(frame)
+        if tracker.time_verdict == "late":
+            continue
+        state.restore(tracker.snapshot())
+        table, time = state.table, state.start + state.time
+        if len(table) == 0:
+            continue
+        kinds = state.joint.rows_by_type(table.label)
+        D = max(kind.dim for kind, _ in kinds)
+        mean, P = np.zeros((len(table), max(D, 6))), np.zeros((len(table), max(D, 6), max(D, 6)))
+        for kind, rows in kinds:
+            mean[rows, : kind.dim] = state.joint.estimator.mean(table.id[rows])
+            P[rows, : kind.dim, : kind.dim] = state.joint.estimator.covariance(table.id[rows])
+        position = mean[:, :2] + state.origin
+        truth = labels.at(time)
+        apart = np.hypot(*np.moveaxis(position[:, None] - truth[None], -1, 0))
+        fresh = table.last_detected >= state.time - 1e-6
+        possible = fresh[:, None] & (table.label[:, None] == labels.label) & (np.nan_to_num(apart, nan=np.inf) < GATE)
+        row, column = assign(np.nan_to_num(apart, nan=1e9), possible, unmatched=GATE)
+        owner = np.full(len(table), -1)
+        owner[row] = column
+        mean[:, :2] = position
+        table.stationarity.position = table.stationarity.position + state.origin
+        for name in ("initiated", "last_detected", "last_in_view"):
+            setattr(table, name, getattr(table, name) - state.time)
+        table.sensors = SensorEvidence.empty(len(table))
+        parts.append(RecordedTracks(table, mean, P))
+        times.append(time)
+        held.append(owner)
+    return parts, np.array(times), held
