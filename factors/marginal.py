@@ -15,7 +15,7 @@ in place of coordinates, shrink both errors alike.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal, get_args
 
 import gtsam
@@ -69,6 +69,38 @@ def marginal_moments(
     except np.linalg.LinAlgError as error:
         raise singular_system(graph, error) from error
     return mean, root @ root.T
+
+
+def block_covariances(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> dict[int, FloatArray]:
+    """Return the covariances (d, d) of all variables, one by one, in one pass from the roots of a tree to its leaves.
+
+    dims: of the variables. With x_F = R^-1 (d - S x_S) for the frontal variables of a clique and its separator,
+
+        G = -R^-1 S,     Sigma_FS = G Sigma_SS,     Sigma_FF = R^-1 R^-T + G Sigma_SS G^T
+
+    The separator is part of the clique above, so that nothing but the blocks of the tree is ever computed (Takahashi,
+    Fagan, Chin 1973; Kaess and Dellaert, Robotics and Autonomous Systems 2009). Raises `FactorError` for a tree whose
+    variables have other dimensions.
+    """
+    found: dict[int, FloatArray] = {}
+    waiting = [(clique, np.empty((0, 0)), dict[int, slice]()) for clique in tree.roots()]
+    while waiting:
+        clique, above, place = waiting.pop()
+        conditional = clique.conditional()
+        keys, R = list(conditional.keys()), conditional.R()
+        ends = np.cumsum([0, *(dims.get(key, 0) for key in keys)])
+        count = int(np.searchsorted(ends, len(R)))
+        if ends[-1] != len(R) + conditional.S().shape[1] or ends[count] != len(R):
+            raise FactorError(f"dims: expected the dimensions of {format_keys(keys)}")
+        rows = np.r_[tuple(place[key] for key in keys[count:])] if len(keys) > count else np.empty(0, dtype=np.int64)
+        of_separator, inverse = above[rows[:, None], rows], np.linalg.inv(R)
+        G = -inverse @ conditional.S()
+        across = G @ of_separator
+        joint = np.block([[inverse @ inverse.T + across @ G.T, across], [across.T, of_separator]])
+        place = {key: slice(start, stop) for key, start, stop in zip(keys, ends[:-1], ends[1:], strict=True)}
+        found.update({key: joint[place[key], place[key]] for key in keys[:count]})
+        waiting += [(clique[k], joint, place) for k in range(clique.nrChildren())]
+    return found
 
 
 def _solve(

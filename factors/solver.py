@@ -28,7 +28,7 @@ import numpy as np
 
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import check_dimensions, native_factor
-from factors.marginal import marginal_moments
+from factors.marginal import block_covariances, marginal_moments
 from factors.nonlinear import Linearisable
 from factors.singular import singular_system
 from factors.validation import FloatArray, format_keys
@@ -86,6 +86,14 @@ class Solution:
             return np.asarray(self._tree.marginalCovariance(key))
         except RuntimeError:  # Cholesky squares the condition number, which objects hardly seen make large
             return marginal_moments(self.linear, [key], "qr")[1]
+
+    def marginals(self) -> dict[int, FloatArray]:
+        """Return the covariances (d, d) of all variables, by key."""
+        try:
+            tree = self._tree
+        except RuntimeError:
+            tree = self.linear.eliminateMultifrontal(function=gtsam.EliminateQR)
+        return block_covariances(tree, self.values.dims())
 
     @cached_property
     def _tree(self) -> gtsam.GaussianBayesTree:

@@ -1,5 +1,5 @@
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
-from .model.motion import ConstantAcceleration, ConstantVelocity, NodeType, RandomWalk
+from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
 from .tracking import GreedyTracker, Tracker, TrackerSettings
@@ -16,6 +16,7 @@ __all__ = [
     "Boxes",
     "ConstantAcceleration",
     "ConstantVelocity",
+    "Curvilinear",
     "Dataset",
     "Detection",
     "Detections",

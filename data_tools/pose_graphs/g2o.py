@@ -14,6 +14,7 @@ hold; as the first pose is always held, it has no effect. Empty lines and those 
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,10 @@ from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.types.boxes import MAX_POSITION
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
+_SLIGHT = 1e-4  # share of the largest eigenvalue by which the smallest may be negative: four digits are rounded so
+_LEAST = 1e-9  # share of the largest eigenvalue that it is then raised to
+_ENDS = ((0, "first"), (1, "second"))
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -48,9 +53,11 @@ _TAGS = {tag: layout for layout in (_PLANAR, _SPATIAL) for tag in (layout.vertex
 def read_g2o(path: str | Path) -> PoseGraph:
     """Read a pose graph; poses come in the order of their ids.
 
+    A file of measurements alone starts at dead reckoning along them. An information matrix with an eigenvalue that is
+    0 or slightly negative, as rounded ones have, is projected to a positive definite one, with a warning.
     Raises `InputError` naming the line for an unknown record, a wrong number of columns, a number that is none or too
-    large, a quaternion off the unit sphere, a pose given twice or missing, or an information matrix that is not
-    positive definite.
+    large, a quaternion off the unit sphere, a pose given twice or missing, or an information matrix with an eigenvalue
+    that is clearly negative.
     """
     file = Path(path)
     tables = _records(file)
@@ -58,28 +65,26 @@ def read_g2o(path: str | Path) -> PoseGraph:
     if not tables or len(planar) not in (0, len(tables)):
         raise InputError(f"{file}: expected poses and edges, all in the plane (SE2) or all in space (SE3:QUAT)")
     layout = _PLANAR if planar else _SPATIAL
-    if layout.vertex not in tables or layout.edge not in tables:
-        missing = layout.edge if layout.vertex in tables else layout.vertex
-        raise InputError(f"{file}: expected {missing} records, there are none")
-    vertices, edges = tables[layout.vertex], tables[layout.edge]
+    if layout.edge not in tables:
+        raise InputError(f"{file}: expected {layout.edge} records, there are none")
+    edges, n = tables[layout.edge], len(layout.pose)
+    between, information = _transforms(edges, 2, layout), _information(edges, 2 + n, layout)
+    if layout.vertex not in tables:
+        named = np.stack([edges.integers(column, name, 0, 2**62) for column, name in _ENDS])
+        ids, rows = np.unique(named, return_inverse=True)
+        first, second = rows.reshape(named.shape)
+        _check_ends(edges, first, second)
+        return PoseGraph.of_measurements(ids, first, second, between, information)
+    vertices = tables[layout.vertex]
     ids = vertices.integers(0, "id", 0, 2**62)
     order = np.argsort(ids, kind="stable")
     twice = np.flatnonzero(ids[order][1:] == ids[order][:-1])
     if len(twice):
         row = int(order[twice[0] + 1])
         raise vertices.fault(row, f"id: pose {ids[row]} is given twice")
-    first, second = (_rows(edges, column, name, ids[order]) for column, name in ((0, "first"), (1, "second")))
-    if (first == second).any():
-        raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
-    n = len(layout.pose)
-    return PoseGraph(
-        ids[order],
-        _transforms(vertices, 1, layout)[order],
-        first,
-        second,
-        _transforms(edges, 2, layout),
-        _information(edges, 2 + n, layout),
-    )
+    first, second = (_rows(edges, column, name, ids[order]) for column, name in _ENDS)
+    _check_ends(edges, first, second)
+    return PoseGraph(ids[order], _transforms(vertices, 1, layout)[order], first, second, between, information)
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> None:
@@ -126,6 +131,11 @@ def _records(file: Path) -> dict[str, TextTable]:
     return {tag: TextTable.of(file, rows, lines) for tag, (rows, lines) in found.items()}
 
 
+def _check_ends(edges: TextTable, first: IntArray, second: IntArray) -> None:
+    if (first == second).any():
+        raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
+
+
 def _rows(edges: TextTable, column: int, name: str, ids: IntArray) -> IntArray:
     """Rows of the poses that a column of the edges names."""
     named = edges.integers(column, name, 0, 2**62)
@@ -164,14 +174,27 @@ def _information(edges: TextTable, column: int, layout: _Layout) -> FloatArray:
     entries = edges.numbers(slice(column, column + len(names)), names)
     matrix = np.zeros((len(entries), k, k))
     matrix[:, upper[0], upper[1]] = matrix[:, upper[1], upper[0]] = entries
-    smallest = np.linalg.eigvalsh(matrix)[:, 0]
-    if (smallest <= 0).any():
-        row = int(np.argmax(smallest <= 0))
+    tangent = np.array(layout.tangent)
+    return _definite(edges, matrix)[:, tangent[:, None], tangent]
+
+
+def _definite(edges: TextTable, matrix: FloatArray) -> FloatArray:
+    """Project matrices (M, k, k) that are nearly positive definite."""
+    values, vectors = np.linalg.eigh(matrix)
+    smallest, largest, k = values[:, 0], values[:, -1], matrix.shape[1]
+    bad = (smallest < -_SLIGHT * largest) | (largest <= 0)
+    if bad.any():
+        row = int(np.argmax(bad))
         raise edges.fault(
             row, f"I11 ... I{k}{k}: expected a positive definite matrix, smallest eigenvalue {smallest[row]:.3g}"
         )
-    tangent = np.array(layout.tangent)
-    return matrix[:, tangent[:, None], tangent]
+    near = np.flatnonzero(smallest <= 0)
+    if len(near):
+        example = edges.fault(int(near[0]), f"smallest eigenvalue {smallest[near[0]]:.3g}")
+        log.warning("%s; so of %d information matrices, which are made positive definite", example, len(near))
+        raised = np.maximum(values[near], _LEAST * largest[near, None])
+        matrix[near] = (vectors[near] * raised[:, None]) @ vectors[near].swapaxes(1, 2)
+    return matrix
 
 
 def _columns(T: FloatArray) -> FloatArray:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from pipelines.cli.console import working
 from pipelines.cli.options import Verbose
 from pipelines.cli.summary import counted
+
+if TYPE_CHECKING:
+    from saga_fg.numerics.arrays import IntArray
 
 Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 
@@ -24,6 +27,16 @@ def g2o(
     isam2_batch: Annotated[
         int, typer.Option("--isam2-batch", min=1, help="Poses that iSAM2 is given with each update.")
     ] = 10,
+    certify: Annotated[
+        bool,
+        typer.Option("--certify", help="Find the global minimum of the chordal cost too, start from it, and prove it."),
+    ] = False,
+    covariances: Annotated[
+        str,
+        typer.Option(
+            "--covariances", metavar="all|last|none|IDS", help="Poses in covariances.csv: IDS with commas between them."
+        ),
+    ] = "all",
     robust: Annotated[
         Loss | None,
         typer.Option("--robust", help="Loss over the measurements that do not join successive poses: false loops."),
@@ -41,6 +54,7 @@ def g2o(
     Examples:
       saga-fg slam g2o sphere2500.g2o --output sphere
       saga-fg slam g2o MIT.g2o --output MIT --compare
+      saga-fg slam g2o CSAIL.g2o --output CSAIL --certify --covariances last
       saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
     """
     from data_tools.files.atomic_files import check_writable_folder
@@ -52,6 +66,8 @@ def g2o(
     from saga_fg.errors import InputError
     from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
 
+    if robust is not None and certify:
+        raise InputError("--certify: expected without --robust, the proof is for squared errors")
     if robust is not None and compare:
         raise InputError("--compare: expected without --robust, GTSAM's optimisers are run without a loss")
     if not 0 < robust_scale < math.inf:
@@ -60,17 +76,37 @@ def g2o(
     loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
-        optimised = optimise_poses(graph, loss)
-        covariances = optimised.covariances()
+        rows = _rows(covariances, graph.ids)
+        optimised = optimise_poses(graph, loss, certify)
+        blocks = optimised.covariances(rows)
     guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):
             errors["GTSAM Levenberg-Marquardt"] = levenberg_marquardt(graph)
             errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
-    write_pose_graph(output, graph, optimised, covariances, errors)
+    write_pose_graph(output, graph, optimised, rows, blocks, errors)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
     typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (guess in the file {guess:.6g})")
+    if (minimum := optimised.chordal) is not None:
+        proven = "the global minimum" if minimum.certified else "not proven to be the global minimum"
+        typer.echo(f"chordal cost {minimum.cost:.8g}, {proven}: no poses below {minimum.bound:.8g}")
     for name, error in errors.items():
         if name.startswith("GTSAM"):
             typer.echo(f"{name}: error {error:.6g}, ours is {optimised.error / error:.4f} times that")
+
+
+def _rows(chosen: str, ids: IntArray) -> IntArray:
+    """Rows of the poses whose covariances are wanted."""
+    import numpy as np
+
+    from saga_fg.errors import InputError
+
+    if chosen in ("all", "last", "none"):
+        return {"all": np.arange(len(ids)), "last": np.array([len(ids) - 1]), "none": np.arange(0)}[chosen]
+    known = {str(name): row for row, name in enumerate(ids.tolist())}
+    names = [name.strip() for name in chosen.split(",")]
+    for name in names:
+        if name not in known:
+            raise InputError(f"--covariances: expected all, last, none or ids of poses with commas, got {name!r:.40}")
+    return np.array([known[name] for name in names])

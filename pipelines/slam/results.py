@@ -28,7 +28,7 @@ from data_tools.plots import paths_from_above, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
 from pipelines.slam.joint import JointRun
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
 from saga_fg.types.landmark import Landmark
@@ -128,16 +128,27 @@ def write_joint(output: Path, run: JointRun) -> None:
 
 
 def write_pose_graph(
-    output: Path, graph: PoseGraph, optimised: OptimisedPoses, covariances: FloatArray, errors: Mapping[str, float]
+    output: Path,
+    graph: PoseGraph,
+    optimised: OptimisedPoses,
+    rows: IntArray,
+    covariances: FloatArray,
+    errors: Mapping[str, float],
 ) -> None:
-    """Write poses.g2o, the graph with its optimised poses, their covariances relative to the first, and errors.json.
+    """Write poses.g2o, the graph with its optimised poses, and errors.json.
 
+    covariances (n, k, k) of poses `rows` (n,), relative to the first one: covariances.csv, unless there are none
     errors: by name: of each start, of the guess itself, of the baselines where they were run
     """
-    d = graph.dim
+    d, minimum = graph.dim, optimised.chordal
+    figures: dict[str, object] = {"best": optimised.start, **errors}
+    if minimum is not None:
+        names = ("cost", "bound", "gap", "certified", "eigenvalue", "dimensions")
+        figures["chordal"] = {name: getattr(minimum, name) for name in names}
     paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
     with atomic_directory(output) as folder:
         write_g2o(folder / "poses.g2o", graph.at(optimised.world_T_pose))
-        write_covariances(folder / "covariances.csv", "id", graph.ids.tolist(), covariances)
-        write_figures(folder / "errors.json", {"best": optimised.start, **errors})
+        if len(rows):
+            write_covariances(folder / "covariances.csv", "id", graph.ids[rows].tolist(), covariances)
+        write_figures(folder / "errors.json", figures)
         write_bytes(folder / "above.png", png(paths_from_above(paths)))

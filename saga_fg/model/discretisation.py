@@ -37,7 +37,7 @@ from saga_fg.errors import InputError
 from saga_fg.model.motion import NodeType, distinct_types
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 LONGEST = 1e12  # s; longer than any two timestamps are apart
 _TAYLOR_DEGREE = 12
@@ -89,20 +89,40 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
             if edges.A_other.shape[1] == d and edges.rate.any():
                 F.append(_coupling_blocks(edges, dt, M, phi, position, kinds, kind))
     if graph.modes:
-        _move_by_modes(graph, dt, F, b, Q, offsets)
+        _move_by_modes(graph, dt, F, b, Q, offsets, coupled)
     return Transition(graph, dt, _merged(F, len(graph)), b, tuple(Q))
 
 
+def own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
+    """F (d, d) and Q (d, d) of a node without edges over `dt` s."""
+    return linear_motion(node_type.generator, node_type.diffusion, dt, node_type.nilpotency)
+
+
+def linear_motion(
+    generator: FloatArray, diffusion: FloatArray, dt: float, nilpotency: int | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """F = exp(A dt) and Q = int_0^dt exp(A s) Qc exp(A s)^T ds of a generator A (d, d) and a diffusion Qc (d, d)."""
+    (F,), Q = _phi_and_noise(generator[None], diffusion[None], dt, 0, nilpotency)
+    return F[0], Q[0]
+
+
 def _move_by_modes(
-    graph: SceneGraph, dt: float, F: list[Blocks], b: FloatArray, Q: list[Blocks], offsets: IntArray
+    graph: SceneGraph,
+    dt: float,
+    F: list[Blocks],
+    b: FloatArray,
+    Q: list[Blocks],
+    offsets: IntArray,
+    coupled: BoolArray,
 ) -> None:
-    """Put the recorded motions of mixtures in place of those of their types: G_i = F_ii exp(-A_i dt) acts on them."""
+    """Put the recorded motions in place of those of their types: G_i = F_ii exp(-A_i dt) acts on them, I if alone."""
     for record in graph.modes:
         rows = graph.rows(record.ids)
         if len(rows) == 0:
             continue
         own = record.predicted(dt, graph.diffusion_scale[rows])[1]
-        back = scipy.linalg.expm(-graph.types[rows[0]].generator * dt)
+        alone = np.eye(own.F.shape[1])
+        back = scipy.linalg.expm(-graph.types[rows[0]].generator * dt) if coupled[rows].any() else alone
         place = np.full(len(graph), -1)
         place[rows] = np.arange(len(rows))
         G = np.empty_like(own.F)
@@ -110,7 +130,7 @@ def _move_by_modes(
             mine = np.flatnonzero((place[blocks.target] >= 0) & (blocks.target == blocks.source))
             if len(mine):
                 at, values = place[blocks.target[mine]], blocks.values.copy()
-                G[at] = values[mine] @ back
+                G[at] = np.where(coupled[blocks.target[mine], None, None], values[mine] @ back, alone)
                 values[mine] = G[at] @ own.F[at]
                 F[number] = Blocks(blocks.target, blocks.source, values)
         b[offsets[rows][:, None] + np.arange(own.b.shape[1])] += (G @ own.b[:, :, None])[:, :, 0]

@@ -21,7 +21,10 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
-from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting
+from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting
+
+_LATERAL_FADING = 0.1  # s, with which an acceleration fades that is not along a vehicle's heading
+_LATERAL_DEVIATION = 0.1  # m/s^2, so that what is left of it stays uncertain
 
 
 class Motion(Protocol):
@@ -52,6 +55,11 @@ class NonlinearMotion(Motion, Protocol):
 def _planar(one_axis: ArrayLike) -> FloatArray:
     """The matrix of one axis, for x and y: components alternate x, y."""
     return np.asarray(np.kron(np.asarray(one_axis), np.eye(2)), dtype=np.float64)
+
+
+def _fading(time_constant: float) -> FloatArray:
+    """Generator (3, 3) of position, velocity and an acceleration that fades, along one axis."""
+    return np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / time_constant]])
 
 
 @dataclass(frozen=True)
@@ -96,11 +104,73 @@ class ConstantAcceleration(Settings):
 
     @property
     def generator(self) -> FloatArray:
-        return _planar([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / self.fading_time]])
+        return _planar(_fading(self.fading_time))
 
     @property
     def diffusion(self) -> FloatArray:
         return _planar(np.diag([0.0, 0.0, self.jerk_noise]))
+
+
+@dataclass(frozen=True)
+class Curvilinear(Settings):
+    """Motion of a vehicle along a curved path: it accelerates along its heading, and turns as its headings do.
+
+    The acceleration along the heading fades (Singer 1970), that across it is that of the turn. White noise
+    acceleration, which differs along and across the heading, acts besides. The heading and the turn rate are known
+    inputs of an interval (`saga_fg.model.known_course`); where they are missing the motion is straight and its noise
+    the same in all directions. Source of the split: Best and Norton, A new model and efficient tracker for a target
+    with curvilinear motion, IEEE Transactions on Aerospace and Electronic Systems 33(3), 1997.
+    """
+
+    acceleration_noise: NonNegative = setting(
+        1.0,
+        "spectral density of the white acceleration along the heading, m^2/s^3; usual 0.3 to 3; higher: follows "
+        "detections faster",
+    )
+    lateral_acceleration_noise: NonNegative = setting(
+        0.07,
+        "spectral density of the white acceleration across the heading, m^2/s^3; usual 0.03 to 0.3; higher: follows "
+        "lane changes faster",
+    )
+    jerk_noise: NonNegative = setting(
+        0.03,
+        "spectral density of the jerk along the heading, m^2/s^5; usual 0.01 to 2; higher: follows changes of "
+        "acceleration faster",
+    )
+    fading_time: PositiveOrInf = setting(
+        8.0, "time constant with which the acceleration fades, s; usual 1 to 10; .inf: never"
+    )
+    turn_time: NonNegative = setting(
+        6.0,
+        "time constant with which a turn seen in the headings fades, s; usual 1 to 8, 0: none; higher: longer curves",
+    )
+    turning_share: Fraction = setting(
+        0.3, "share of objects that turn; usual 0.1 to 0.5; higher: small turn rates are believed sooner"
+    )
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        return ("x", "y", "vx", "vy", "ax", "ay")
+
+    @property
+    def generator(self) -> FloatArray:
+        return _planar(_fading(self.fading_time))
+
+    @property
+    def diffusion(self) -> FloatArray:
+        white = (self.acceleration_noise + self.lateral_acceleration_noise) / 2
+        return _planar(np.diag([0.0, white, self.jerk_noise / 2]))
+
+    @property
+    def along(self) -> tuple[FloatArray, FloatArray]:
+        """Generator and diffusion (3, 3) of position, velocity and acceleration along the heading."""
+        return _fading(self.fading_time), np.diag([0.0, self.acceleration_noise, self.jerk_noise])
+
+    @property
+    def across(self) -> tuple[FloatArray, FloatArray]:
+        """Generator and diffusion (3, 3) across the heading, where an acceleration fades at once: turns are known."""
+        jerk = 2 * _LATERAL_DEVIATION**2 / _LATERAL_FADING
+        return _fading(_LATERAL_FADING), np.diag([0.0, self.lateral_acceleration_noise, jerk])
 
 
 @dataclass(frozen=True)

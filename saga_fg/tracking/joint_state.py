@@ -15,7 +15,7 @@ import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
-from saga_fg.model.discretisation import discretise
+from saga_fg.model.discretisation import discretise, own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.motion import Motion, NodeType
@@ -25,7 +25,7 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.kinematics import Kinematics, RelativePositions
 from saga_fg.tracking.names import EstimatorName
-from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
+from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.types.frame import Frame
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m

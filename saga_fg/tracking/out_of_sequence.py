@@ -11,17 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.model.discretisation import discretise
+from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION
 from saga_fg.model.motion import NodeType
-from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray
-
-
-def own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
-    """F (d, d) and Q (d, d) of a node without edges over `dt` s."""
-    transition = discretise(SceneGraph.of([0], node_type), dt)
-    return transition.F[0].values[0], transition.Q[0].values[0]
 
 
 def moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from saga_fg.model.edge_rules import build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.known_turn import KnownTurns, turns_as_known
+from saga_fg.model.known_course import KnownCourses
+from saga_fg.model.motion import Curvilinear
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.deletion import untrackable
@@ -21,7 +22,6 @@ from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
 
-LEAST_TURN = 0.01  # rad/s; less is straight on: 0.2 m aside in 2 s at 10 m/s, within the noise of a detection
 MOST_STEPS = 100  # that an interval is predicted in
 
 
@@ -52,9 +52,8 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
     state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
-    state.graph = replace(state.graph, modes=_known_turns(state))
+    state.graph = replace(state.graph, modes=_known_courses(state, dt))
     state.joint.predict(state.graph, dt)
-    table.turn.predict(dt, state.class_values(table.label, "turn_time")[0])
     table.box.turn_with(before, state.kinematics().velocity, unseen)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
@@ -69,18 +68,25 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
     return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
 
 
-def _known_turns(state: TrackerState) -> tuple[KnownTurns, ...]:
-    """The turns of moving tracks whose classes turn, by motion and time constant."""
-    table = state.table
-    fading_time, rate = state.class_values(table.label, "turn_time")[0], table.turn.known()
-    turning = (fading_time > 0) & (np.abs(rate) > LEAST_TURN) & (np.hypot(*state.kinematics().velocity.T) > MOVING)
-    found = []
-    for node_type, rows in state.joint.rows_by_type(table.label[turning], moving=True) if turning.any() else []:
-        rows = np.flatnonzero(turning)[rows]
-        if turns_as_known(node_type):
-            for time in np.unique(fading_time[rows]).tolist():
-                same = rows[fading_time[rows] == time]
-                found.append(KnownTurns(node_type, table.id[same], rate[same], time))
+def _known_courses(state: TrackerState, dt: float) -> tuple[KnownCourses, ...]:
+    """The courses of vehicles with a heading over the next `dt` s, by motion; their turn rates are predicted after."""
+    table, velocity = state.table, state.kinematics().velocity
+    turn_time, found = np.zeros(len(table)), []
+    for node_type, rows in state.joint.rows_by_type(table.label, moving=True):
+        motion = node_type.motion
+        if not isinstance(motion, Curvilinear):
+            continue
+        turn_time[rows] = motion.turn_time
+        rows = rows[np.isfinite(table.box.yaw[rows])]
+        if len(rows):
+            rate, variance = table.turn.known(rows, motion.turning_share)
+            turns = (motion.turn_time > 0) & (np.hypot(*velocity[rows].T) > MOVING)
+            rate, variance = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0)
+            mean = state.joint.estimator.mean(table.id[rows])
+            heading = table.box.yaw[rows]
+            found.append(KnownCourses.of(node_type, table.id[rows], heading, rate, variance, mean, dt))
+    if turn_time.any():
+        table.turn.predict(dt, turn_time)
     return tuple(found)
 
 

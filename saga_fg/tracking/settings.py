@@ -10,7 +10,7 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
 from saga_fg.model.modes import Mixture
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NonlinearMotion, RandomWalk
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.road.cones import ConeLine
@@ -41,9 +41,12 @@ from saga_fg.types.signal import SignalSettings
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
-    motion: ConstantVelocity | ConstantAcceleration | RandomWalk | CoordinatedTurn | Bicycle | Mixture = settings_group(
-        lambda: ConstantVelocity(acceleration_noise=2.0),
-        "motion model of the class; random_walk for objects that never move, such as cones",
+    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Bicycle | Mixture = (
+        settings_group(
+            lambda: ConstantVelocity(acceleration_noise=2.0),
+            "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
+            "never move, such as cones",
+        )
     )
     initial_speed_deviation: Positive = setting(
         5.0, "standard deviation of the velocity of a new track along its heading, m/s; usual 1 (pedestrians) to 8"
@@ -84,10 +87,6 @@ class ClassSettings(Settings):
         1.2,
         "delete a track this long after its last detection, s, unless it can be re-linked; usual 1 to 2; higher: "
         "doubtful tracks live longer",
-    )
-    turn_time: NonNegative = setting(
-        0.0,
-        "time constant with which a turn seen in the headings fades, s; usual 1 to 3, 0: none; higher: longer curves",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"

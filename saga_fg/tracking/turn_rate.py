@@ -6,7 +6,8 @@ r"""Turn rates of tracks from their measured headings, each estimated by itself 
 S is the variance of the innovation z - h; beyond twice its expected deviation a heading is an outlier and counts less.
 
 A heading may be off by half a turn, and is turned to the side of the estimate. Most objects go straight most of the
-time, while w is noise. So what is predicted with is the mean of w under the prior that a share of objects turns:
+time, while w is noise. So what is predicted with is the mean of w, and its variance, under the prior that a share of
+objects turns, `Curvilinear.turning_share`:
 
     w_known = w ( g sigma_t^2 / (P + sigma_t^2) + (1 - g) sigma_s^2 / (P + sigma_s^2) ),   g = P(turns | w)
 
@@ -25,7 +26,6 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
 
 DEVIATION = 0.15  # rad/s, stationary standard deviation of a rate: a bend of 50 m at 7 m/s
-TURNING_SHARE = 0.1  # share of objects that turn: most roads are straight, and most that turn do so briefly
 TURNING = 0.3  # rad/s, deviation of their rates: a crossing is a quarter turn in some 5 s
 STRAIGHT = 0.01  # rad/s, deviation of the others' rates: corrections within the lane
 _LEAST_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
@@ -81,10 +81,13 @@ class TurnRate(Columns):
         self.rate[rows] += gain[:, 1] * innovation
         self.P[rows] = P - gain[:, :, None] * P[:, None, 0]
 
-    def known(self) -> FloatArray:
-        """(n,) turn rates to predict with, rad/s."""
-        w2, P = self.rate**2, self.P[:, 1, 1]
+    def known(self, rows: IntArray, turning_share: float) -> tuple[FloatArray, FloatArray]:
+        """Turn rates of tracks `rows` (k,) to predict with, rad/s, and their variances (k,)."""
+        rate, P, share = self.rate[rows], self.P[rows, 1, 1], min(max(turning_share, 1e-9), 1 - 1e-9)
         straight, turning = P + STRAIGHT**2, P + TURNING**2
-        log_odds = np.log(TURNING_SHARE / (1 - TURNING_SHARE)) + 0.5 * np.log(straight / turning)
-        turns = 1 / (1 + np.exp(np.clip(-log_odds - 0.5 * w2 * (1 / straight - 1 / turning), -50, 50)))
-        return np.asarray(self.rate * (turns * TURNING**2 / turning + (1 - turns) * STRAIGHT**2 / straight))
+        log_odds = np.log(share / (1 - share)) + 0.5 * np.log(straight / turning)
+        turns = 1 / (1 + np.exp(np.clip(-log_odds - 0.5 * rate**2 * (1 / straight - 1 / turning), -50, 50)))
+        if_turning, if_straight = TURNING**2 / turning, STRAIGHT**2 / straight
+        kept = turns * if_turning + (1 - turns) * if_straight
+        between = turns * (1 - turns) * (rate * (if_turning - if_straight)) ** 2
+        return rate * kept, P * kept + between

@@ -8,13 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from factors import RangeRate
+from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.out_of_sequence import moved_to_present, own_motion
+from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.tracking.retrodiction import past_positions
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic_flow import Passages

@@ -98,6 +98,33 @@ def test_what_is_wrong_is_located(tmp_path: Path, text: str, old: str, new: str,
     assert str(path) in str(caught.value)
 
 
+def test_a_file_of_measurements_alone_starts_at_dead_reckoning(tmp_path: Path) -> None:
+    """Pose 9 is reached against the direction of its measurement, pose 4 by the shorter way."""
+    graph = read_g2o(
+        written(
+            tmp_path,
+            "EDGE_SE2 2 4 1 0 1.5707963267948966 1 0 0 1 0 1\n"
+            "EDGE_SE2 9 4 0 2 0 1 0 0 1 0 1\n"
+            "EDGE_SE2 9 2 5 5 1 1 0 0 1 0 1\n",
+        )
+    )
+    assert graph.ids.tolist() == [2, 4, 9]
+    np.testing.assert_array_equal(graph.world_T_pose[0], np.eye(3))
+    np.testing.assert_allclose(graph.world_T_pose[1], [[0, -1, 1], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+    np.testing.assert_allclose(graph.world_T_pose[2], np.linalg.inv(graph.first_T_second[2]), atol=1e-12)
+
+
+def test_slightly_indefinite_information_is_projected_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    graph = read_g2o(written(tmp_path, PLANAR.replace("4 1 0.5 5 0.25 6", "4 2.00001 0 1 0 6")))
+    values = np.linalg.eigvalsh(graph.information[0])
+    assert 0 < values[0] < 1e-8
+    np.testing.assert_allclose(graph.information[0], [[4, 2, 0], [2, 1, 0], [0, 0, 6]], atol=1e-4)
+    assert "line 6: smallest eigenvalue -8" in caplog.text
+    assert "1 information matrices" in caplog.text
+
+
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.g2o: cannot be read"):
         read_g2o(tmp_path / "none.g2o")

@@ -16,6 +16,7 @@ from factors import (
     prior_factor,
     prior_factors,
 )
+from factors.marginal import block_covariances
 
 
 def random_graph(rng, dims, covariance):
@@ -56,6 +57,25 @@ def test_marginal_keeps_what_is_known_of_the_rest(seed, elimination, covariance)
     rows = np.concatenate([_rows(kept, dims, key) for key in kept[::-1][:3]])
     np.testing.assert_allclose(joint_mean, mean[rows], atol=1e-8)
     np.testing.assert_allclose(joint_P, P[np.ix_(rows, rows)], atol=1e-8)
+
+
+@pytest.mark.parametrize("options", [{}, {"function": gtsam.EliminateQR}])
+@pytest.mark.parametrize("seed", range(5))
+def test_block_covariances_are_those_of_the_dense_inverse(seed, options, covariance):
+    rng = np.random.default_rng(seed)
+    keys = rng.permutation(500)[:12].tolist()
+    dims = {key: int(rng.integers(1, 5)) for key in keys}
+    graph = random_graph(rng, dims, covariance)
+    graph.push_back(prior_factor(501, np.zeros(2), np.eye(2)))  # a tree of its own
+    dims[501] = 2
+    found = block_covariances(graph.eliminateMultifrontal(**options), dims)
+    _, P = moments(graph, [*keys, 501])
+    assert set(found) == set(dims)
+    for key, block in found.items():
+        rows = _rows([*keys, 501], dims, key)
+        np.testing.assert_allclose(block, P[np.ix_(rows, rows)], rtol=1e-9, atol=1e-12)
+    with pytest.raises(FactorError, match="dims: expected the dimensions of"):
+        block_covariances(graph.eliminateMultifrontal(), dims | {keys[0]: 7})
 
 
 def _rows(keys, dims, key):

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from data_tools.pose_graphs import read_g2o, write_g2o
 from pipelines.cli import app
 from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
-from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
+from saga_fg.slam.pose_graph import chordal_minimum, chordal_poses, factor_graph, optimise_poses, pose_values
 from tests.saga_fg.loops import loop
 
 RECORDINGS = Path(os.environ.get("SAGA_FG_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "slam"
@@ -42,6 +42,28 @@ def test_the_command_writes_the_optimum(tmp_path: Path, dim: int) -> None:
     assert (output / "above.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_chordal_minimum_is_certified_and_some_covariances_are_written(tmp_path: Path) -> None:
+    graph, _ = loop(3, seed=0)
+    write_g2o(tmp_path / "loop.g2o", graph)
+    edges = [line for line in (tmp_path / "loop.g2o").read_text().splitlines() if line.startswith("EDGE")]
+    (tmp_path / "loop.g2o").write_text("\n".join(edges) + "\n")
+    arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), "--certify"]
+    result = CliRunner().invoke(app, [*arguments, "--covariances", "120,30"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "the global minimum: no poses below" in result.stdout
+    found = json.loads((tmp_path / "out" / "errors.json").read_text())
+    assert found["chordal"]["certified"]
+    assert found["from the chordal minimum"] == pytest.approx(found[f"from the {found['best']}"], rel=1e-6)
+    rows = np.genfromtxt(tmp_path / "out" / "covariances.csv", delimiter=",", names=True)
+    assert rows["id"].tolist() == [120, 30]
+    whole = optimise_poses(read_g2o(tmp_path / "loop.g2o")).covariances()
+    np.testing.assert_allclose(rows["P11"], whole[[12, 3], 0, 0], rtol=1e-6)
+    arguments[4] = str(tmp_path / "none")
+    result = CliRunner().invoke(app, [*arguments, "--covariances", "none"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert not (tmp_path / "none" / "covariances.csv").exists()
+
+
 def test_a_graph_in_pieces_is_refused_by_the_name_of_its_file(tmp_path: Path) -> None:
     file, output = tmp_path / "pieces.g2o", tmp_path / "out"
     poses = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in (3, 4, 7))
@@ -52,15 +74,16 @@ def test_a_graph_in_pieces_is_refused_by_the_name_of_its_file(tmp_path: Path) ->
     assert not output.exists()
 
 
-@pytest.mark.parametrize("place", ["1e8", "1e9"])
-def test_a_graph_without_a_minimum_that_can_be_found_is_one_line(tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("place", [1e8, 1e9])
+def test_a_measurement_across_a_country_has_its_covariance(tmp_path: Path, place: float) -> None:
+    """The first pose is held to 1e-4 rad, which is kilometres at the other end."""
     file, output = tmp_path / "far.g2o", tmp_path / "out"
     file.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 {place} 0 0 100 0 0 100 0 400\n")
     result = CliRunner().invoke(app, ["slam", "g2o", str(file), "--output", str(output)])
-    assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {file}: expected coordinates and information of sizes that")
-    assert result.stderr.count("\n") == 1
-    assert not output.exists()
+    assert result.exit_code == 0
+    rows = np.genfromtxt(output / "covariances.csv", delimiter=",", names=True)
+    assert rows["P22"][1] == pytest.approx(place**2 * 1e-8 + 1 / 100, rel=1e-6)
+    assert rows["P33"][1] == pytest.approx(1e-8 + 1 / 400, rel=1e-6)
 
 
 def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
@@ -86,6 +109,11 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
     ("options", "message"),
     [
         (["--robust", "huber", "--compare"], "--compare: expected without --robust"),
+        (["--robust", "huber", "--certify"], "--certify: expected without --robust"),
+        (
+            ["--covariances", "10,elephant"],
+            "--covariances: expected all, last, none or ids of poses with commas, got 'e",
+        ),
         (["--robust", "huber", "--robust-scale", "-1"], "--robust-scale -1: expected a number > 0"),
     ],
 )
@@ -104,6 +132,18 @@ def test_a_broken_file_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "line 1: expected 4 values after VERTEX_SE2, got 3" in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not RECORDINGS.exists(), reason="the public pose graphs are not there (SAGA_FG_DATA)")
+@pytest.mark.parametrize(
+    ("name", "cost"),
+    [("CSAIL", 31.7037), ("intel", 48.4467), ("MIT", 61.1541), ("smallGrid3D", 1025.40), ("sphere2500", 1687.01)],
+)
+def test_the_chordal_minimum_of_public_graphs_is_that_of_the_literature(name: str, cost: float) -> None:
+    graph = read_g2o(RECORDINGS / f"{name}.g2o")
+    minimum = chordal_minimum(graph, chordal_poses(graph))
+    assert minimum.certified
+    assert minimum.cost == pytest.approx(cost, rel=1e-5)
 
 
 @pytest.mark.skipif(not RECORDINGS.exists(), reason="the public pose graphs are not there (SAGA_FG_DATA)")

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from saga_fg import ConstantAcceleration, ConstantVelocity, Edges, NodeType, RandomWalk, SceneGraph
+from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, Edges, NodeType, RandomWalk, SceneGraph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 
 CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
 BUS = NodeType("bus", ConstantAcceleration(jerk_noise=0.4))
+VAN = NodeType("van", Curvilinear(turn_time=1.5, fading_time=2.0, jerk_noise=0.7))
 TRAM = NodeType("tram", ConstantAcceleration(jerk_noise=0.7, fading_time=2.0))
 CONE = NodeType("cone", RandomWalk(drift=0.02))
 POLE = NodeType("pole", RandomWalk())  # stands still for ever

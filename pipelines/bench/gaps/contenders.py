@@ -57,7 +57,7 @@ def _moving(family: str | Path, turn: bool) -> Callable[[Mapping[str, ClassSetti
             if isinstance(own.motion, ConstantVelocity):
                 noise = own.motion.acceleration_noise
             motion = CoordinatedTurn(noise) if turn and label in TURNING else ConstantVelocity(noise)
-            found[label] = replace(own, motion=motion, turn_time=0.0)
+            found[label] = replace(own, motion=motion)
         return found
 
     return change

@@ -1,12 +1,17 @@
-"""Pose graphs: the type, a start that needs no guess, and their optimisation."""
+"""Pose graphs: the type, a start that needs no guess, their optimisation and its proof."""
 
+from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses, nearest_rotations
+from saga_fg.slam.pose_graph.chordal_cost import ChordalCost
 from saga_fg.slam.pose_graph.graph import PoseGraph
 from saga_fg.slam.pose_graph.optimisation import OptimisedPoses, factor_graph, optimise_poses, pose_array, pose_values
 
 __all__ = [
+    "ChordalCost",
+    "ChordalMinimum",
     "OptimisedPoses",
     "PoseGraph",
+    "chordal_minimum",
     "chordal_poses",
     "factor_graph",
     "nearest_rotations",

@@ -2,25 +2,27 @@
 
 Rotations, relaxed to matrices and anchored at R_0 = 1 (chordal relaxation):
 
-    min  sum_e  kappa_e || R_second - R_first R_e ||_F^2,      kappa_e = k_R / tr(Sigma_R,e)
+    min  sum_e  kappa_e || R_second - R_first R_e ||_F^2
 
 then each is replaced by the nearest rotation (polar decomposition). With these, the positions:
 
-    min  sum_e  tau_e || t_second - t_first - R_first t_e ||^2,    tau_e = d / tr(Sigma_t,e)
+    min  sum_e  tau_e || t_second - t_first - R_first t_e ||^2
+
+with the weights of the chordal cost (`saga_fg.slam.pose_graph.chordal_cost`), whose minimum is near.
 
 Source: L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniques for 3D SLAM: a survey on rotation
-estimation and its use in pose graph optimization", ICRA 2015; the weights are those of SE-Sync (Rosen et al., IJRR
-2019). Both systems are sparse and solved directly.
+estimation and its use in pose graph optimization", ICRA 2015. Both systems are sparse and solved directly.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array, diags_array
+from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph.chordal_cost import edge_matrix, edge_weights
 from saga_fg.slam.pose_graph.graph import PoseGraph
 
 
@@ -33,12 +35,10 @@ def chordal_poses(graph: PoseGraph) -> FloatArray:
     apart = graph.components() != 0
     if apart.any():
         raise InputError(f"pose {int(graph.ids[apart][0])}: expected measurements that connect it with the first pose")
-    covariance = np.linalg.inv(graph.information)
-    turn = np.trace(covariance[:, graph.rotation, graph.rotation], axis1=1, axis2=2)
-    shift = np.trace(covariance[:, graph.translation, graph.translation], axis1=1, axis2=2)
+    kappa, tau = edge_weights(graph)
     poses = np.tile(np.eye(d + 1), (len(graph), 1, 1))
-    poses[:, :d, :d] = _rotations(graph, (2 * d - 3) / turn)
-    poses[:, :d, d] = _positions(graph, poses[:, :d, :d], d / shift)
+    poses[:, :d, :d] = _rotations(graph, kappa)
+    poses[:, :d, d] = _positions(graph, poses[:, :d, :d], tau)
     return np.asarray(graph.world_T_pose[0] @ poses)
 
 
@@ -54,7 +54,7 @@ def _rotations(graph: PoseGraph, weight: FloatArray) -> FloatArray:
     """Return rotations (N, d, d); with X_i = R_i^T an edge has the residual X_second - R_e^T X_first in each column."""
     d = graph.dim
     R = graph.first_T_second[:, :d, :d]
-    A = _edge_matrix(graph, -R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape))
+    A = edge_matrix(graph, -R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape))
     X = _anchored(A, np.repeat(weight, d), np.zeros((len(R) * d, d)), np.eye(d))
     return nearest_rotations(X.reshape(-1, d, d).swapaxes(1, 2))
 
@@ -62,15 +62,7 @@ def _rotations(graph: PoseGraph, weight: FloatArray) -> FloatArray:
 def _positions(graph: PoseGraph, R: FloatArray, weight: FloatArray) -> FloatArray:
     d, ones = graph.dim, np.ones((len(graph.first), 1, 1))
     moved = (R[graph.first] @ graph.first_T_second[:, :d, d:])[:, :, 0]
-    return _anchored(_edge_matrix(graph, -ones, ones), weight, moved, np.zeros((1, d)))
-
-
-def _edge_matrix(graph: PoseGraph, first: FloatArray, second: FloatArray) -> csc_array:
-    """Return the sparse matrix with a row of blocks for each edge: (M, b, b) in the columns of its two poses."""
-    m, b = first.shape[:2]
-    blocks, columns = np.stack([first, second], axis=1), np.stack([graph.first, graph.second], axis=1)
-    entries = (blocks.reshape(-1, b, b), columns.ravel(), 2 * np.arange(m + 1))
-    return bsr_array(entries, shape=(m * b, len(graph) * b)).tocsc()
+    return _anchored(edge_matrix(graph, -ones, ones), weight, moved, np.zeros((1, d)))
 
 
 def _anchored(A: csc_array, weight: FloatArray, b: FloatArray, anchor: FloatArray) -> FloatArray:

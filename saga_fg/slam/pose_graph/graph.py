@@ -40,6 +40,19 @@ class PoseGraph:
     first_T_second: FloatArray
     information: FloatArray
 
+    @classmethod
+    def of_measurements(
+        cls, ids: IntArray, first: IntArray, second: IntArray, first_T_second: FloatArray, information: FloatArray
+    ) -> PoseGraph:
+        """A graph without a guess: poses start at dead reckoning from the first one, along the fewest measurements.
+
+        Poses that no measurements connect with the first one start where it is.
+        """
+        size = np.asarray(first_T_second).shape[-1]
+        still = np.tile(np.eye(size), (len(ids), 1, 1))
+        graph = cls(ids, still, first, second, first_T_second, information)
+        return graph.at(_dead_reckoned(graph)) if len(graph) else graph
+
     def __post_init__(self) -> None:
         ids = checked_ids("ids", self.ids)
         size = np.asarray(self.world_T_pose).shape[-1:]
@@ -92,6 +105,24 @@ class PoseGraph:
         _, label = connected_components(coo_array((ones, (self.first, self.second)), shape=(len(self), len(self))))
         _, first_row, part = np.unique(label, return_index=True, return_inverse=True)
         return np.asarray(np.argsort(np.argsort(first_row))[part], dtype=np.int64)
+
+
+def _dead_reckoned(graph: PoseGraph) -> FloatArray:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    first, second = graph.first.tolist(), graph.second.tolist()
+    joined = coo_array((np.ones(len(first)), (graph.first, graph.second)), shape=(len(graph), len(graph)))
+    order, before = breadth_first_order(joined.tocsr(), 0, directed=False)
+    edge_of = dict(zip(zip(first, second, strict=True), range(len(first)), strict=True))
+    poses = graph.world_T_pose.copy()
+    for row in order[1:].tolist():
+        parent = int(before[row])
+        if (edge := edge_of.get((parent, row))) is not None:
+            poses[row] = poses[parent] @ graph.first_T_second[edge]
+        else:
+            poses[row] = poses[parent] @ np.linalg.inv(graph.first_T_second[edge_of[row, parent]])
+    return poses
 
 
 def _checked_transforms(name: str, value: FloatArray, count: int, d: int) -> FloatArray:

@@ -20,7 +20,7 @@ from saga_fg.estimators import BatchSolver, GraphFilter, IncrementalFilter, Join
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.keys import node_key
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.known_turn import KnownTurns
+from saga_fg.model.known_course import KnownCourses
 from saga_fg.model.transition import Blocks
 from tests.saga_fg.estimator_programs import (
     Add,
@@ -34,7 +34,7 @@ from tests.saga_fg.estimator_programs import (
 )
 from tests.saga_fg.estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from tests.saga_fg.graph_keys import newest_key
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM, random_graph
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM, VAN, random_graph
 from tests.saga_fg.road_scenes import road_program
 
 ESTIMATORS = [
@@ -124,21 +124,21 @@ def test_a_long_program_does_not_drift_away(make, seed):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_nodes_that_turn_agree_with_the_textbook(make, seed):
-    """Turns of known rates, recorded with every interval, of constant velocity and of fading acceleration."""
+    """Courses with known headings and turn rates, recorded with every interval."""
     rng = np.random.default_rng(seed)
-    program = random_program(rng, moments=7, kinds=(CAR, TRAM, CONE))
-    in_step([with_turns(rng, operation) for operation in program], make())
+    program = random_program(rng, moments=7, kinds=(CAR, VAN, CONE))
+    in_step([with_courses(rng, operation) for operation in program], make())
 
 
-def with_turns(rng, operation):
-    """A prediction in which some of the moving nodes turn."""
+def with_courses(rng, operation):
+    """A prediction in which some of the vans have a known course, and some of these brake to a stop."""
     if not isinstance(operation, Predict):
         return operation
-    graph, turns = operation.transition.graph, []
-    for kind in (CAR, TRAM):
-        rows = [k for k, t in enumerate(graph.types) if t is kind and rng.random() < 0.7]
-        turns.append(KnownTurns(kind, graph.nodes[rows], rng.normal(0, 0.4, len(rows)), 1.5))
-    return Predict(discretise(dataclasses.replace(graph, modes=tuple(turns)), operation.transition.dt))
+    graph, dt = operation.transition.graph, operation.transition.dt
+    ids = graph.nodes[[k for k, t in enumerate(graph.types) if t is VAN and rng.random() < 0.7]]
+    heading, rate, variance = rng.normal(0, (2.0, 0.4, 0.1), (len(ids), 3)).T
+    record = KnownCourses.of(VAN, ids, heading, rate, variance**2, rng.normal(0, 2, (len(ids), 6)), dt)
+    return Predict(discretise(dataclasses.replace(graph, modes=(record,)), dt))
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-6, 1e-3])

@@ -10,7 +10,7 @@ from saga_fg.learning import GapSettings, HiddenObjects, hidden_objects
 from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
 from saga_fg.tracking.stationarity import StationaritySettings
@@ -21,13 +21,13 @@ ONCE = GapSettings(longest=1.5, spacing=1.0)
 FOLLOW = Following(SharedVelocity(), rate=0.5, gap_scale=20.0)
 
 
-def settings_of(motion, **others):
-    classes = {"default": ClassSettings(motion=motion, initial_speed_deviation=8.0, max_distance=20.0, **others)}
+def settings_of(motion):
+    classes = {"default": ClassSettings(motion=motion, initial_speed_deviation=8.0, max_distance=20.0)}
     return TrackerSettings(classes=classes, edges=(), stationarity=StationaritySettings(prior=0.2))
 
 
 VELOCITY = settings_of(ConstantVelocity(1.0))
-FADING = settings_of(ConstantAcceleration(1.0, fading_time=1.0), turn_time=2.0)
+FADING = settings_of(Curvilinear(fading_time=1.0, turn_time=2.0))
 
 
 def turning(moments=60):

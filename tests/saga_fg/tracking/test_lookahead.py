@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg import ConstantAcceleration, ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import FixedLagSmoother, IncrementalFilter, JointKalmanFilter
 from saga_fg.estimators.reference import Gaussian, kalman_predict
 from saga_fg.model.edge_rules import Following
@@ -19,7 +19,7 @@ from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 HORIZONS = [0.5, 1.0, 2.0, 5.0]
 LED = Following(interaction=SharedVelocity(along_heading=True), rate=1.0)
 CLASSES = {
-    "car": ClassSettings(motion=ConstantVelocity(1.0), turn_time=2.0),
+    "car": ClassSettings(motion=Curvilinear(turn_time=2.0)),
     "truck": ClassSettings(motion=ConstantAcceleration(0.5, fading_time=3.0)),
 }
 
@@ -73,7 +73,7 @@ def test_every_estimator_predicts_as_the_textbook(name, kind, monkeypatch):
     monkeypatch.setattr(kind, "predict", recording)
     found = tracker.predict(HORIZONS, joint=True)
     assert len(transitions) == 10
-    places = np.array([0, 1, 6, 7, 10, 11])  # x, y of a state of six components and two of four
+    places = np.array([0, 1, 6, 7, 12, 13])  # x, y of three states of six components
     for k, transition in enumerate(transitions):
         assert transition.nodes.tolist() == [1, 2, 3]
         x = kalman_predict(x, transition.F_matrix.toarray(), transition.b, transition.Q_matrix.toarray())
@@ -125,7 +125,7 @@ def test_headings_turn_with_the_velocity():
     def bend(t):
         return 30 * np.array([[np.sin(0.3 * t), 1 - np.cos(0.3 * t)]])
 
-    tracker = Tracker(TrackerSettings({"default": ClassSettings(motion=ConstantVelocity(1.0), turn_time=5.0)}))
+    tracker = Tracker(TrackerSettings({"default": ClassSettings(motion=Curvilinear(turn_time=5.0))}))
     run(tracker, [frame(t, bend(t), yaw=0.3 * t) for t in np.arange(0, 4, 0.1)])
     found = tracker.predict([0.0, 0.4, 1.0])
     assert found.yaw[0, 0] == pytest.approx(0.3 * 3.9, abs=0.05)

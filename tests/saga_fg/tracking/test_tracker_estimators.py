@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg import ConstantAcceleration, ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
 from tests.saga_fg.traffic_frames import frame, run, seen, straight
@@ -110,9 +110,9 @@ def test_an_estimator_that_is_none_is_refused():
 @pytest.mark.parametrize("estimator", ESTIMATORS[1:])
 @pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
 def test_every_estimator_takes_the_same_turns(estimator, edges):
-    """Two that turn, one behind the other, of which one is not detected at last; velocity and fading acceleration."""
+    """Two that turn, one behind the other, of which one is not detected at last."""
     rng, rate, speed = np.random.default_rng(5), 0.3, 8.0
-    classes = {label: replace(of_class, turn_time=1.5) for label, of_class in CLASSES.items()}
+    classes = {label: replace(of_class, motion=Curvilinear(turn_time=1.5)) for label, of_class in CLASSES.items()}
     settings = TrackerSettings(classes, edges=edges)
     reference, other = (Tracker(replace(settings, estimator=name), SENSORS) for name in ("kalman", estimator))
     for t in np.arange(0, 4, 0.1):

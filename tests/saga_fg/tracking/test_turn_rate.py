@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg import ConstantVelocity, Sensor, Tracker, TrackerSettings
+from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.turn_rate import DEVIATION, TurnRate
+from saga_fg.tracking.turn_rate import DEVIATION, STRAIGHT, TURNING, TurnRate
 from tests.saga_fg.traffic_frames import frame
 
 DT, RATE, SPEED = 0.1, 0.3, 8.0
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.03)})}
-MOTION = ConstantVelocity(1.0)
+MOTION = Curvilinear(turn_time=2.0)
+SHARE = 0.3  # of objects that turn
 TURNS = TrackerSettings(
-    classes={"default": ClassSettings(motion=MOTION, turn_time=2.0, max_coasting=3.0)}, edges=(), report_coasting=3.0
+    classes={"default": ClassSettings(motion=MOTION, max_coasting=3.0)}, edges=(), report_coasting=3.0
 )
-STRAIGHT = replace(TURNS, classes={"default": replace(TURNS.classes["default"], turn_time=0.0)})
+NO_TURNS = replace(TURNS, classes={"default": replace(TURNS.classes["default"], motion=replace(MOTION, turn_time=0.0))})
 
 
 def estimated(rates, noise=0.03, seed=0, flipped=0.0):
@@ -32,17 +33,33 @@ def estimated(rates, noise=0.03, seed=0, flipped=0.0):
     return turn
 
 
+def known(turn):
+    """The rate to predict with."""
+    return turn.known(np.array([0]), SHARE)[0].item()
+
+
 @pytest.mark.parametrize("flipped", [0.0, 0.5])
 def test_the_rate_of_a_turn_is_found_whichever_way_round_the_boxes_are(flipped):
     turn = estimated(np.full(20, RATE), flipped=flipped)
     assert turn.rate.item() == pytest.approx(RATE, abs=0.08)
-    assert turn.known().item() == pytest.approx(turn.rate.item(), abs=0.06), "a clear turn is hardly shrunk"
+    assert known(turn) == pytest.approx(turn.rate.item(), abs=0.06), "a clear turn is hardly shrunk"
 
 
 def test_noise_is_no_turn():
-    known = [abs(estimated(np.zeros(20), seed=seed).known().item()) for seed in range(30)]
-    assert np.median(known) < 0.005
-    assert max(known) < 0.1
+    rates = [abs(known(estimated(np.zeros(20), seed=seed))) for seed in range(30)]
+    assert np.median(rates) < 0.01
+    assert max(rates) < 0.15
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.05, 0.4])
+def test_mean_and_variance_are_those_of_the_mixture_of_turning_and_straight(rate):
+    turn = estimated(np.full(20, rate))
+    w, P, x = turn.rate.item(), turn.P[0, 1, 1], np.linspace(-2, 2, 40001)
+    normal = lambda d, s: np.exp(-0.5 * (d / s) ** 2) / s  # noqa: E731
+    density = (SHARE * normal(x, TURNING) + (1 - SHARE) * normal(x, STRAIGHT)) * normal(w - x, np.sqrt(P))
+    mean = (x * density).sum() / density.sum()
+    variance = ((x - mean) ** 2 * density).sum() / density.sum()
+    assert [value.item() for value in turn.known(np.array([0]), SHARE)] == pytest.approx([mean, variance], rel=1e-4)
 
 
 def test_a_wild_heading_counts_little():
@@ -72,7 +89,7 @@ def test_two_steps_predict_as_one(share):
 def test_without_headings_nothing_is_known():
     turn = TurnRate.initiated(np.array([np.nan]), np.array([np.pi]))
     turn.update(np.array([0]), np.array([np.nan]), np.array([np.pi]))
-    assert turn.known().item() == 0.0
+    assert known(turn) == 0.0
     turn.update(np.array([0]), np.array([0.5]), np.array([0.1]))
     assert turn.heading.item() == pytest.approx(0.5)
 
@@ -83,7 +100,7 @@ def test_a_first_heading_after_a_while_leaves_a_covariance():
     for k in range(20):
         turn.update(np.array([0]), np.array([RATE * k * DT]), np.array([0.03]))
         assert np.linalg.eigvalsh(turn.P[0]).min() > 0
-        assert abs(turn.known().item()) < 2 * RATE
+        assert abs(known(turn)) < 2 * RATE
         turn.predict(DT, np.array([2.0]))
     assert turn.rate.item() == pytest.approx(RATE, abs=0.08)
 
@@ -121,4 +138,4 @@ def coasting_error(settings, gap):
 
 @pytest.mark.parametrize("gap", [1.0, 2.0])
 def test_turning_objects_are_followed_round_the_bend(gap):
-    assert coasting_error(TURNS, gap) < 0.8 * coasting_error(STRAIGHT, gap)
+    assert coasting_error(TURNS, gap) < 0.8 * coasting_error(NO_TURNS, gap)

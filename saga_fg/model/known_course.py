@@ -1,0 +1,115 @@
+r"""Curvilinear motion along known courses: a vehicle's heading and turn rate are inputs of an interval.
+
+Of a vehicle with heading h, u = (cos h, sin h), position, velocity and acceleration move along u by the generator A_1,
+and across u by A_2, in which an acceleration fades at once (`Curvilinear`). Its velocity turns by an angle theta:
+
+    F0 = exp(A_1 dt) (x) u u^T + exp(A_2 dt) (x) (I - u u^T)
+    theta = c tau (1 - exp(-dt / tau))                        c: turn rate at the start, tau: its time constant
+    x0 = x with  a <- a - brake u                             brake: u . a of a vehicle that would else reverse, or 0
+    v' = R(theta) (F0 x0)_v,   a' = R(theta) (F0 x0)_a
+    p' = p + sin(theta / 2) / (theta / 2) R(theta / 2) ((F0 x0)_p - p)
+
+The chord is exact for a constant speed and a constant rate; where the rate fades or the speed changes it is near.
+
+    Q = Q_1 (x) u u^T + Q_2 (x) (I - u u^T),   Q_k = int exp(A_k s) Qc_k exp(A_k s)^T ds,   Qc_2: + q on the velocity
+    q = 2 T |v|^2 var(c)
+
+q is the acceleration across the course that an uncertain turn rate makes: its errors are taken for white, of a
+correlation time T = `RATE_CORRELATION`. Q is not rotated within the interval.
+
+With constant velocity and tau infinite this is the coordinated turn (`saga_fg.model.turning`), whose turn rate is part
+of the state and makes it nonlinear. Here it is estimated beside the joint state, and recorded with the interval as the
+edges are: given the record the motion is linear. Sources: Bar-Shalom, Li and Kirubarajan, Estimation with Applications
+to Tracking and Navigation (2001), section 11.7.1; Best and Norton (1997) for the noise along and across the heading;
+Singer (1970) for the first-order decay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from saga_fg.model.discretisation import linear_motion
+from saga_fg.model.motion import Curvilinear, NodeType
+from saga_fg.model.scene_graph import MatchedMotion
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+
+RATE_CORRELATION = 1.0  # s
+_LEAST_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
+_P, _V, _A = slice(0, 2), slice(2, 4), slice(4, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownCourses(Columns):
+    """n nodes of one `Curvilinear` type: ids (n,), heading (n,) rad.
+
+    rate           (n,) turn rate, rad/s, left is positive
+    lateral_noise  (n,) q above, m^2/s^3
+    brake          (n, 2) mean acceleration that is taken away, m/s^2
+    """
+
+    ids: IntArray
+    heading: FloatArray
+    rate: FloatArray
+    lateral_noise: FloatArray
+    brake: FloatArray
+    node_type: NodeType
+
+    @classmethod
+    def of(
+        cls,
+        node_type: NodeType,
+        ids: IntArray,
+        heading: FloatArray,
+        rate: FloatArray,
+        rate_variance: FloatArray,
+        mean: FloatArray,
+        dt: float,
+    ) -> KnownCourses:
+        """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2."""
+        u = _unit(heading)
+        speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
+        reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
+        brake = np.where(reverses, acceleration, 0.0)[:, None] * u
+        lateral_noise = (mean[:, _V] ** 2).sum(axis=1) * rate_variance * 2 * RATE_CORRELATION
+        return cls(ids, heading, rate, lateral_noise, brake, node_type)
+
+    def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, MatchedMotion]:
+        """dt seconds later, and the motions until then; scale (n,) of the process noise."""
+        motion = self.node_type.motion
+        assert isinstance(motion, Curvilinear)
+        tau = max(motion.turn_time, _LEAST_TIME)
+        theta = self.rate * tau * -np.expm1(-dt / tau)
+        (F_along, Q_along), (F_across, Q_across) = (linear_motion(*axis, dt) for axis in (motion.along, motion.across))
+        Q_white = linear_motion(motion.across[0], np.diag([0.0, 1.0, 0.0]), dt)[1]
+        u = _unit(self.heading)
+        ahead = u[:, :, None] * u[:, None]
+        aside = np.eye(2) - ahead
+        F = _planar(F_along, ahead) + _planar(F_across, aside)
+        Q = _planar(Q_along, ahead) + _planar(Q_across + self.lateral_noise[:, None, None] * Q_white, aside)
+        b = -(F[:, :, _A] @ self.brake[:, :, None])[:, :, 0]
+        chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
+        F[:, _P, 2:], b[:, _P] = chord @ F[:, _P, 2:], (chord @ b[:, _P, None])[:, :, 0]
+        for part in (_V, _A):
+            F[:, part], b[:, part] = turn @ F[:, part], (turn @ b[:, part, None])[:, :, 0]
+        later = replace(
+            self, heading=self.heading + theta, rate=self.rate * np.exp(-dt / tau), brake=np.zeros_like(self.brake)
+        )
+        return later, MatchedMotion(F, b, Q * scale[:, None, None])
+
+
+def _planar(one_axis: FloatArray, projection: FloatArray) -> FloatArray:
+    """(n, 6, 6) of the matrix, (3, 3) or (n, 3, 3), of one axis; projection (n, 2, 2) on that axis."""
+    spread = np.broadcast_to(one_axis, (len(projection), 3, 3))[:, :, None, :, None] * projection[:, None, :, None]
+    return spread.reshape(len(projection), 6, 6)
+
+
+def _unit(heading: FloatArray) -> FloatArray:
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+def _rotation(theta: FloatArray) -> FloatArray:
+    c, s = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

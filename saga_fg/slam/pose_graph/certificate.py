@@ -1,0 +1,191 @@
+r"""Proof that poses are the global minimum of the chordal cost, and the way to it where they are not.
+
+At a critical point of F = tr(Y^T Q Y) over frames Y_i, with the multipliers Lambda of the constraints Y_i Y_i^T = 1,
+
+    S = Q - blockdiag(Lambda_1, ..., Lambda_N),     S Y = 0,     F* >= F + N d min(lambda_min(S), 0)
+
+for frames of any dimension r, as tr(Y'^T Lambda Y') is the same for all frames Y'. So the minimum is global if no
+eigenvalue of S is negative. The signs of the pivots of S + eta 1 tell whether one is below -eta; with the positions, of
+which the first is fixed, S is sparse, and has as many negative pivots. The lowest eigenvalue is then the one nearest to
+-eta, which shifted inverse iteration finds at once.
+
+Where an eigenvalue is negative its vector is a direction of descent for frames of one dimension more (the Riemannian
+staircase). At a global minimum of more than d dimensions the frames are rounded to rotations, which are improved in
+their turn; the cost of the frames is a bound from below for theirs.
+
+Source: Rosen, Carlone, Bandeira, Leonard, SE-Sync, IJRR 2019; Rosen, Accelerating Certifiable Estimation with
+Preconditioned Eigensolvers, RA-L 2022, for the test by factorisation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import block_diag, csc_array, diags_array
+from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
+
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph.chordal import nearest_rotations
+from saga_fg.slam.pose_graph.chordal_cost import ChordalCost, factorised
+from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.stiefel import Frames, best_frames, multipliers, nearest_frames
+
+GAP = 1e-6  # relative difference between the cost and its proven bound at which poses count as the global minimum
+MOST_DIMENSIONS = 7  # more than d of the frames; the staircase ends far lower, where it ends at all
+_ROUNDING = 1e-11  # of the largest entry of S: eigenvalues nearer to 0 can't be told from it
+_CONVERGED = 1e-14  # decrease that a step still promises, relative to the cost: rounding
+_SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
+_ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
+_LARGER = 10.0  # ratio of successive shifts, until no eigenvalue is below
+
+
+@dataclass(frozen=True, eq=False)
+class ChordalMinimum:
+    """Poses of least chordal cost, and what that cost can't fall below.
+
+    world_T_pose  (N, d + 1, d + 1), the first as in the graph
+    cost          F of these poses
+    bound         proven lower bound of F over all poses
+    eigenvalue    a lower bound, 0 or less, of the eigenvalues of S at the frames that prove this
+    dimensions    r of these frames; d: the poses themselves
+    """
+
+    world_T_pose: FloatArray
+    cost: float
+    bound: float
+    eigenvalue: float
+    dimensions: int
+
+    @property
+    def gap(self) -> float:
+        """Difference between cost and bound, relative to the cost; 0 for poses that agree with all measurements."""
+        return (self.cost - self.bound) / self.cost if self.cost > 0 else 0.0
+
+    @property
+    def certified(self) -> bool:
+        """True if this is the global minimum of the chordal cost."""
+        return self.gap <= GAP
+
+
+def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
+    """The minimum of the chordal cost by the staircase; start: poses (N, d + 1, d + 1)."""
+    cost, d, n = ChordalCost.of(graph), graph.dim, len(graph)
+    found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2))
+    lowest = lowest_eigenvalue(cost, frames.Y)
+    proofs = [(frames.cost + n * d * lowest.value, lowest.value, d)]
+    while lowest.direction is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS:
+        frames = descend(cost, _escaped(cost, frames, lowest.direction))
+        lowest = lowest_eigenvalue(cost, frames.Y)
+        proofs.append((frames.cost + n * d * lowest.value, lowest.value, frames.Y.shape[2]))
+    if frames is not found:
+        found = min(found, descend(cost, rounded_rotations(frames.Y)), key=lambda each: each.cost)
+        lowest = lowest_eigenvalue(cost, found.Y)
+        proofs.append((found.cost + n * d * lowest.value, lowest.value, d))
+    bound, eigenvalue, dimensions = max(proofs)
+    return ChordalMinimum(_poses(graph, cost, found.Y), found.cost, bound, eigenvalue, dimensions)
+
+
+def descend(cost: ChordalCost, Y: FloatArray) -> Frames:
+    """The local minimum from frames Y (N, d, r)."""
+    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED)
+
+
+@dataclass(frozen=True, eq=False)
+class LowestEigenvalue:
+    """value: lower bound of the eigenvalues of S, at most 0; direction (N, d): of the lowest, None if it may be 0."""
+
+    value: float
+    direction: FloatArray | None
+
+
+def lowest_eigenvalue(cost: ChordalCost, Y: FloatArray) -> LowestEigenvalue:
+    """The test of S at frames Y (N, d, r)."""
+    n, d, r = Y.shape
+    flat = Y.reshape(n * d, r)
+    QY = cost.times(flat)
+    L = multipliers(Y, QY.reshape(Y.shape))
+    S = _with_positions(cost, L)
+    eta = max(GAP * float((flat * QY).sum()) / (n * d), _ROUNDING * float(abs(cost.M).max()))
+    below = False
+    while _negative(solver := factorised(S + _on_rotations(cost, eta))):
+        below, eta = True, eta * _LARGER
+    value, vector = _eigenpair(cost, L, solver, eta)
+    return LowestEigenvalue(min(value, 0.0) - 2 * _ACCURACY * eta, vector.reshape(n, d) if below else None)
+
+
+def _negative(solver: SuperLU) -> bool:
+    return bool((solver.U.diagonal() <= 0).any())
+
+
+def _with_positions(cost: ChordalCost, L: FloatArray) -> csc_array:
+    """M less the multipliers, without the first position."""
+    whole = np.zeros((len(L), cost.dim + 1, cost.dim + 1))
+    whole[:, : cost.dim, : cost.dim] = L
+    return _without_first_position(cost, (cost.M - block_diag(list(whole), format="csc")).tocsc())
+
+
+def _on_rotations(cost: ChordalCost, eta: float) -> csc_array:
+    diagonal = np.zeros(cost.M.shape[0])
+    diagonal[cost.rotations] = eta
+    return _without_first_position(cost, diags_array(diagonal).tocsc())
+
+
+def _without_first_position(cost: ChordalCost, matrix: csc_array) -> csc_array:
+    kept = np.delete(np.arange(cost.M.shape[0]), cost.dim)
+    return matrix[kept][:, kept]
+
+
+def _eigenpair(cost: ChordalCost, L: FloatArray, solver: SuperLU, eta: float) -> tuple[float, FloatArray]:
+    """The lowest eigenvalue of S and its vector (N d,), which lies above -eta: `solver` factorises S + eta."""
+    size, d = len(cost.rotations), cost.dim
+    rows = cost.rotations - (cost.rotations > d)  # without the first position
+
+    def times(v: FloatArray) -> FloatArray:
+        V = v.reshape(size, 1)
+        return (cost.times(V) - (L @ V.reshape(-1, d, 1)).reshape(size, 1)).ravel()
+
+    def solve(v: FloatArray) -> FloatArray:
+        whole = np.zeros(cost.M.shape[0] - 1)
+        whole[rows] = v.ravel()
+        return np.asarray(solver.solve(whole)[rows])
+
+    S, inverse = (LinearOperator((size, size), matvec=f, dtype=np.float64) for f in (times, solve))
+    start = np.random.default_rng(0).normal(size=size)
+    value, vector = eigsh(S, k=1, sigma=-eta, which="LM", OPinv=inverse, v0=start, tol=_ACCURACY)
+    return float(value[0]), vector[:, 0]
+
+
+def _escaped(cost: ChordalCost, frames: Frames, direction: FloatArray) -> FloatArray:
+    """Frames (N, d, r + 1) of lower cost, along an eigenvector (N, d) of S with a negative eigenvalue."""
+    n, d, r = frames.Y.shape
+    lifted = np.concatenate([frames.Y, np.zeros((n, d, 1))], axis=2)
+    step = np.zeros_like(lifted)
+    step[:, :, r] = direction
+    length = np.sqrt(n * d)
+    while length > _SHORTEST:
+        moved = nearest_frames(lifted + length * step)
+        flat = moved.reshape(n * d, r + 1)
+        if float((flat * cost.times(flat)).sum()) < frames.cost:
+            return moved
+        length /= 2
+    return lifted
+
+
+def rounded_rotations(Y: FloatArray) -> FloatArray:
+    """Rotations (N, d, d), transposed as frames are, near frames (N, d, r) of more dimensions."""
+    n, d, r = Y.shape
+    _, _, Wt = np.linalg.svd(Y.reshape(n * d, r), full_matrices=False)
+    R = Y @ Wt[:d].T
+    if (np.linalg.det(R) < 0).sum() > n / 2:
+        R = R * np.where(np.arange(d) == d - 1, -1.0, 1.0)
+    return nearest_rotations(R)
+
+
+def _poses(graph: PoseGraph, cost: ChordalCost, Y: FloatArray) -> FloatArray:
+    """Poses of rotations as frames (N, d, d), moved so that the first is that of the graph."""
+    n, d, _ = Y.shape
+    poses = np.tile(np.eye(d + 1), (n, 1, 1))
+    poses[:, :d, :d] = Y.swapaxes(1, 2)
+    poses[:, :d, d] = cost.best_positions(Y.reshape(n * d, d))
+    return np.asarray(graph.world_T_pose[0] @ np.linalg.inv(poses[0]) @ poses)

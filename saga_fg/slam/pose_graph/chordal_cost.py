@@ -1,0 +1,122 @@
+r"""The chordal cost of a pose graph, a quadratic form in rotation matrices and positions.
+
+    F = sum_e  kappa_e || R_second - R_first R_e ||_F^2 + tau_e || t_second - t_first - R_first t_e ||^2
+      = tr( Y^T M Y ),      Y = ( Y_1; ...; Y_N ),  Y_i = ( R_i^T; t_i^T ),  M = A^T W A
+
+    kappa_e = d / (2 tr(Sigma_R,e)) in space, 1 / tr(Sigma_R,e) in the plane,      tau_e = d / tr(Sigma_t,e)
+
+with an edge a row of blocks of A: 1 at its second pose, -T_e^T at its first one. Its minimum is not that of the cost of
+`saga_fg.slam.pose_graph.graph`, which measures rotations by their angle, but near it; and whether a minimum is the
+global one can be proved (`saga_fg.slam.pose_graph.certificate`).
+
+Positions are free, and the best ones for given rotations solve a linear problem. What is left is a form in Y_R alone,
+
+    F = tr( Y_R^T Q Y_R ),     Q = M_RR - M_Rt M_tt^+ M_tR
+
+Source: Rosen, Carlone, Bandeira, Leonard, SE-Sync: a certifiably correct algorithm for synchronization over the special
+Euclidean group, IJRR 2019, equations 20 to 24; the weights are those of its implementation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.sparse import bsr_array, csc_array, diags_array
+from scipy.sparse.linalg import SuperLU, splu
+
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.slam.pose_graph.graph import PoseGraph
+
+_FLOOR = 1e-9  # of the largest diagonal entry of M, added to make it definite: rotations and positions are relative
+
+
+def edge_weights(graph: PoseGraph) -> tuple[FloatArray, FloatArray]:
+    """kappa (M,), 1 / rad^2, and tau (M,), 1 / m^2, of the measurements."""
+    covariance = np.linalg.inv(graph.information)
+    turn = np.trace(covariance[:, graph.rotation, graph.rotation], axis1=1, axis2=2)
+    shift = np.trace(covariance[:, graph.translation, graph.translation], axis1=1, axis2=2)
+    return (1.0 if graph.dim == 2 else 1.5) / turn, graph.dim / shift
+
+
+def edge_matrix(graph: PoseGraph, first: FloatArray, second: FloatArray) -> csc_array:
+    """Sparse matrix with a row of blocks for each edge: (M, b, b) in the columns of its two poses."""
+    m, b = first.shape[:2]
+    blocks, columns = np.stack([first, second], axis=1), np.stack([graph.first, graph.second], axis=1)
+    entries = (blocks.reshape(-1, b, b), columns.ravel(), 2 * np.arange(m + 1))
+    return bsr_array(entries, shape=(m * b, len(graph) * b)).tocsc()
+
+
+@dataclass(frozen=True, eq=False)
+class ChordalCost:
+    """M (N (d + 1), N (d + 1)) of a pose graph of N poses in d dimensions."""
+
+    dim: int
+    M: csc_array
+
+    @classmethod
+    def of(cls, graph: PoseGraph) -> Self:
+        """Of all measurements of a graph."""
+        d, (kappa, tau) = graph.dim, edge_weights(graph)
+        T = graph.first_T_second
+        A = edge_matrix(graph, -T.swapaxes(1, 2), np.broadcast_to(np.eye(d + 1), T.shape))
+        W = np.column_stack([np.tile(kappa[:, None], (1, d)), tau]).ravel()
+        return cls(d, (A.T @ diags_array(W) @ A).tocsc())
+
+    def at(self, world_T_pose: FloatArray) -> float:
+        """F of poses (N, d + 1, d + 1)."""
+        Y = world_T_pose[:, : self.dim].swapaxes(1, 2).reshape(-1, self.dim)
+        return float((Y * (self.M @ Y)).sum())
+
+    @cached_property
+    def rotations(self) -> IntArray:
+        """Rows of Y_R."""
+        return np.flatnonzero(np.arange(self.M.shape[0]) % (self.dim + 1) != self.dim)
+
+    @cached_property
+    def positions(self) -> IntArray:
+        """Rows of Y_t."""
+        return np.arange(self.dim, self.M.shape[0], self.dim + 1)
+
+    def times(self, Y: FloatArray) -> FloatArray:
+        """Q Y for Y (N d, r)."""
+        t = self.best_positions(Y)
+        return np.asarray(self._M_RR @ Y + self._M_Rt @ t)
+
+    def best_positions(self, Y: FloatArray) -> FloatArray:
+        """Y_t (N, r) of least cost for Y_R (N d, r), the first being 0."""
+        t = np.zeros((len(self.positions), Y.shape[1]))
+        if len(t) > 1:
+            t[1:] = self._positions_solver.solve(np.ascontiguousarray(-(self._M_Rt.T @ Y)[1:]))
+        return t
+
+    def preconditioned(self, Y: FloatArray) -> FloatArray:
+        """(Q + floor)^-1 Y for Y (N d, r), as the block of the inverse of the whole matrix."""
+        whole = np.zeros((self.M.shape[0], Y.shape[1]))
+        whole[self.rotations] = Y
+        return np.asarray(self._solver.solve(whole)[self.rotations])
+
+    @cached_property
+    def _M_RR(self) -> csc_array:
+        return self.M[self.rotations][:, self.rotations]
+
+    @cached_property
+    def _M_Rt(self) -> csc_array:
+        return self.M[self.rotations][:, self.positions]
+
+    @cached_property
+    def _positions_solver(self) -> SuperLU:
+        free = self.positions[1:]
+        return factorised(self.M[free][:, free])
+
+    @cached_property
+    def _solver(self) -> SuperLU:
+        return factorised(self.M + _FLOOR * self.M.diagonal().max() * diags_array(np.ones(self.M.shape[0])))
+
+
+def factorised(matrix: csc_array) -> SuperLU:
+    """LU without exchange of rows, of a symmetric matrix: U has the signs of its eigenvalues on the diagonal."""
+    options = {"SymmetricMode": True}
+    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)

@@ -1,0 +1,131 @@
+"""Curvilinear motion along known courses: linear motion along an arc, recorded with the interval."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from saga_fg import ConstantAcceleration, Curvilinear, NodeType, SceneGraph
+from saga_fg.model.discretisation import discretise, linear_motion
+from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.known_course import RATE_CORRELATION, KnownCourses
+from saga_fg.model.scene_graph import Edges
+from saga_fg.model.turning import CoordinatedTurn
+from tests.saga_fg.random_graphs import node_table
+
+LONG = 1e9  # s, as good as no fading
+MOTION = Curvilinear(turn_time=1.5, fading_time=2.0, jerk_noise=0.7, lateral_acceleration_noise=0.2)
+CAR = NodeType("car", MOTION)
+P, V, A = slice(0, 2), slice(2, 4), slice(4, 6)
+
+
+def course(node_type, heading=0.0, rate=0.0, rate_variance=0.0, mean=(0, 0, 8, 0, 0, 0), dt=0.4):
+    angle, turn, variance = (np.array([float(value)]) for value in (heading, rate, rate_variance))
+    return KnownCourses.of(node_type, np.array([7]), angle, turn, variance, np.array([mean], dtype=float), dt)
+
+
+def along(record, node_type=CAR):
+    graph = SceneGraph.of([7], node_type)
+    return replace(graph, modes=(record,))
+
+
+def own(record, dt, node_type=CAR):
+    """F, b and Q of the node."""
+    step = discretise(along(record, node_type), dt)
+    return step.F[0].values[0], step.b, step.Q[0].values[0]
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-9, 0.3, -0.8])
+@pytest.mark.parametrize("dt", [0.1, 0.5, 2.0])
+def test_without_acceleration_and_fading_it_is_the_coordinated_turn(rate, dt):
+    x = np.array([3.0, -1.0, 8.0, 2.0])
+    car = NodeType("car", Curvilinear(turn_time=LONG))
+    F, b, _ = own(course(car, rate=rate), dt, car)
+    assert F[:4, :4] @ x + b[:4] == pytest.approx(CoordinatedTurn().flow(np.append(x, rate), dt)[:4], abs=1e-6)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, -2.5])
+def test_the_acceleration_acts_along_the_heading_alone(heading):
+    u = np.array([np.cos(heading), np.sin(heading)])
+    F, _, _ = own(course(CAR, heading), 0.4)
+    straight = discretise(SceneGraph.of([7], CAR), 0.4).F[0].values[0]
+    x = np.concatenate([np.zeros(2), 8 * u, 2 * u])
+    assert F @ x == pytest.approx(straight @ x), "along it, as a fading acceleration does"
+    gone = F[:, A] @ [-u[1], u[0]]
+    assert np.abs(gone) == pytest.approx(np.zeros(6), abs=0.1), "across it, hardly for 0.1 s"
+    assert gone[A] == pytest.approx(np.zeros(2), abs=0.02)
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.1])
+def test_the_noise_differs_along_and_across_the_heading(heading):
+    dt, variance, speed = 0.4, 0.01, 8.0
+    c, s = np.cos(heading), np.sin(heading)
+    mean = np.concatenate([np.zeros(2), [speed * c, speed * s], np.zeros(2)])
+    _, _, Q = own(course(CAR, heading, rate_variance=variance, mean=mean), dt)
+    turn = np.kron(np.eye(3), [[c, -s], [s, c]])
+    in_frame = turn.T @ Q @ turn
+    generator, diffusion = MOTION.across
+    diffusion[1, 1] += 2 * RATE_CORRELATION * variance * speed**2
+    assert in_frame[::2, ::2] == pytest.approx(linear_motion(*MOTION.along, dt)[1])
+    assert in_frame[1::2, 1::2] == pytest.approx(linear_motion(generator, diffusion, dt)[1])
+    assert in_frame[::2, 1::2] == pytest.approx(np.zeros((3, 3)), abs=1e-12)
+
+
+def test_along_the_heading_it_is_singers_model_with_white_acceleration():
+    fading = NodeType("car", ConstantAcceleration(MOTION.jerk_noise, MOTION.fading_time))
+    F, _, Q = own(course(CAR), 0.4)
+    singer = discretise(SceneGraph.of([7], fading), 0.4)
+    assert F[::2, ::2] == pytest.approx(singer.F[0].values[0][::2, ::2])
+    white = Q[::2, ::2] - singer.Q[0].values[0][::2, ::2]
+    assert white[:2, :2] == pytest.approx(
+        MOTION.acceleration_noise * np.array([[0.4**3 / 3, 0.4**2 / 2], [0.4**2 / 2, 0.4]])
+    )
+    assert white[2] == pytest.approx(np.zeros(3))
+
+
+def test_the_speed_is_kept_and_the_whole_turn_is_rate_times_time_constant():
+    v = own(course(CAR, rate=0.2), 60.0)[0][V, V] @ [10.0, 0.0]
+    assert v == pytest.approx(10 * np.array([np.cos(0.3), np.sin(0.3)]))
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_braking_ends_at_standstill(heading):
+    """A vehicle that would reverse within the interval keeps its speed; one that is faster brakes on."""
+    u, dt = np.array([np.cos(heading), np.sin(heading)]), 0.5
+    for speed, brakes_on in ((0.4, False), (4.0, True)):
+        x = np.concatenate([np.zeros(2), speed * u, -2 * u])
+        F, b, _ = own(course(CAR, heading, mean=x, dt=dt), dt)
+        after = (F @ x + b)[V] @ u
+        assert (after < speed - 0.5) if brakes_on else after == pytest.approx(speed)
+        assert (F @ x + b)[A] @ u == pytest.approx((F @ x)[A] @ u if brakes_on else 0.0)
+
+
+@pytest.mark.parametrize("mean", [(0, 0, 8, 0, 0, 0), (0, 0, 0.2, 0, -3, 0)])
+def test_two_half_steps_turn_as_one(mean):
+    graph, dt = along(course(CAR, rate=0.4, mean=mean)), 0.4
+    first, second = discretise(graph, dt / 2), discretise(graph.after(dt / 2), dt / 2)
+    whole = discretise(graph, dt)
+    assert whole.F_matrix.toarray()[V, V] == pytest.approx((second.F_matrix @ first.F_matrix).toarray()[V, V], abs=1e-9)
+    assert whole.F_matrix.toarray() == pytest.approx((second.F_matrix @ first.F_matrix).toarray(), abs=1e-2)
+    assert whole.b == pytest.approx(second.F_matrix @ first.b + second.b, abs=2e-2)
+
+
+def test_edges_act_on_the_velocity_of_turning_nodes():
+    """An edge that takes over the neighbour's velocity at once leaves nothing of the node's own."""
+    nodes = node_table(np.random.default_rng(0), (CAR, CAR), ids=[7, 8])
+    one = np.array([0]), np.array([1])
+    edges = Edges("shared_velocity", *one, np.array([200.0]), *SharedVelocity().triples(nodes, *one))
+    graph = SceneGraph(np.array([7, 8]), (CAR, CAR), (edges,), modes=(course(CAR, rate=0.5),))
+    F = discretise(graph, 0.5).F_matrix.toarray()
+    assert F[V, V] == pytest.approx(np.zeros((2, 2)), abs=1e-9)
+    assert F[V, 8:10] == pytest.approx(np.eye(2), abs=1e-9)
+    assert F[P, P] == pytest.approx(np.eye(2))
+
+
+def test_some_nodes_are_selected():
+    heading, rate, variance = np.arange(9.0).reshape(3, 3)
+    record = KnownCourses.of(CAR, np.array([1, 2, 3]), heading, rate, variance, np.zeros((3, 6)), 0.1)
+    chosen = record.select(np.array([2, 0]))
+    assert chosen.ids.tolist() == [3, 1]
+    assert chosen.rate.tolist() == [5.0, 3.0]
+    assert chosen.node_type is CAR

@@ -1,0 +1,148 @@
+"""The proof of the global minimum of the chordal cost, and the way to it from a bad local one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from saga_fg import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph import ChordalCost, PoseGraph, chordal_minimum, chordal_poses, optimise_poses
+from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, rounded_rotations
+from saga_fg.slam.pose_graph.stiefel import nearest_frames
+from tests.saga_fg.loops import loop, moved
+
+
+def ring(dim: int, poses: int = 20, seed: int = 0) -> PoseGraph:
+    """One round of equal turns, each pose measured from the one before, the first from the last."""
+    k = 3 * (dim - 1)
+    turn = slice(2, 3) if dim == 2 else slice(0, 3)
+    step, variance = np.zeros(k), np.full(k, 1e-2)
+    step[0 if dim == 2 else 3], step[2] = 1.0, 2 * np.pi / poses
+    variance[turn] = 1e-4
+    measured = moved(dim, step + 0.01 * np.random.default_rng(seed).normal(size=(poses, k)))
+    first = np.arange(poses)
+    information = np.tile(np.diag(1 / variance), (poses, 1, 1))
+    return PoseGraph.of_measurements(np.arange(poses), first, (first + 1) % poses, measured, information)
+
+
+def twice_round(dim: int, poses: int = 20) -> FloatArray:
+    """Poses whose headings go round twice on the way."""
+    T, angle = np.tile(np.eye(dim + 1), (poses, 1, 1)), 4 * np.pi * np.arange(poses) / poses
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(angle)
+    T[:, 1, 0], T[:, 0, 1] = np.sin(angle), -np.sin(angle)
+    return T
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_cost_is_the_sum_over_measurements(dim: int) -> None:
+    graph, true = loop(dim, seed=2)
+    T, covariance = graph.first_T_second, np.linalg.inv(graph.information)
+    kappa = (1.0 if dim == 2 else 1.5) / np.trace(covariance[:, graph.rotation, graph.rotation], axis1=1, axis2=2)
+    tau = dim / np.trace(covariance[:, graph.translation, graph.translation], axis1=1, axis2=2)
+    R, t = true[:, :dim, :dim], true[:, :dim, dim]
+    turned = R[graph.second] - R[graph.first] @ T[:, :dim, :dim]
+    shifted = t[graph.second] - t[graph.first] - (R[graph.first] @ T[:, :dim, dim:])[:, :, 0]
+    expected = (kappa * (turned**2).sum(axis=(1, 2)) + tau * (shifted**2).sum(axis=1)).sum()
+    assert ChordalCost.of(graph).at(true) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_positions_are_eliminated_at_their_best(dim: int) -> None:
+    graph, true = loop(dim, seed=0)
+    cost, rng = ChordalCost.of(graph), np.random.default_rng(1)
+    Y = true[:, :dim, :dim].swapaxes(1, 2).reshape(-1, dim)
+    poses = true.copy()
+    poses[:, :dim, dim] = cost.best_positions(Y)
+    least = float((Y * cost.times(Y)).sum())
+    assert least == pytest.approx(cost.at(poses), rel=1e-9)
+    for _ in range(5):
+        other = poses.copy()
+        other[1:, :dim, dim] += 0.1 * rng.normal(size=(len(graph) - 1, dim))
+        assert cost.at(other) > least
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_minimum_is_proven_and_no_other_poses_are_below_the_bound(dim: int, seed: int) -> None:
+    graph, true = loop(dim, seed)
+    minimum = chordal_minimum(graph, chordal_poses(graph))
+    cost = ChordalCost.of(graph)
+    assert minimum.certified
+    assert minimum.bound <= minimum.cost <= cost.at(true)
+    assert minimum.cost == pytest.approx(cost.at(minimum.world_T_pose), rel=1e-9)
+    np.testing.assert_allclose(minimum.world_T_pose[0], graph.world_T_pose[0], atol=1e-9)
+    rng, k = np.random.default_rng(seed), 3 * (dim - 1)
+    for scale in (0.01, 0.1, 1.0):
+        assert cost.at(true @ moved(dim, scale * rng.normal(size=(len(true), k)))) > minimum.bound
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_bad_local_minimum_is_told_and_left(dim: int) -> None:
+    graph, start = ring(dim), twice_round(dim)
+    cost = ChordalCost.of(graph)
+    stuck = descend(cost, start[:, :dim, :dim].swapaxes(1, 2))
+    lowest = lowest_eigenvalue(cost, stuck.Y)
+    assert lowest.value < -1
+    assert lowest.direction is not None
+    minimum, known = chordal_minimum(graph, start), chordal_minimum(graph, chordal_poses(graph))
+    assert stuck.cost > 1000 * known.cost
+    assert minimum.cost == pytest.approx(known.cost, rel=1e-6)
+    assert minimum.certified
+    assert known.certified
+
+
+def test_what_is_not_the_minimum_is_not_certified() -> None:
+    graph = ring(2)
+    cost = ChordalCost.of(graph)
+    stuck = descend(cost, twice_round(2)[:, :2, :2].swapaxes(1, 2))
+    assert stuck.cost + 2 * len(graph) * lowest_eigenvalue(cost, stuck.Y).value < 0.5 * stuck.cost
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_lowest_eigenvalue_is_that_of_the_dense_matrix(dim: int) -> None:
+    graph = ring(dim)
+    cost, n = ChordalCost.of(graph), len(graph)
+    for start in (twice_round(dim), chordal_poses(graph)):
+        Y = descend(cost, start[:, :dim, :dim].swapaxes(1, 2)).Y
+        Q = cost.times(np.eye(n * dim))
+        product = (Q @ Y.reshape(-1, dim)).reshape(Y.shape) @ Y.swapaxes(1, 2)
+        S = Q.copy()
+        for i in range(n):
+            block = slice(i * dim, (i + 1) * dim)
+            S[block, block] -= (product[i] + product[i].T) / 2
+        dense = np.linalg.eigvalsh((S + S.T) / 2)[0]
+        assert lowest_eigenvalue(cost, Y).value == pytest.approx(min(dense, 0.0), rel=1e-2, abs=1e-6)
+
+
+def test_frames_of_more_dimensions_are_rounded_to_rotations() -> None:
+    rng = np.random.default_rng(0)
+    R = nearest_frames(rng.normal(size=(8, 3, 3)))
+    R = R * np.linalg.det(R)[:, None, None]
+    lift = nearest_frames(rng.normal(size=(1, 3, 5)))[0]
+    rounded = rounded_rotations(R @ lift)
+    np.testing.assert_allclose(np.linalg.det(rounded), 1.0)
+    np.testing.assert_allclose(rounded[1:] @ rounded[0].T, R[1:] @ R[0].T, atol=1e-9)
+
+
+def test_the_certified_start_is_one_of_the_starts() -> None:
+    graph, _ = loop(2, seed=1)
+    optimised = optimise_poses(graph, certify=True)
+    assert optimised.chordal is not None
+    assert optimised.chordal.certified
+    assert optimised.errors["chordal minimum"] == pytest.approx(optimised.error, rel=1e-6)
+    assert optimise_poses(graph).chordal is None
+
+
+def test_a_graph_in_pieces_cannot_be_certified() -> None:
+    graph = ring(2)
+    apart = PoseGraph(
+        graph.ids,
+        graph.world_T_pose,
+        graph.first[:10],
+        graph.second[:10],
+        graph.first_T_second[:10],
+        graph.information[:10],
+    )
+    with pytest.raises(InputError, match="expected measurements that connect it"):
+        optimise_poses(apart, certify=True)
