@@ -139,9 +139,8 @@ def bench_fusion(
     def of_rows(name: str, rows: Sequence[int]) -> dict[str, float]:
         return fusion_figures([judged[name][row] for row in rows], settings.annotation_range)
 
-    changes = sampled_differences(
-        lambda rows: of_rows("both", rows), lambda rows: of_rows("LiDAR", rows), len(seeds), draws
-    )
+    units = [[row] for row in range(len(seeds))]
+    changes = sampled_differences(lambda rows: of_rows("both", rows), lambda rows: of_rows("LiDAR", rows), units, draws)
     return {name: of_rows(name, range(len(seeds))) for name in CONTENDERS}, changes
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
@@ -15,9 +16,12 @@ from data_tools.datasets.ngsim.windows import NgsimWindows
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.evaluation import nuscenes_hota, nuscenes_label_errors
 from data_tools.datasets.openacc import OpenAccPlatoons
+from data_tools.datasets.overlapping import overlapping
 from data_tools.datasets.recorded_traffic import TrafficRecordings
+from data_tools.datasets.source import ChosenScenes
 from data_tools.evaluation.hota import HotaRow
 from data_tools.evaluation.placed_detections import placed_detections
+from data_tools.files.error_messages import unknown_name
 from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
@@ -28,6 +32,7 @@ from data_tools.metrics import (
     nuscenes_tracking_metrics,
     scene_metrics,
 )
+from data_tools.metrics.hota import HotaOfScenes
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.recorded_source import SensedRecordings
 from data_tools.simulator.recorded_world import MAST, VEHICLE
@@ -48,11 +53,30 @@ class Score:
     figures_of  headline figures of some scenes, by their numbers; a number may occur more than once
     errors      at the labels, scene by scene
     hota        HOTA of all scenes by class, where a set has it; raises `MissingExtraError` without trackeval
+    hota_of     HOTA of cars of some scenes, where a set has that; raises as above when it is called
+    cluster     for each scene the first of those that overlap with it in time; empty where none do
     """
 
     figures_of: Callable[[Sequence[int]], dict[str, float]]
     errors: tuple[LabelErrors, ...]
     hota: Callable[[], Sequence[HotaRow]] = tuple
+    hota_of: Callable[[], HotaOfScenes] | None = None
+    cluster: tuple[str, ...] = ()
+
+    def with_hota(self) -> Score:
+        """The same with HOTA of cars among the headline figures, where it can be had of any scenes."""
+        if self.hota_of is None:
+            return self
+        hota, others = self.hota_of(), self.figures_of
+        return replace(self, figures_of=lambda rows: others(rows) | {"HOTA car": hota(rows)}, hota_of=None)
+
+    @property
+    def units(self) -> list[list[int]]:
+        """The scenes by their numbers, those that overlap together."""
+        found: dict[str, list[int]] = {}
+        for row in range(len(self.errors)):
+            found.setdefault(self.cluster[row] if self.cluster else str(row), []).append(row)
+        return list(found.values())
 
     @property
     def figures(self) -> dict[str, float]:
@@ -69,6 +93,10 @@ class RecordingSet(Protocol):
     def family(self) -> Family: ...
     @property
     def dataset(self) -> Dataset: ...
+    @property
+    def clusters(self) -> Mapping[str, str]:
+        """For each scene, by name, the first of those that overlap with it in time; none where none do."""
+        ...
 
     def score(self, runs: Runs) -> Score:
         """Judge a tracker's output on all scenes."""
@@ -79,6 +107,7 @@ class NuScenesSet:
     """Scenes in the nuScenes layout, judged by the official metrics."""
 
     family: Family = "nuscenes"
+    clusters: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, name: str, dataroot: Path, detections: Mapping[str, Path], split: str) -> None:
         """Raises `InputError` for missing or broken files."""
@@ -109,6 +138,7 @@ class KittiSet:
     """KITTI sequences, judged by the 3D metrics averaged over recall."""
 
     family: Family = "kitti"
+    clusters: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, name: str, dataroot: Path, detections: Path, sequences: Sequence[str] | None = None) -> None:
         """Raises `InputError` for missing files."""
@@ -146,27 +176,34 @@ class KittiSet:
 
 @dataclass(frozen=True)
 class TrueSet:
-    """Scenes with the exact truth at every frame, hidden objects by the track that last followed them."""
+    """Scenes with the exact truth at every frame, hidden objects by the track that last followed them.
+
+    clusters  for each scene, by name, the first of those that overlap with it in time; empty where none do
+    """
 
     name: str
     family: Family
     dataset: Dataset
+    clusters: Mapping[str, str] = field(default_factory=dict)
 
     def score(self, runs: Runs) -> Score:
         """Compare with the truth at every frame."""
-        metrics, errors = [], []
+        metrics, errors, pairs = [], [], []
         for run in runs.values():
             truth = run.scene.ground_truth
             assert truth is not None
             metrics.append(scene_metrics(truth, run.tracks))
             labels = SceneBoxes.of_annotations(truth, hidden=False)
-            errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
+            found = SceneBoxes.of_tracks(run.tracks)
+            errors.append(label_errors(labels, found, labels.boxes.velocity))
+            pairs.append((SceneBoxes.of_annotations(truth), found))
 
         def figures_of(rows: Sequence[int]) -> dict[str, float]:
             m = SceneMetrics.pool(metrics[row] for row in rows)
             return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
 
-        return Score(figures_of, tuple(errors))
+        cluster = tuple(self.clusters.get(name, name) for name in runs)
+        return Score(figures_of, tuple(errors), hota_of=lambda: HotaOfScenes(pairs, "car"), cluster=cluster)
 
 
 def simulated_set(scenes: int, seed: int = 0, settings: SimulatorSettings | None = None) -> RecordingSet:
@@ -189,8 +226,47 @@ def recording_set(name: str, data: Path | None, scenes: int, viewpoint: str | No
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
     if name in SETS:
         return SETS[name](data)
-    recordings, usual = TRAFFIC_SETS[name]
-    return TrueSet(name, "traffic", SensedRecordings(recordings(data), viewpoint or usual, None, seed=0))
+    traffic, usual = TRAFFIC_SETS[name]
+    recordings = traffic(data)
+    clusters = overlapping(map(recordings.recording, recordings.names)) if name in OVERLAPPING else {}
+    return TrueSet(name, "traffic", SensedRecordings(recordings, viewpoint or usual, None, seed=0), clusters)
+
+
+@dataclass(frozen=True)
+class ChosenRecordings:
+    """Some recordings of a set."""
+
+    whole: RecordingSet
+    dataset: Dataset
+
+    @property
+    def name(self) -> str:
+        """That of the set."""
+        return self.whole.name
+
+    @property
+    def family(self) -> Family:
+        """That of the set."""
+        return self.whole.family
+
+    @property
+    def clusters(self) -> Mapping[str, str]:
+        """Those of the set."""
+        return self.whole.clusters
+
+    def score(self, runs: Runs) -> Score:
+        """Judge a tracker's output on them."""
+        return self.whole.score(runs)
+
+
+def chosen_recordings(sets: Sequence[RecordingSet], recordings: Sequence[str]) -> list[RecordingSet]:
+    """The sets that have some of the recordings, with these alone. Raises `InputError` for one that none has."""
+    known = tuple(name for each in sets for name in each.dataset.scenes)
+    unknown = next((name for name in recordings if name not in known), None)
+    if unknown is not None:
+        raise InputError(f"--test: {unknown_name('recording', unknown, known)}")
+    mine = ((each, [name for name in each.dataset.scenes if name in recordings]) for each in sets)
+    return [ChosenRecordings(each, ChosenScenes(each.dataset, ",".join(found))) for each, found in mine if found]
 
 
 def _nuscenes(name: str, split: str, sensor: str, file: str) -> Callable[[Path], RecordingSet]:
@@ -212,3 +288,5 @@ TRAFFIC_SETS: dict[str, tuple[Callable[[Path], TrafficRecordings], str]] = {
     "openacc": (lambda data: OpenAccPlatoons(data / "openacc"), VEHICLE),
 }
 """Recorded traffic, whose detections are made, and the usual viewpoint; taken only where it is asked for."""
+OVERLAPPING = ("ngsim",)
+"""Sets whose recordings may overlap in time."""

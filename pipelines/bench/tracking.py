@@ -19,21 +19,21 @@ from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
 from pipelines.bench.gaps.learned import learn_interactions
 from pipelines.bench.predictions import PredictionErrors, PredictionRecorder
 from pipelines.bench.recordings import RecordingSet, Score
-from pipelines.bench.variants import Variant, variants
+from pipelines.bench.variants import GRAPH_MATCHING, Variant, variants
 from pipelines.config import TrackConfig
 from pipelines.observers import StageClock
 from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
 from saga_fg.errors import InputError
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.tracking import Tracker
-from saga_fg.types.dataset import Dataset
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
 
 SAGA, KF, BASELINE = "saga", "kf", "centerpoint"
 LEARNED = Variant("learned interactions")
 FOLDS = 2  # of scenes that interactions are learned from
-LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE")
+RELATIVE_SWITCHES = "IDS, relative"
+LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE", RELATIVE_SWITCHES)
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class VariantResult:
 
 @dataclass(frozen=True, eq=False)
 class SetResult:
-    """All variants on one set, and what the graph changes: saga less kf (relative for errors), by figure."""
+    """All variants on one set, and what the graph changes: less kf (relative for errors), by variant and figure."""
 
     name: str
     scenes: tuple[str, ...]
     variants: Mapping[str, VariantResult]
-    differences: Mapping[str, Interval]
+    differences: Mapping[str, Mapping[str, Interval]]
 
     def ratio(self, variant: str) -> float:
         """Time a frame over that of `centerpoint`."""
@@ -119,7 +119,7 @@ def bench_set(
     compared = variants(base, settings.components, settings.contenders)
     learned: dict[str, LearnedInteractions] = {}
     if settings.contenders:
-        learned = learn_by_folds(recordings.dataset, base, progress)
+        learned = learn_by_folds(recordings, base, progress)
         compared += (LEARNED,)
     runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
     seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
@@ -142,13 +142,20 @@ def bench_set(
     for variant in compared:
         tracked = runs.pop(variant.name)
         score = recordings.score(tracked)
+        if settings.contenders:
+            score = score.with_hota()
         per_frame = 1000 / max(sum(run.frames for run in tracked.values()), 1)
         stages = {stage: per_frame * spent for stage, spent in clocks[variant.name].seconds.items()}
         spent = per_frame * seconds[variant.name]
         judged = {f"HOTA {row.label}": row.figures.hota for row in _in_space(score)} if settings.contenders else {}
         ahead = tuple(predictions[variant.name])
         results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages, ahead)
-    differences = graph_differences(results[SAGA].score, results[KF].score, settings)
+    compared_with_kf = (SAGA, GRAPH_MATCHING.name, LEARNED.name) if settings.contenders else (SAGA,)
+    differences = {
+        name: graph_differences(results[name].score, results[KF].score, settings)
+        for name in compared_with_kf
+        if name in results
+    }
     return SetResult(recordings.name, scenes, results, differences)
 
 
@@ -158,32 +165,43 @@ def _in_space(score: Score) -> list[HotaRow]:
 
 
 def learn_by_folds(
-    dataset: Dataset, base: TrackConfig, progress: Progress | None = None
+    recordings: RecordingSet, base: TrackConfig, progress: Progress | None = None
 ) -> dict[str, LearnedInteractions]:
     """Interactions for every scene, learned from the truth of the scenes of the other fold.
 
-    Raises `InputError` for a single scene.
+    Scenes that overlap are in one fold. Raises `InputError` for a single one.
     """
-    if len(dataset.scenes) < FOLDS:
-        raise InputError(f"{', '.join(dataset.scenes)}: expected scenes to learn from beside it")
+    scenes = recordings.dataset.scenes
+    unit = {name: recordings.clusters.get(name, name) for name in scenes}
+    units = list(dict.fromkeys(unit.values()))
+    if len(units) < FOLDS:
+        raise InputError(f"{', '.join(scenes)}: expected scenes to learn from beside it")
     learned: dict[str, LearnedInteractions] = {}
     for fold in range(FOLDS):
-        tested = dataset.scenes[fold::FOLDS]
-        others = {name: dataset.scene(name) for name in dataset.scenes if name not in tested}
+        tested = [name for name in scenes if unit[name] in units[fold::FOLDS]]
+        read = (recordings.dataset.scene(name) for name in scenes if name not in tested)
+        others = {scene.name: scene for scene in read}  # several may have the same truth
         found = learn_interactions(others, f"scenes {', '.join(others)}", base, progress=progress)
         learned |= dict.fromkeys(tested, found.interactions)
     return learned
 
 
 def graph_differences(saga: Score, kf: Score, settings: TrackingBenchSettings) -> dict[str, Interval]:
-    """Saga against kf: headline figures as differences, RMSEs as relative changes. Needs two scenes; else empty."""
-    if len(saga.errors) < 2:
+    """Saga against kf: headline figures as differences, RMSEs as relative changes.
+
+    Needs two scenes that don't overlap; else empty.
+    """
+    units = saga.units
+    if len(units) < 2:
         return {}
     result = {}
     if settings.draws:
-        result = sampled_differences(saga.figures_of, kf.figures_of, len(saga.errors), settings.draws, settings.seed)
+        result = sampled_differences(saga.figures_of, kf.figures_of, units, settings.draws, settings.seed)
     for name in ("position", "velocity", "heading"):
-        a, b = ([errors.sample(name).square_sums for errors in score.errors] for score in (saga, kf))
+        a, b = (
+            [np.sum([score.errors[row].sample(name).square_sums for row in unit], axis=0) for unit in units]
+            for score in (saga, kf)
+        )
         result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
     return result
 
@@ -191,29 +209,39 @@ def graph_differences(saga: Score, kf: Score, settings: TrackingBenchSettings) -
 def sampled_differences(
     first: Callable[[Sequence[int]], Mapping[str, float]],
     second: Callable[[Sequence[int]], Mapping[str, float]],
-    scenes: int,
+    units: Sequence[Sequence[int]],
     draws: int,
     seed: int = 0,
     confidence: float = 0.95,
 ) -> dict[str, Interval]:
-    """First less second over `scenes` scenes in each figure that both have, with its interval."""
+    """First less second in each figure that both have, and relative switches, with intervals.
+
+    units  numbers of the scenes; those of one unit are drawn together
+    """
     rng = np.random.default_rng(seed)
     sampled: dict[str, list[float]] = {}
     for _ in range(draws):
-        rows = rng.integers(scenes, size=scenes).tolist()
-        a, b = first(rows), second(rows)
-        for name in a:
-            if name in b:
-                sampled.setdefault(name, []).append(a[name] - b[name])
+        rows = [row for unit in rng.integers(len(units), size=len(units)).tolist() for row in units[unit]]
+        for name, value in _differences(first(rows), second(rows)).items():
+            sampled.setdefault(name, []).append(value)
     tail = (1 - confidence) / 2
-    ours, theirs = first(range(scenes)), second(range(scenes))
+    every = [row for unit in units for row in unit]
+    estimate = _differences(first(every), second(every))
     result = {}
     for name, values in sampled.items():
         known = [value for value in values if math.isfinite(value)]
-        if name in ours and name in theirs and known:
+        if name in estimate and known:
             low, high = np.quantile(known, [tail, 1 - tail]).tolist()
-            result[name] = Interval(ours[name] - theirs[name], low, high, confidence)
+            result[name] = Interval(estimate[name], low, high, confidence)
     return result
+
+
+def _differences(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, float]:
+    """In each figure that both have, and of switches the relative change as well."""
+    found = {name: value - theirs[name] for name, value in ours.items() if name in theirs}
+    if "IDS" in found:
+        found[RELATIVE_SWITCHES] = found["IDS"] / theirs["IDS"] if theirs["IDS"] else math.nan
+    return found
 
 
 def verdict(name: str, difference: Interval) -> str:

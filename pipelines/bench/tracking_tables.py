@@ -7,7 +7,7 @@ from typing import Any
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, calibration, error_summary, errors_by_class
 from pipelines.bench.predictions import PredictionErrors, prediction_figures
-from pipelines.bench.tracking import KF, SAGA, SetResult, verdict
+from pipelines.bench.tracking import KF, RELATIVE_SWITCHES, SAGA, SetResult, verdict
 
 
 def tables(result: SetResult) -> list[FigureTable]:
@@ -32,9 +32,9 @@ def figures(result: SetResult) -> dict[str, Any]:
             }
             for name, each in result.variants.items()
         },
-        "saga_against_kf": {
-            name: {"difference": interval, "verdict": verdict(name, interval)}
-            for name, interval in result.differences.items()
+        "against_kf": {
+            variant: {name: {"difference": each, "verdict": verdict(name, each)} for name, each in found.items()}
+            for variant, found in result.differences.items()
         },
         "predictions": prediction_figures(_predicting(result), KF),
         "calibration": {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()},
@@ -68,16 +68,18 @@ def _headline(name: str, value: float) -> str:
 
 
 def _differences(result: SetResult) -> list[FigureTable]:
-    if not result.differences:
-        return []
-    rows = tuple((name, *_interval(name, each), verdict(name, each)) for name, each in result.differences.items())
-    title = f"{result.name}: what the graph changes, saga less kf (RMSE: relative), 95 % intervals over scenes"
-    return [FigureTable(title, ("figure", "difference", "from", "to", "saga is"), rows)]
+    tables = []
+    for variant, found in result.differences.items():
+        rows = tuple((name, *_interval(name, each), verdict(name, each)) for name, each in found.items())
+        title = f"{result.name}: what the graph changes, {variant} less kf (RMSE: relative), 95 % intervals over scenes"
+        if rows:
+            tables.append(FigureTable(title, ("figure", "difference", "from", "to", f"{variant} is"), rows))
+    return tables
 
 
 def _interval(name: str, difference: Interval) -> tuple[str, ...]:
     values = (difference.estimate, difference.low, difference.high)
-    if name.endswith("RMSE") and not name.startswith("hidden"):
+    if name == RELATIVE_SWITCHES or (name.endswith("RMSE") and not name.startswith("hidden")):
         return tuple(f"{100 * value:+.2f} %" for value in values)
     return tuple(f"{value:+.4g}" for value in values)
 

@@ -16,6 +16,10 @@ from pipelines.cli.tables import JsonFile, MarkdownFile, PictureFile, report, wr
 from pipelines.cli.tracking_options import InteractionsOption, with_interactions
 from saga_fg.errors import InputError
 
+LengthsOption = Annotated[
+    str | None, typer.Option("--lengths", help="Of made gaps, s, with commas: of 1, 2, 3, 5.  [default: all of them]")
+]
+
 if TYPE_CHECKING:
     from pipelines.bench.gaps.bench import Contender, Run
     from pipelines.bench.gaps.fitted import Fit
@@ -95,10 +99,7 @@ def gaps(
         bool,
         typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
     ] = False,
-    lengths: Annotated[
-        str | None,
-        typer.Option("--lengths", help="Of made gaps, s, with commas: of 1, 2, 3, 5.  [default: all of them]"),
-    ] = None,
+    lengths: LengthsOption = None,
     viewpoint: Annotated[
         str,
         typer.Option(
@@ -172,7 +173,7 @@ def gaps(
             raise InputError(f"set {name}: expected recordings to judge, {why}")
     if plot is not None and passes == 0:
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), _lengths(lengths))
+    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths))
     if situations and (life == "shipped" or passes == 0):
         raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
     runs: dict[str, list[Run]] = {}
@@ -201,6 +202,18 @@ def gaps(
         write_telling_picture(picture, source, runs[source.name], pair)
 
 
+def chosen_lengths(text: str | None) -> tuple[float, ...]:
+    """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
+    from pipelines.bench.gaps.gap import LENGTHS
+
+    known = {f"{length:g}": length for length in LENGTHS}
+    wanted = names("--lengths", text) if text else tuple(known)
+    for each in wanted:
+        if each not in known:
+            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {each!r:.40}")
+    return tuple(known[each] for each in known if each in wanted)
+
+
 def _recordings(source: RecordingSource) -> tuple[str, ...]:
     with source.opened() as dataset:
         return dataset.scenes
@@ -222,18 +235,6 @@ def _folds(text: str | None) -> int | None:
     if not (text.isascii() and text.isdecimal() and int(text) >= 2):
         raise InputError(f"--folds: expected a number of 2 or more, or place, got {text!r:.40}")
     return int(text)
-
-
-def _lengths(text: str | None) -> tuple[float, ...]:
-    """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
-    from pipelines.bench.gaps.gap import LENGTHS
-
-    known = {f"{length:g}": length for length in LENGTHS}
-    wanted = names("--lengths", text) if text else tuple(known)
-    for each in wanted:
-        if each not in known:
-            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {each!r:.40}")
-    return tuple(known[each] for each in known if each in wanted)
 
 
 def _check_names(recordings: Mapping[str, Sequence[str]], taught: Sequence[str], judged: Sequence[str]) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from data_tools.datasets.source import names
+from pipelines.cli.bench_gaps import LengthsOption, chosen_lengths
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.tables import JsonFile, MarkdownFile, report
@@ -26,6 +27,28 @@ def tracking(
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--viewpoint",
+            help="Of the sensors in the sets ngsim and openacc: mast, above, vehicle, the id of one, or X,Y,Z in m.  "
+            "[default: mast, vehicle]",
+        ),
+    ] = None,
+    test: Annotated[
+        str | None, typer.Option("--test", help="Track these recordings alone, with commas.  [default: all]")
+    ] = None,
+    passes: Annotated[
+        int,
+        typer.Option(
+            "--passes",
+            min=0,
+            help="Track each recording so often with made gaps, in the sets simulated, ngsim and openacc; see bench "
+            "gaps.  [default: 0, as detected]",
+            show_default=False,
+        ),
+    ] = 0,
+    lengths: LengthsOption = None,
     components: Annotated[bool, typer.Option(help="Switch the components off one by one as well.")] = True,
     contenders: Annotated[
         bool,
@@ -49,19 +72,25 @@ def tracking(
       saga-fg bench tracking --sets simulated --scenes 4 --draws 0
       saga-fg bench tracking --data data --json figures.json --markdown tables.md
       saga-fg bench tracking --data data --sets kitti --no-components
+      saga-fg bench tracking --data data --sets ngsim --passes 4 --lengths 2,3 --contenders --no-components
       saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components
     """
-    from pipelines.bench.recordings import SETS, recording_set
+    from pipelines.bench.gaps.hidden_recordings import with_made_gaps
+    from pipelines.bench.recordings import SETS, chosen_recordings, recording_set
     from pipelines.bench.tracking import TrackingBenchSettings, bench_set
     from pipelines.bench.tracking_tables import figures, tables
     from pipelines.config import load_config
 
     everything = (*SETS, "simulated") if data is not None else ("simulated",)
-    chosen = [recording_set(name, data, scenes) for name in (names("--sets", sets) if sets else everything)]
+    chosen = [recording_set(name, data, scenes, viewpoint) for name in (names("--sets", sets) if sets else everything)]
+    if test is not None:
+        chosen = chosen_recordings(chosen, names("--test", test))
     settings = TrackingBenchSettings(components, contenders, draws)
-    results = []
+    results, hidden_for = [], chosen_lengths(lengths)
     with progress_bar(unit="variants") as progress:
         for recordings in chosen:
-            results.append(bench_set(recordings, load_config(recordings.family, config), settings, progress))
+            base = load_config(recordings.family, config)
+            compared = with_made_gaps(recordings, base.sensors, passes, hidden_for) if passes else recordings
+            results.append(bench_set(compared, base, settings, progress))
     shown = [table for result in results for table in tables(result)]
     report(shown, {result.name: figures(result) for result in results}, json_file, markdown)

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.datasets.annotated import detected
-from data_tools.datasets.overlapping import overlapping
 from data_tools.datasets.registry import dataset_source
 from data_tools.simulator.recorded_world import ABOVE
-from pipelines.bench.recordings import SETS, TRAFFIC_SETS, RecordingSet, recording_set
+from pipelines.bench.recordings import SETS, TRAFFIC_SETS, RecordingSet, TrueSet, recording_set
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 
@@ -21,8 +20,6 @@ ANNOTATED = {"argoverse2": "av2", "eth_ucy": "eth_ucy"}
 """Data sets whose detections are their visible annotations, and their folders in that of --data."""
 KNOWN = (*SETS, "simulated", *TRAFFIC_SETS, *ANNOTATED)
 """All sets."""
-OVERLAPPING = ("ngsim",)
-"""Sets whose recordings may overlap in time."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +59,8 @@ class RecordingSource:
     @property
     def clusters(self) -> Mapping[str, str]:
         """The first of the recordings that overlap in time with each, by name; empty where none can."""
-        if self.name not in OVERLAPPING or self.data is None:
-            return {}
-        recordings = TRAFFIC_SETS[self.name][0](self.data)
-        return overlapping(recordings.recording(name) for name in recordings.names)
+        found = _set(self.name, self.data, self.scenes, self.viewpoint) if self.name in TRAFFIC_SETS else None
+        return found.clusters if isinstance(found, TrueSet) else {}
 
     def places(self, recordings: Sequence[str]) -> Mapping[str, str]:
         """The site or setting of each recording of traffic; of other sets, each is a place of its own."""
