@@ -10,7 +10,8 @@ from benchmarks.independent_filter import INITIAL_SPEED_DEVIATION, FilteredTraje
 from benchmarks.trajectories import Trajectories
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.numerics.arrays import IntArray

@@ -14,7 +14,8 @@ import numpy as np
 from pipelines.bench.flocks import sample_step
 from pipelines.config import TrackConfig
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following, Neighbours, build_graph
+from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.sensor import NoiseModel, Sensor

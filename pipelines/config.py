@@ -41,7 +41,7 @@ class TrackConfig:
     """Configuration of tracking."""
 
     tracker: TrackerSettings = settings_group(
-        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges)"
+        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges and trails)"
     )
     greedy: GreedySettings = settings_group(GreedySettings, "the tracker of the method centerpoint")
     sensors: Mapping[str, Sensor] = settings_group(
@@ -76,7 +76,7 @@ class TrackConfig:
         )
 
     def new_tracker(self, method: Method, observer: Observer | None = None) -> Tracker | GreedyTracker:
-        """A fresh tracker: `saga`, `kf` (the same without edges) or `centerpoint` (greedy nearest centre).
+        """A fresh tracker: `saga`, `kf` (the same without edges and trails) or `centerpoint` (greedy nearest centre).
 
         The `observer` watches the first two; `centerpoint` tells nothing.
         """
@@ -86,7 +86,10 @@ class TrackConfig:
 
     def of_method(self, method: Method) -> TrackConfig:
         """Return a copy for a method: without edges, unless it is `saga`."""
-        return self if method == "saga" else replace(self, tracker=replace(self.tracker, edges=()))
+        if method == "saga":
+            return self
+        alone = replace(self.tracker, edges=(), trails=replace(self.tracker.trails, memory=0.0))
+        return replace(self, tracker=alone)
 
 
 def load_interactions(path: Path) -> LearnedInteractions:

@@ -49,9 +49,9 @@ MOST_GAPS = 300  # a random sample to learn from; more only take longer
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
 _LED = Following(
     SharedVelocity(),
-    rate=1.5,
+    rate=3.0,
     max_gap=60.0,
-    gap_scale=18.0,
+    gap_scale=16.0,
     lateral_scale=1.2,
     min_separation=0.8,
     classes=ROAD_USERS,

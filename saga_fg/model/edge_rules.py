@@ -1,31 +1,30 @@
 r"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
 
     rate_ij = r_j * rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
+              r_j * rate * exp( -ahead_ij / gap_scale ) * ...                                  behind a leader
 
-r_j is the probability that the source exists: the rate is the expected one, and clutter pulls at nobody.
+The nearer a leader, the sooner its speed becomes one's own; on recorded traffic this decides more than how the law
+depends on the gap. r_j is the probability that the source exists: the rate is the expected one, and clutter pulls at
+nobody.
 A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the tracker in place of these.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.errors import InputError
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
 from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity, applies
-from saga_fg.model.motion import distinct_types
+from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
-from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.settings import (
     NonNegative,
     NonNegativeInt,
@@ -35,7 +34,6 @@ from saga_fg.settings import (
     settings_group,
 )
 
-_MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 _LEAST = 1e-9  # probability that a certain object does not exist
 Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
@@ -129,15 +127,17 @@ class Following(Settings):
     interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
-    rate: NonNegative = setting(
-        0.5, "strength of an edge at lateral offset and heading difference zero, 1/s; usual 0.2 to 1"
-    )
+    rate: NonNegative = setting(1.0, "strength of an edge right behind the leader, straight ahead, 1/s; usual 0.5 to 4")
     max_gap: NonNegative = setting(
         40.0,
         "no edge from a leader further ahead than this, centre to centre, m; usual 20 to 80; higher: more "
         "edges, slower",
     )
-    gap_scale: PositiveOrInf = setting(25.0, "sigma of the kernel on the distance ahead, m; .inf: no kernel")
+    gap_scale: PositiveOrInf = setting(
+        20.0,
+        "distance ahead over which the strength falls to 37 %, m; usual 10 to 30, .inf: it does not; higher: leaders "
+        "far ahead count more",
+    )
     lateral_scale: PositiveOrInf = setting(
         1.2,
         "sigma of the kernel on the leader's lateral offset, m; usual a third of a lane; higher: leaders in "
@@ -167,9 +167,9 @@ class Following(Settings):
         share = np.ones_like(f.ahead) if self.parked else f.target_moved
         if self.leaders != "any":
             share = share * (f.source_moved if self.leaders == "moving" else 1 - f.source_moved)
-        exponent = (f.ahead / self.gap_scale) ** 2 + (f.turn / self.heading_scale) ** 2
-        exponent = exponent + (lateral_of_arc(f) / self.lateral_scale) ** 2
-        return np.where(self.in_lane(f), share * self.rate * np.exp(-exponent / 2), 0.0)
+        exponent = (f.turn / self.heading_scale) ** 2 + (lateral_of_arc(f) / self.lateral_scale) ** 2
+        rate = self.rate * np.exp(-f.ahead / self.gap_scale - exponent / 2)
+        return np.where(self.in_lane(f), share * rate, 0.0)
 
     def in_lane(self, f: EdgeFeatures) -> BoolArray:
         """Mask (...) of the sources ahead in the lane of their targets, near enough to lead or to be in between."""
@@ -235,9 +235,9 @@ def traffic_rules() -> tuple[Following, Neighbours]:
     hidden = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
     leader = Following(
         SharedVelocity(),
-        rate=1.5,
+        rate=3.0,
         max_gap=60.0,
-        gap_scale=18.0,
+        gap_scale=16.0,
         lateral_scale=1.2,
         min_separation=0.8,
         leaders="moving",
@@ -259,66 +259,6 @@ def traffic_rules() -> tuple[Following, Neighbours]:
 def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
     """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
     return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))
-
-
-def build_graph(
-    nodes: NodeTable,
-    rules: Sequence[EdgeRule],
-    min_rate: float = 1e-3,
-    explained_noise: float = 0.0,
-    noise_scale: FloatArray | None = None,
-) -> SceneGraph:
-    """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
-
-    Edges weaker than `min_rate` (1/s) are left out.
-
-    A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
-    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it.
-
-    Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
-    """
-    groups: list[Edges] = []
-    nonlinear: list[NonlinearEdges] = []
-    total_rate = np.zeros(len(nodes))
-    if len(nodes) > 1:
-        kinds, kind = distinct_types(nodes.types)
-        first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
-        kind = np.array([first.setdefault(t.components, len(first)) for t in kinds])[kind]
-        for rule in rules:
-            target, source, rate = _checked_pairs(rule, nodes)
-            if nodes.existence is not None:
-                rate = rate * nodes.existence[source]
-            keep = rate >= min_rate
-            target, source, rate = target[keep], source[keep], rate[keep]
-            pair_kind = kind[target] * len(first) + kind[source]
-            for k in np.flatnonzero(np.bincount(pair_kind)):
-                mine = pair_kind == k
-                t, s = target[mine], source[mine]
-                law = rule.interaction
-                if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
-                    continue
-                if isinstance(law, AccelerationLaw):
-                    nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))
-                else:
-                    groups.append(Edges(type(law).__name__, t, s, rate[mine], *law.triples(nodes, t, s)))
-                np.add.at(total_rate, t, rate[mine])
-    scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
-    if noise_scale is not None:
-        scale = scale * noise_scale
-    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale, tuple(nonlinear))
-
-
-def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
-    """The pairs of a rule, which may be a user's; `InputError` for rows or rates that are not valid."""
-    what = f"edge rule {type(rule).__name__}"
-    pairs = rule.pairs(nodes)
-    target = checked_rows(f"{what}: target", pairs[0])
-    source = checked_rows(f"{what}: source", pairs[1], len(target))
-    for name, rows in (("target", target), ("source", source)):
-        if len(rows) and (rows.min() < 0 or rows.max() >= len(nodes)):
-            bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
-            raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
-    return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))
 
 
 def close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray]:

@@ -9,6 +9,12 @@ and across u by A_2, in which an acceleration fades at once (`Curvilinear`). Its
     v' = R(theta) (F0 x0)_v,   a' = R(theta) (F0 x0)_a
     p' = p + sin(theta / 2) / (theta / 2) R(theta / 2) ((F0 x0)_p - p)
 
+Wheels roll along the course: of a vehicle that nobody detects, what of the velocity is across it may fade at a rate k.
+With n the normal of h + theta, and n_m that of h + theta / 2:
+
+    v', a'  times  I - n n^T (1 - exp(-k dt))
+    p' - p  times  I - n_m n_m^T (1 - (1 - exp(-k dt)) / (k dt))
+
 The chord is exact for a constant speed and a constant rate; where the rate fades or the speed changes it is near.
 
     Q = Q_1 (x) u u^T + Q_2 (x) (I - u u^T),   Q_k = int exp(A_k s) Qc_k exp(A_k s)^T ds,   Qc_2: + q on the velocity
@@ -38,6 +44,7 @@ from saga_fg.numerics.columns import Columns
 
 RATE_CORRELATION = 1.0  # s
 _LEAST_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
+_LEAST = 1e-9  # time constants, so that nothing is divided by 0
 _P, _V, _A = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
@@ -48,6 +55,7 @@ class KnownCourses(Columns):
     rate           (n,) turn rate, rad/s, left is positive
     lateral_noise  (n,) q above, m^2/s^3
     brake          (n, 2) mean acceleration that is taken away, m/s^2
+    settling       (n,) k above, 1/s, 0 for velocities across that stay
     """
 
     ids: IntArray
@@ -55,6 +63,7 @@ class KnownCourses(Columns):
     rate: FloatArray
     lateral_noise: FloatArray
     brake: FloatArray
+    settling: FloatArray
     node_type: NodeType
 
     @classmethod
@@ -67,14 +76,17 @@ class KnownCourses(Columns):
         rate_variance: FloatArray,
         mean: FloatArray,
         dt: float,
+        settling: FloatArray | None = None,
     ) -> KnownCourses:
-        """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2."""
+        """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2; settling
+        0 if not given."""
         u = _unit(heading)
         speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
         reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
         brake = np.where(reverses, acceleration, 0.0)[:, None] * u
         lateral_noise = (mean[:, _V] ** 2).sum(axis=1) * rate_variance * 2 * RATE_CORRELATION
-        return cls(ids, heading, rate, lateral_noise, brake, node_type)
+        settling = np.zeros(len(ids)) if settling is None else settling
+        return cls(ids, heading, rate, lateral_noise, brake, settling, node_type)
 
     def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, MatchedMotion]:
         """dt seconds later, and the motions until then; scale (n,) of the process noise."""
@@ -91,6 +103,10 @@ class KnownCourses(Columns):
         Q = _planar(Q_along, ahead) + _planar(Q_across + self.lateral_noise[:, None, None] * Q_white, aside)
         b = -(F[:, :, _A] @ self.brake[:, :, None])[:, :, 0]
         chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
+        passed = np.maximum(self.settling * dt, _LEAST)
+        faded = -np.expm1(-passed)
+        chord = _less_across(self.heading + theta / 2, 1 - faded / passed) @ chord
+        turn = _less_across(self.heading + theta, faded) @ turn
         F[:, _P, 2:], b[:, _P] = chord @ F[:, _P, 2:], (chord @ b[:, _P, None])[:, :, 0]
         for part in (_V, _A):
             F[:, part], b[:, part] = turn @ F[:, part], (turn @ b[:, part, None])[:, :, 0]
@@ -108,6 +124,12 @@ def _planar(one_axis: FloatArray, projection: FloatArray) -> FloatArray:
 
 def _unit(heading: FloatArray) -> FloatArray:
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+def _less_across(course: FloatArray, share: FloatArray) -> FloatArray:
+    """Matrices (n, 2, 2) that take away a share (n,) of what is across a course (n,)."""
+    normal = _unit(course + np.pi / 2)
+    return np.asarray(np.eye(2) - share[:, None, None] * normal[:, :, None] * normal[:, None])
 
 
 def _rotation(theta: FloatArray) -> FloatArray:

@@ -144,6 +144,11 @@ class Curvilinear(Settings):
         6.0,
         "time constant with which a turn seen in the headings fades, s; usual 1 to 8, 0: none; higher: longer curves",
     )
+    course_time: NonNegative = setting(
+        0.0,
+        "time constant with which the velocity across the course of an undetected object fades, s; usual 0.5 to 2, "
+        "0: never; lower: it keeps to its path, that of its heading and of earlier traffic",
+    )
     turning_share: Fraction = setting(
         0.3, "share of objects that turn; usual 0.1 to 0.5; higher: small turn rates are believed sooner"
     )

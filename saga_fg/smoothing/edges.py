@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph

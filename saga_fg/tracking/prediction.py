@@ -11,13 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.model.edge_rules import build_graph
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.known_course import KnownCourses
-from saga_fg.model.motion import Curvilinear
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.deletion import untrackable
+from saga_fg.tracking.known_courses import known_courses
 from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
@@ -52,9 +50,11 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
     state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
-    state.graph = replace(state.graph, modes=_known_courses(state, dt))
+    courses, heading = known_courses(state, dt, unseen)
+    state.graph = replace(state.graph, modes=courses)
     state.joint.predict(state.graph, dt)
     table.box.turn_with(before, state.kinematics().velocity, unseen)
+    table.box.yaw = np.where(np.isfinite(heading), heading, table.box.yaw)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
 
@@ -66,28 +66,6 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
         return None
     stationarity.predict(dt, state.kinematics(), settings)
     return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
-
-
-def _known_courses(state: TrackerState, dt: float) -> tuple[KnownCourses, ...]:
-    """The courses of vehicles with a heading over the next `dt` s, by motion; their turn rates are predicted after."""
-    table, velocity = state.table, state.kinematics().velocity
-    turn_time, found = np.zeros(len(table)), []
-    for node_type, rows in state.joint.rows_by_type(table.label, moving=True):
-        motion = node_type.motion
-        if not isinstance(motion, Curvilinear):
-            continue
-        turn_time[rows] = motion.turn_time
-        rows = rows[np.isfinite(table.box.yaw[rows])]
-        if len(rows):
-            rate, variance = table.turn.known(rows, motion.turning_share)
-            turns = (motion.turn_time > 0) & (np.hypot(*velocity[rows].T) > MOVING)
-            rate, variance = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0)
-            mean = state.joint.estimator.mean(table.id[rows])
-            heading = table.box.yaw[rows]
-            found.append(KnownCourses.of(node_type, table.id[rows], heading, rate, variance, mean, dt))
-    if turn_time.any():
-        table.turn.predict(dt, turn_time)
-    return tuple(found)
 
 
 def node_table(state: TrackerState) -> NodeTable:

@@ -32,6 +32,7 @@ from saga_fg.settings import (
 from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName, EstimatorName
 from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.trails import TrailSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.road_map import RoadMap
 from saga_fg.types.signal import SignalSettings
@@ -273,6 +274,7 @@ class TrackerSettings(Settings):
     traffic_flow_prior: TrafficFlowSettings = settings_group(
         TrafficFlowSettings, "speed of new tracks from the traffic around them"
     )
+    trails: TrailSettings = settings_group(TrailSettings, "paths of undetected objects from those of earlier traffic")
     stationarity: StationaritySettings = settings_group(
         StationaritySettings, "estimation of which objects are stationary"
     )

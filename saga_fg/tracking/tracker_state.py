@@ -33,6 +33,7 @@ from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic_flow import TrafficFlowPrior
+from saga_fg.tracking.trails import Trails
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
@@ -50,6 +51,7 @@ class TrackerSnapshot:
     map_nodes     known lights, stop lines, lanes and walls
     ego           the vehicle as a node
     traffic       speeds of earlier traffic
+    trails        paths of earlier traffic
     graph         scene graph of the latest interval, None before the first
     start         time from which all others in here are counted, s
     time          of the state, s
@@ -66,6 +68,7 @@ class TrackerSnapshot:
     map_nodes: MapNodes
     ego: EgoNode
     traffic: TrafficFlowPrior
+    trails: Trails
     graph: SceneGraph | None
     start: float
     time: float
@@ -106,7 +109,7 @@ class TrackerState:
         self.table = TrackTable.empty(len(self.class_groups))
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.of(settings)
-        self.traffic = TrafficFlowPrior(settings.traffic_flow_prior)
+        self.traffic, self.trails = TrafficFlowPrior(settings.traffic_flow_prior), Trails(settings.trails)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -206,7 +209,7 @@ class TrackerState:
 
 
 def _copied(value: T) -> T:
-    """Copy what is changed in place: the table, the map, the vehicle and traffic; all else is never changed."""
+    """Copy what is changed in place: the table, the map, the vehicle, traffic and trails; all else is never changed."""
     if isinstance(value, TrackTable):
         return value.snapshot()
-    return copy.copy(value) if isinstance(value, MapNodes | EgoNode | TrafficFlowPrior) else value
+    return copy.copy(value) if isinstance(value, MapNodes | EgoNode | TrafficFlowPrior | Trails) else value

@@ -19,6 +19,7 @@ from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.tracking.retrodiction import past_positions
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic_flow import Passages
+from saga_fg.tracking.trails import TrailPoints
 
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
@@ -46,6 +47,9 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         moves = (speed > MOVING) & (speed > 3 * now.speed_deviation)
         table.box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
         table.has_moved[t] |= moves[t]
+        seen = t[moves[t]]
+        heading, time = np.arctan2(*now.velocity[seen, ::-1].T), np.full(len(seen), state.time)
+        state.trails.update(TrailPoints(table.id[seen], now.position[seen] + state.origin, heading, time))
     if state.settings.traffic_flow_prior.weight > 0:
         passing, now = table.select(t), state.kinematics().select(t)
         state.traffic.update(Passages.of(passing, now.position + state.origin, now, state.time))

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph, traffic_rules
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, traffic_rules
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
@@ -162,7 +163,7 @@ def test_by_default_a_hidden_vehicle_follows_and_a_duplicate_leads_nobody():
 def test_in_a_straight_queue_each_follows_the_one_ahead(heading):
     pairs = Following().pairs(table(*straight(6, heading=heading)))
     assert leaders(pairs) == {k: k - 1 for k in range(1, 6)}
-    assert pairs.rate == pytest.approx(0.5 * np.exp(-((12.0 / 25.0) ** 2) / 2))
+    assert pairs.rate == pytest.approx(np.exp(-12.0 / 20.0))
 
 
 @pytest.mark.parametrize("radius", [30.0, -30.0, 60.0, -200.0])
@@ -209,7 +210,7 @@ def test_the_rate_falls_with_distance_offset_and_turn():
 
     rates = [rate(10, 0, 0), rate(20, 0, 0), rate(20, 1, 0), rate(20, 1, -0.3)]
     assert rates == sorted(rates, reverse=True)
-    assert rate(20, 20 * np.tan(0.15), 0.3) == pytest.approx(0.5 * np.exp(-((20 / 25) ** 2 + (0.3 / 0.4) ** 2) / 2))
+    assert rate(20, 20 * np.tan(0.15), 0.3) == pytest.approx(np.exp(-20 / 20 - (0.3 / 0.4) ** 2 / 2))
 
 
 # neighbours

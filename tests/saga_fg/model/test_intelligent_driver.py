@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following, build_graph
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.road.stopping import DriverStopping, RedLight
 from saga_fg.model.stability import require_stable

@@ -129,3 +129,32 @@ def test_some_nodes_are_selected():
     assert chosen.ids.tolist() == [3, 1]
     assert chosen.rate.tolist() == [5.0, 3.0]
     assert chosen.node_type is CAR
+
+
+def settled(record, k):
+    return replace(record, settling=np.full(1, k))
+
+
+def test_what_is_across_the_course_fades_and_what_is_along_stays():
+    """On a straight course the velocity across fades like exp(-k t), and moves the vehicle by its integral."""
+    F = own(settled(course(CAR), 2.0), 0.5)[0]
+    after = F @ [0, 0, 10.0, 1.0, 0, 0]
+    assert after[P] == pytest.approx([5.0, (1 - np.exp(-1.0)) / 2])
+    assert after[V] == pytest.approx([10.0, np.exp(-1.0)])
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7])
+def test_along_the_course_of_a_bend_settling_changes_nothing(heading):
+    x = np.concatenate([[1.0, 2.0], 8 * np.array([np.cos(heading), np.sin(heading)]), np.zeros(2)])
+    plain = course(CAR, heading, rate=0.4)
+    expected = own(plain, 0.4)[0] @ x
+    assert own(settled(plain, 2.0), 0.4)[0] @ x == pytest.approx(expected)
+    assert own(settled(plain, 0.0), 0.4)[0] == pytest.approx(own(plain, 0.4)[0], abs=1e-7)
+
+
+def test_two_half_steps_settle_as_one():
+    graph, dt = along(settled(course(CAR, rate=0.4), 1.5)), 0.2
+    halves = discretise(graph.after(dt / 2), dt / 2).F_matrix @ discretise(graph, dt / 2).F_matrix
+    whole = discretise(graph, dt).F_matrix.toarray()
+    assert whole[V, V] == pytest.approx(halves.toarray()[V, V], abs=1e-9)
+    assert whole == pytest.approx(halves.toarray(), abs=1e-2)

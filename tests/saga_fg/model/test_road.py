@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from saga_fg import InputError
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
-from saga_fg.model.edge_rules import Following, build_graph
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.rigid_coupling import Attached, RigidCoupling
 from saga_fg.model.road.cones import ConeLine

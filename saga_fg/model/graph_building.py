@@ -1,0 +1,77 @@
+"""The scene graph of an interval, from the estimates at its start and the rules that choose edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import EdgeRule, Pairs
+from saga_fg.model.interactions import NodeTable, applies
+from saga_fg.model.motion import distinct_types
+from saga_fg.model.nonlinear_interactions import AccelerationLaw
+from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
+from saga_fg.numerics.arrays import FloatArray, checked, checked_rows
+
+_MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+
+
+def build_graph(
+    nodes: NodeTable,
+    rules: Sequence[EdgeRule],
+    min_rate: float = 1e-3,
+    explained_noise: float = 0.0,
+    noise_scale: FloatArray | None = None,
+) -> SceneGraph:
+    """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
+
+    Edges weaker than `min_rate` (1/s) are left out.
+
+    A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it.
+
+    Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
+    """
+    groups: list[Edges] = []
+    nonlinear: list[NonlinearEdges] = []
+    total_rate = np.zeros(len(nodes))
+    if len(nodes) > 1:
+        kinds, kind = distinct_types(nodes.types)
+        first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
+        kind = np.array([first.setdefault(t.components, len(first)) for t in kinds])[kind]
+        for rule in rules:
+            target, source, rate = _checked_pairs(rule, nodes)
+            if nodes.existence is not None:
+                rate = rate * nodes.existence[source]
+            keep = rate >= min_rate
+            target, source, rate = target[keep], source[keep], rate[keep]
+            pair_kind = kind[target] * len(first) + kind[source]
+            for k in np.flatnonzero(np.bincount(pair_kind)):
+                mine = pair_kind == k
+                t, s = target[mine], source[mine]
+                law = rule.interaction
+                if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
+                    continue
+                if isinstance(law, AccelerationLaw):
+                    nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))
+                else:
+                    groups.append(Edges(type(law).__name__, t, s, rate[mine], *law.triples(nodes, t, s)))
+                np.add.at(total_rate, t, rate[mine])
+    scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
+    if noise_scale is not None:
+        scale = scale * noise_scale
+    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale, tuple(nonlinear))
+
+
+def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """The pairs of a rule, which may be a user's; `InputError` for rows or rates that are not valid."""
+    what = f"edge rule {type(rule).__name__}"
+    pairs = rule.pairs(nodes)
+    target = checked_rows(f"{what}: target", pairs[0])
+    source = checked_rows(f"{what}: source", pairs[1], len(target))
+    for name, rows in (("target", target), ("source", source)):
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(nodes)):
+            bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
+            raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
+    return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))

@@ -1,0 +1,142 @@
+r"""Trails of earlier traffic: the paths that vehicles took lately, along which others can be expected to go on.
+
+A trail is a row of points of one track, `SPACING` m apart, each with the direction of travel. A path is predicted from
+a place and a course h in steps of ds: with the trails j near its next place, of each the nearest point, d_j m away,
+
+    k_j = exp( -d_j^2 / (2 reach^2) - (h_j - h)^2 / (2 TURN^2) ),   m, s^2: mean and variance of h_j - h under k_j
+    h'  = h + c m + (1 - c) u ds,   c = K / (K + PRIOR) / (1 + s^2 / AGREEMENT^2),  K = sum of k_j
+
+with u the curvature that the vehicle has itself, which fades along the way. Where there are no trails, it goes on as it
+does; where they part, nothing is known of its course, until it is nearer to one of them.
+
+The trails need no map, outlive single tracks and are forgotten after `memory` s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.settings import NonNegative, Positive, Settings, setting
+
+SPACING = 2.0  # m between the points of a trail
+STEP = 3.0  # m between the points of a predicted path
+NEAREST = 12  # trail points that are compared with a place
+PRIOR = 0.2  # weight of going on as before, against that of one trail right here: few leave the path of others
+TURN = 0.3  # rad, sigma of the kernel on the difference of headings
+AGREEMENT = 0.1  # rad, deviation of the headings of trails from which they say little
+_BEND = 20.0  # m, along which a curvature of one's own fades
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class TrailSettings(Settings):
+    """Paths of vehicles that are not detected, along the trails of earlier traffic, see `saga_fg.tracking.trails`."""
+
+    memory: NonNegative = setting(
+        0.0, "remember the trails of traffic for this long, s; usual 30 to 120; higher: older traffic counts, 0: none"
+    )
+    reach: Positive = setting(
+        1.5, "sigma of the kernel on the distance to a trail, m; usual half a lane; higher: other lanes count"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TrailPoints(Columns):
+    """n points: id of the track, position (n, 2), world, m, heading, rad, time, s."""
+
+    id: IntArray
+    position: FloatArray
+    heading: FloatArray
+    time: FloatArray
+
+
+class Paths(NamedTuple):
+    """Predicted paths of n vehicles at m + 1 places, `STEP` m apart, from where they are.
+
+    position (n, m + 1, 2) m; heading (n, m + 1) rad; certainty (n, m + 1) in [0, 1) with which trails give the heading
+    """
+
+    position: FloatArray
+    heading: FloatArray
+    certainty: FloatArray
+
+
+@dataclass(eq=False)
+class Trails:
+    """The trails of the last `memory` seconds."""
+
+    settings: TrailSettings
+    points: TrailPoints | None = None
+    _tree: cKDTree | None = field(default=None, repr=False)
+
+    def update(self, passing: TrailPoints) -> None:
+        """Remember where moving tracks are, if that is `SPACING` m from their last point."""
+        if self.settings.memory == 0 or len(passing) == 0:
+            return
+        if self.points is None:
+            self.points, self._tree = passing, None
+            return
+        new = passing.select(self._moved(passing))
+        old = self.points.time < passing.time[0] - self.settings.memory
+        if len(new) or old.any():
+            self.points, self._tree = self.points.select(~old).append(new), None
+
+    def _moved(self, passing: TrailPoints) -> BoolArray:
+        """(n,) whether tracks are at least `SPACING` m from their latest points, or have none."""
+        points = self.points
+        assert points is not None
+        ids, last = np.unique(points.id[::-1], return_index=True)
+        if len(ids) == 0:
+            return np.ones(len(passing), dtype=np.bool_)
+        at = np.minimum(np.searchsorted(ids, passing.id), len(ids) - 1)
+        apart = passing.position - points.position[::-1][last[at]]
+        return np.asarray((ids[at] != passing.id) | (np.hypot(*apart.T) >= SPACING))
+
+    def headings(self, ids: IntArray, position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean of h_j - h (n,), rad, at places (n, 2), world, with headings h (n,), and its certainty c (n,);
+        the trails of tracks `ids` (n,) tell them nothing."""
+        points, settings = self.points, self.settings
+        if points is None or len(points) == 0:
+            return np.zeros(len(heading)), np.zeros(len(heading))
+        if self._tree is None:
+            self._tree = cKDTree(points.position, balanced_tree=False, compact_nodes=False)
+        apart, at = self._tree.query(position, k=NEAREST, distance_upper_bound=2 * settings.reach)
+        at = np.minimum(at, len(points) - 1)
+        of = points.id[at]
+        found = np.isfinite(apart) & (of != ids[:, None]) & ~np.tril(of[:, :, None] == of[:, None], -1).any(axis=2)
+        turn = wrap_angle(points.heading[at] - heading[:, None])
+        aside = np.where(found, apart, 0.0)
+        k = np.exp(-((aside / settings.reach) ** 2 + (turn / TURN) ** 2) / 2) * found
+        total = k.sum(axis=1)
+        mean = (k * turn).sum(axis=1) / np.maximum(total, _LEAST)
+        variance = (k * (turn - mean[:, None]) ** 2).sum(axis=1) / np.maximum(total, _LEAST)
+        return mean, total / (total + PRIOR) / (1 + variance / AGREEMENT**2)
+
+    def paths(
+        self, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
+    ) -> Paths:
+        """Predict the paths of n tracks at `position` (n, 2), world, with a `curvature` (n,) of their own, 1/m."""
+        place, course = position, heading
+        turn, certainty = self.headings(ids, place, course)
+        course = course + certainty * turn
+        places, courses, certain = [place], [course], [certainty]
+        for step in range(steps):
+            own = curvature * STEP * np.exp(-(step + 0.5) * STEP / _BEND)
+            middle = course + own / 2
+            there = place + STEP * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+            turn, certainty = self.headings(ids, there, course)
+            after = course + certainty * turn + (1 - certainty) * own
+            middle = (course + after) / 2
+            place = place + STEP * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+            course = after
+            places.append(place)
+            courses.append(course)
+            certain.append(certainty)
+        return Paths(np.stack(places, axis=1), np.stack(courses, axis=1), np.stack(certain, axis=1))

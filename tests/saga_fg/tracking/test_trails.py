@@ -1,0 +1,173 @@
+"""Paths along the trails of earlier traffic, and tracks that follow them unseen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
+from saga_fg.model.sensor import NoiseModel
+from saga_fg.tracking import ClassSettings
+from saga_fg.tracking.trails import STEP, TrailPoints, Trails, TrailSettings
+from tests.saga_fg.traffic_frames import frame
+
+SETTINGS = TrailSettings(memory=60.0)
+SPEED, RADIUS, DT = 8.0, 20.0, 0.1
+NOBODY = np.array([-1])
+
+
+def passing(position, heading, time=0.0, ids=None):
+    n = len(position)
+    ids = np.zeros(n, dtype=np.int64) if ids is None else np.array(ids)
+    return TrailPoints(
+        ids, np.array(position, dtype=float), np.broadcast_to(heading, n).astype(float), np.full(n, time)
+    )
+
+
+def along(place, heading, ids=0, settings=SETTINGS):
+    """The trail of one track by its places (k, 2) and headings (k,)."""
+    trails = Trails(settings)
+    for k, (p, h) in enumerate(zip(place, heading, strict=True)):
+        trails.update(passing([p], h, 0.1 * k, [ids]))
+    return trails
+
+
+def arc(length, radius=RADIUS):
+    """Places and headings of a bend to the left that begins at (0, 0) towards x, after 20 m straight on."""
+    angle = np.maximum(length, 0.0) / radius
+    x = np.where(length < 0, length, radius * np.sin(angle))
+    return np.stack([x, radius * (1 - np.cos(angle))], axis=-1), angle
+
+
+def path(trails, position=(-10.0, 0.0), heading=0.0, curvature=0.0, steps=10, track=NOBODY):
+    return trails.paths(track, np.array([position]), np.array([heading]), np.array([curvature]), steps)
+
+
+def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
+    trails = along(*arc(np.arange(-20, 20, 0.5)))
+    apart = np.hypot(*np.diff(trails.points.position, axis=0).T)
+    assert (apart >= 1.99).all()
+    assert (apart < 2.6).all()
+
+
+def test_points_are_forgotten():
+    trails = along(*arc(np.arange(-20, 0, 2.0)))
+    trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]))
+    assert trails.points.time.min() >= 0.5
+
+
+def test_without_a_memory_nothing_is_remembered():
+    assert along(*arc(np.arange(-20, 0, 2.0)), settings=TrailSettings()).points is None
+
+
+def test_a_path_goes_round_the_bend_of_earlier_traffic():
+    found = path(along(*arc(np.arange(-20, 40, 1.0))))
+    expected, heading = arc(-10 + STEP * np.arange(11))
+    assert found.position[0] == pytest.approx(expected, abs=0.6)
+    assert found.heading[0] == pytest.approx(heading, abs=0.12)
+    assert found.certainty.min() > 0.4
+
+
+def test_a_vehicle_beside_the_trail_stays_beside_it():
+    found = path(along(*arc(np.arange(-20, 40, 1.0))), position=(-10.0, 1.0))
+    radius = np.hypot(*(found.position[0, 5:] - [0.0, RADIUS]).T)
+    assert radius == pytest.approx(np.full(6, RADIUS - 1.0), abs=0.6)
+
+
+@pytest.mark.parametrize(
+    ("position", "heading"), [((-10.0, 0.0), np.pi), ((-10.0, 8.0), 0.0)], ids=["oncoming", "another lane"]
+)
+def test_other_traffic_leads_nobody(position, heading):
+    found = path(along(*arc(np.arange(-20, 40, 1.0))), position, heading, steps=4)
+    assert found.heading[0] == pytest.approx(np.full(5, heading), abs=1e-2)
+    assert found.certainty.max() < 0.05
+
+
+def test_without_trails_a_path_keeps_its_own_bend_which_fades():
+    straight, bent = path(Trails(SETTINGS)), path(Trails(SETTINGS), curvature=0.05)
+    assert straight.heading[0] == pytest.approx(np.zeros(11))
+    turns = np.diff(bent.heading[0])
+    assert turns[0] == pytest.approx(0.05 * STEP, rel=0.1)
+    assert (np.diff(turns) < 0).all()
+
+
+def test_ones_own_trail_leads_one_nowhere():
+    trails = along(*arc(np.arange(-20, 40, 1.0)), ids=5)
+    assert path(trails, track=np.array([5])).certainty.max() == 0.0
+
+
+def test_where_trails_part_the_course_is_uncertain():
+    trails = along(*arc(np.arange(-20, 40, 1.0)))
+    for p in np.arange(-20, 40, 1.0):
+        trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]))
+    found = path(trails)
+    assert found.certainty[0, 1] > 0.5, "before the fork"
+    assert found.certainty[0, 5:8].min() < 0.5 * found.certainty[0, 1], "at the fork"
+
+
+@given(turn=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))
+def test_the_world_may_be_turned_and_moved(turn, x, y):
+    place, heading = arc(np.arange(-20, 20, 2.1))
+    c, s = np.cos(turn), np.sin(turn)
+    R = np.array([[c, s], [-s, c]])
+    here = path(along(place, heading), steps=6)
+    there = path(along(place @ R + (x, y), heading + turn), np.array([-10.0, 0.0]) @ R + (x, y), turn, steps=6)
+    assert there.position[0] == pytest.approx(here.position[0] @ R + (x, y), abs=1e-6)
+    assert there.heading[0] == pytest.approx(here.heading[0] + turn, abs=1e-6)
+
+
+# tracks
+
+SENSORS = {"lidar": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.05)})}
+CAR = ClassSettings(Curvilinear(course_time=0.7), max_coasting=6.0)
+ON = TrackerSettings({"default": CAR}, edges=(), report_coasting=6.0, trails=SETTINGS)
+
+
+def driven(settings, follower=3.0, hidden=2.0, gap=2.5, seed=0):
+    """A car drives round a bend, another `follower` s behind is not detected from a place before the bend on.
+
+    Trackers, and the errors of the hidden car at the end, m.
+    """
+    rng, trackers, start = np.random.default_rng(seed), [Tracker(each, SENSORS) for each in settings], follower + hidden
+    for k in range(int((start + gap) / DT) + 1):
+        t = k * DT
+        times = [t, t - follower] if follower <= t <= start else [t]
+        place, yaw = zip(*(arc(np.array(-20.0 + SPEED * each)) for each in times), strict=True)
+        noisy = np.array(place) + 0.1 * rng.normal(size=(len(times), 2))
+        seen = frame(t, noisy, yaw=np.array(yaw) + 0.05 * rng.normal(size=len(times)))
+        reported = [tracker.step(seen) for tracker in trackers]
+    truth = arc(np.array(-20.0 + SPEED * (hidden + gap)))[0]
+    return trackers, [np.hypot(*(tracks.boxes.position[1, :2] - truth)) for tracks in reported]
+
+
+def test_a_hidden_car_follows_the_path_of_earlier_traffic_round_a_bend():
+    off = replace(ON, trails=TrailSettings(), classes={"default": replace(CAR, motion=Curvilinear())})
+    with_trails, without = np.mean([driven((ON, off), seed=seed)[1] for seed in range(3)], axis=0)
+    assert with_trails < 0.4 * without
+
+
+def test_its_heading_goes_with_it():
+    (tracker,), _ = driven((ON,))
+    assert tracker.tracks(0.0).boxes.yaw[1] == pytest.approx(arc(np.array(-20.0 + SPEED * 4.5))[1], abs=0.2)
+
+
+@pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
+@pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
+def test_every_estimator_takes_the_same_paths(estimator, edges):
+    one = replace(ON, edges=edges)
+    trackers, _ = driven((one, replace(one, estimator=estimator)), gap=1.0)
+    assert trackers[0].graph.modes[0].settling[1] > 0
+    first, second = (tracker.tracks(6.3) for tracker in trackers)
+    assert first.id.tolist() == second.id.tolist()
+    assert first.boxes.position == pytest.approx(second.boxes.position, abs=1e-7)
+    assert first.position_covariance == pytest.approx(second.position_covariance, rel=1e-6)
+
+
+def test_trails_are_part_of_a_snapshot():
+    (tracker,), _ = driven((ON,), gap=0.5)
+    before, later = tracker.snapshot(), frame(5.6, [arc(np.array(-20 + SPEED * 5.6))[0]], yaw=0.5)
+    first = tracker.step(later).boxes.position
+    tracker.restore(before)
+    assert np.array_equal(tracker.step(later).boxes.position, first)
