@@ -12,6 +12,7 @@ from typing import Literal, get_args
 from data_tools.files.error_messages import unknown_name
 from pipelines.configuration import load_settings, read_settings
 from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.model.sensor import Sensor
@@ -70,10 +71,13 @@ class TrackConfig:
         return replace(self, tracker=replace(self.tracker, classes=classes))
 
     def with_interactions(self, learned: LearnedInteractions) -> TrackConfig:
-        """Return a copy with learned edge rules; process noise stays, as association needs more than prediction."""
-        return replace(
-            self, tracker=replace(self.tracker, edges=learned.edges, explained_noise=learned.explained_noise)
-        )
+        """Return a copy with learned edge rules in place of those that can be learned, and with their explained noise.
+
+        Process noise stays, as association needs more of it than prediction; so do signals, lanes, lines and walls.
+        """
+        others = tuple(rule for rule in self.tracker.edges if not isinstance(rule, Following | Neighbours))
+        edges, explained = learned.edges + others, learned.explained_noise
+        return replace(self, tracker=replace(self.tracker, edges=edges, explained_noise=explained))
 
     def new_tracker(self, method: Method, observer: Observer | None = None) -> Tracker | GreedyTracker:
         """A fresh tracker: `saga`, `kf` (the same without edges and trails) or `centerpoint` (greedy nearest centre).

@@ -23,7 +23,6 @@ from saga_fg.types.track import Tracks
 
 PAST = 3.0  # s, of the paths that are drawn
 COASTING = 0.15  # s without detection from which a track is drawn as coasting
-ELLIPSE_95 = 5.991  # 95 % quantile of the chi-square distribution with 2 degrees of freedom
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b", "#637939", "#3949ab")
 Extent = tuple[float, float, float, float]
 
@@ -110,7 +109,7 @@ def _draw_tracks(ax: Any, panel: Panel, ego_T_world: FloatArray, extent: Extent)
                 *centre, *velocity[row], width=0.12, head_width=0.7, length_includes_head=True, linewidth=0, **style
             )
         if coasting:
-            ring = centre + ellipse_95(track.position_covariance) @ ego_T_world[:2, :2].T
+            ring = centre + ellipse(track.position_covariance) @ ego_T_world[:2, :2].T
             ax.plot(*ring.T, linewidth=0.8, **style)
         ax.annotate(
             str(track.id), centre, xytext=(0, 7), textcoords="offset points", fontsize=7, ha="center",
@@ -126,11 +125,12 @@ def _outlines(boxes: Boxes, ego_T_world: FloatArray) -> FloatArray:
     return Boxes(local.label, local.position, size, np.where(known, local.yaw, 0.0), local.velocity).corners()
 
 
-def ellipse_95(covariance: FloatArray) -> FloatArray:
-    """Return the 95 % ellipse (64, 2) of a position covariance (2, 2), about the origin."""
+def ellipse(covariance: FloatArray, probability: float = 0.95) -> FloatArray:
+    """Return the ellipse (64, 2) of a probability of a position covariance (2, 2), about the origin."""
     values, vectors = np.linalg.eigh(covariance)
+    squared = -2 * np.log(1 - probability)  # chi-squared with two degrees of freedom
     angle = np.linspace(0.0, 2 * np.pi, 64)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.sqrt(ELLIPSE_95 * np.maximum(values, 0.0))
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.sqrt(squared * np.maximum(values, 0.0))
     return np.asarray(circle @ vectors.T)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.plots.birds_eye import ellipse_95
+from data_tools.plots.birds_eye import ellipse
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 COLOURS = {"interaction": "#4d4d4d", "detection": "#009e73", "initiation": "#cc79a7", "marginal prior": "#8c8c8c"}
@@ -130,7 +130,7 @@ def _draw_node(ax: Any, node: Mapping[str, Any], place: FloatArray, newest: bool
         points = np.concatenate([outline, outline[:1]]) if box else outline
         ax.plot(*points.T, color="#9a9a9a" if box else "#56b4e9", linewidth=0.8, zorder=2)
     if "covariance" in node:
-        ring = (place + ellipse_95(np.array(node["covariance"], dtype=float))).T
+        ring = (place + ellipse(np.array(node["covariance"], dtype=float))).T
         ax.plot(*ring, color="#1f77b4", alpha=0.45, linewidth=0.6, zorder=2)
         if np.ptp(ring, axis=1).max() < LARGE:
             ax.fill(*ring, facecolor="#1f77b4", alpha=0.15, linewidth=0, zorder=2)

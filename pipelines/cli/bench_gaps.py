@@ -121,6 +121,10 @@ def gaps(
             callback=writable,
         ),
     ] = None,
+    of: Annotated[
+        str | None,
+        typer.Option("--of", help="Draw a gap of an object in this situation, such as 'at red'.", metavar="SITUATION"),
+    ] = None,
     json_file: JsonFile = None,
     markdown: MarkdownFile = None,
     verbose: Verbose = False,
@@ -140,6 +144,7 @@ def gaps(
       saga-fg bench gaps --data data --sets kitti --train 0000,0003 --test 0002,0007 --plot gaps.png
       saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
       saga-fg bench gaps --data data --sets ngsim --life kept --folds place --fit edges,boosted --situations
+      saga-fg bench gaps --data data --sets ngsim --test USA_Lanker-2_6_T-1 --life kept --picture gap.png --of 'at red'
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -147,6 +152,7 @@ def gaps(
     from pipelines.bench.gaps.fitted import bench_splits, splits_of
     from pipelines.bench.gaps.picture import write_telling_picture
     from pipelines.bench.gaps.plot import write_plot
+    from pipelines.bench.gaps.situations import SITUATIONS
     from pipelines.bench.gaps.sources import KNOWN, RecordingSource, set_names
     from pipelines.bench.gaps.tables import figures, tables
     from pipelines.config import load_config
@@ -176,6 +182,8 @@ def gaps(
     settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths))
     if situations and (life == "shipped" or passes == 0):
         raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
+    if of is not None and (picture is None or of not in SITUATIONS):
+        raise InputError(f"--of: expected --picture, and one of {', '.join(SITUATIONS)}")
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
         for source in sources:
@@ -199,7 +207,7 @@ def gaps(
         compared = _contenders(contenders, own or [], interactions, source.family, load_config(source.family, config))
         better = next((each for each in compared if each.name != against), compared[0])
         pair = [next(each for each in compared if each.name == against), better]
-        write_telling_picture(picture, source, runs[source.name], pair)
+        write_telling_picture(picture, source, runs[source.name], pair, of)
 
 
 def chosen_lengths(text: str | None) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ configuration. Innovations after gaps have heavy tails, hence Student's t. How w
 noise, which serves association as well and is left as it is: the scale c of each class is the most likely one, and is
 not kept. The parameters are the logarithms of rates and widths within bounds, so that rates stay positive. The
 objective is minimised by L-BFGS-B with differences for derivatives: one prediction of all gaps takes a fraction of a
-second, and rules may be anybody's. A weak Gaussian prior about the template decides where the recordings do not.
+second, and rules may be anybody's. A Gaussian prior about the template decides where the recordings do not.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "speed_scale": (0.1, 10.0),
 }
 """Bounds of rates and widths; an infinite width stays infinite. Others: a tenth to ten times the template's value."""
-PRIOR = 2e-2  # weight of a unit of squared difference from the template, against the mean over the gaps
+PRIOR = 0.4  # weight of a unit of squared difference from the template, against the mean over the gaps
 TAILS = 3.0  # degrees of freedom of the innovations
 PLACE_DEVIATION = 0.1  # m, of labels
 FEWEST = 30  # places of a class; classes with fewer share a scale
@@ -113,11 +113,16 @@ class FittedInteractions:
 
 
 def fit_interactions(
-    sample: HiddenObjects, settings: TrackerSettings, template: Sequence[Rule] = TEMPLATE, iterations: int = 8
+    sample: HiddenObjects,
+    settings: TrackerSettings,
+    template: Sequence[Rule] = TEMPLATE,
+    iterations: int = 8,
+    prior: float = PRIOR,
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
     settings   of the tracker, with its base motion; template: where the search begins
+    prior      weight of the template; gaps of one recording tell much the same, so it is not small
 
     Rules whose classes do not occur are left out. Rules that reach no gap stay as they are, with a loss of NaN. Raises
     `InputError` for a sample without gaps.
@@ -133,7 +138,7 @@ def fit_interactions(
 
     def loss(x: FloatArray) -> float:
         prediction = sample.predict(settings, parameters.valued(x))
-        return negative_log_likelihood(sample, prediction) + PRIOR * float(((x - start) ** 2).sum())
+        return negative_log_likelihood(sample, prediction) + prior * float(((x - start) ** 2).sum())
 
     options = {"maxiter": iterations, "eps": 1e-3}
     found = minimize(loss, start, method="L-BFGS-B", bounds=parameters.bounds, options=options)

@@ -6,6 +6,7 @@ with made gaps (`pipelines.bench.gaps.bench`), on the tracker's own configuratio
 
     everywhere   edges act as fitted
     hidden       edges are weighted by their information gain, low into objects in view, and fitted with it
+    refitted     the rules of the configuration, fitted
     shipped      the rules of the configuration
     nowhere      none: the base motion alone
 
@@ -29,7 +30,9 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.model.edge_information import EdgeInformation
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.types.dataset import Scene
 
 HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
@@ -106,18 +109,23 @@ def learn_interactions(
             progress(f"base motion {name}", done + 1, len(scenes))
     if not any(gaps.values()):
         raise InputError(f"{origin}: expected objects that are followed for {settings.gaps.followed:g} s and more")
-    templates = {"refitted": start.edges} if start is not None and start.edges else _forms()
-    shipped = tuple(rule for rule in config.tracker.edges if hasattr(rule, "classes"))
+    shipped = tuple(rule for rule in config.tracker.edges if isinstance(rule, Following | Neighbours))
+    templates = _forms(shipped) if start is None else {"refitted": start.edges}
     groups = coupled_classes([*shipped, *(rule for rules in templates.values() for rule in rules)])
 
     def fitted(names: Sequence[str], forms: Mapping[str, Rules], group: tuple[str, ...]) -> dict[str, Rules]:
-        parts = [found for name in names if (found := gaps[name]) is not None]
+        parts = [part for name in names if (part := gaps[name]) is not None]
         sample = HiddenObjects.pooled(parts) if parts else None
         mine = None if sample is None else sample.select(np.flatnonzero(np.isin(sample.label, group)))
         if mine is None or len(mine) == 0:
             return {}
-        rules = {form: _of_group(rules, group) for form, rules in forms.items()}
-        return {form: fit_interactions(mine, config.tracker, own).rules for form, own in rules.items() if own}
+        found: dict[str, Rules] = {}
+        for done, (form, rules) in enumerate(forms.items()):
+            if own := _of_group(rules, group):
+                found[form] = fit_interactions(mine, config.tracker, own).rules
+            if progress is not None:
+                progress(f"fit {form}, {group[0]}, ...", done + 1, len(forms))
+        return found
 
     first, second = held_out_parts(scenes)
     parts = [
@@ -177,10 +185,11 @@ def coupled_classes(rules: Sequence[Rule]) -> list[tuple[str, ...]]:
     return [tuple(sorted(group)) for group in groups]
 
 
-def _forms() -> dict[str, Rules]:
+def _forms(shipped: Rules) -> dict[str, Rules]:
     return {
         "everywhere": TEMPLATE,
         "hidden": tuple(replace(rule, information_gain=HIDDEN) for rule in TEMPLATE),
+        "refitted": tuple(rule for rule in shipped if not isinstance(rule.interaction, AccelerationLaw)),
     }
 
 

@@ -2,13 +2,14 @@
 
 The object travels from left to right. Its labels are a grey line, dashed where it has no detection; the boxes of its
 neighbours are grey, and crosses are detections, at the last moment of the gap. Each track that holds the object has a
-colour of its own, from the moment at which it does, with its 95 % ellipse at every second of the gap: one colour before
-and after the gap is one identity.
+colour of its own, from the moment at which it does, with its 90 % ellipse at every second of the gap: one colour before
+and after the gap is one identity. Where there is a road map, its lanes are thin lines, and its stop lines have the
+colours that their lights show at the last moment of the gap; the next one ahead is in the picture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,19 +18,26 @@ import numpy as np
 
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import png
-from data_tools.plots.birds_eye import COLOURS, ellipse_95
+from data_tools.plots.birds_eye import COLOURS, ellipse
 from pipelines.bench.gaps.bench import Contender, Run, judged_run
 from pipelines.bench.gaps.contenders import Life
 from pipelines.bench.gaps.gap import Gap
 from pipelines.bench.gaps.judging import CAP, GapOutcome
 from pipelines.bench.gaps.labelled import LabelledScene
+from pipelines.bench.gaps.route import Route
+from pipelines.bench.gaps.situations import colours_at, first_line
 from pipelines.bench.gaps.sources import RecordingSource
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.types.road_map import RoadMap
 from saga_fg.types.track import Tracks
 
 BEFORE, AFTER = 1.5, 1.0  # s
 MARGIN, LEAST = 8.0, 10.0  # m: before and after the object's way, and the least height of a panel
+ROAD_MARGIN, ROAD_LEAST = 15.0, 16.0  # m: the same where there is a road map
+BEYOND_LINE = 5.0  # m
+RING = 0.9  # probability of the ellipses
+LIGHTS = {"red": "#d62728", "amber": "#ff9f0e", "green": "#2ca02c"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,34 +50,41 @@ class DrawnGap:
     outcome: GapOutcome
 
 
-def telling_gap(first: Sequence[Run], second: Sequence[Run]) -> tuple[str, Gap]:
+def telling_gap(first: Sequence[Run], second: Sequence[Run], situation: str | None = None) -> tuple[str, Gap]:
     """The recording and the gap in which the first contender does better than the second by most.
 
-    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. Raises
-    `InputError` where there is no gap.
+    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. With a
+    situation, among made gaps in which the object is in it. Raises `InputError` where there is no gap.
     """
     best: tuple[tuple[int, float], str, Gap] | None = None
     for ours, theirs in zip(first, second, strict=True):
-        for gap, mine, other in zip(ours.gaps, ours.outcomes, theirs.outcomes, strict=True):
+        for gap, at, mine, other in zip(ours.gaps, ours.situations, ours.outcomes, theirs.outcomes, strict=True):
+            if situation is not None and not any(situation in each for each in at.values()):
+                continue
             gain = min(other.error, CAP) - mine.error
             worth = (int(mine.kept is True) - int(other.kept is True), gain if np.isfinite(gain) else 0.0)
             if best is None or worth > best[0]:
                 best = worth, ours.recording, gap
     if best is None:
-        raise InputError("--picture: expected recordings with gaps, there are none")
+        of = f" of objects {situation}" if situation is not None else ""
+        raise InputError(f"--picture: expected recordings with gaps{of}, there are none")
     return best[1], best[2]
 
 
 def write_telling_picture(
-    path: Path, source: RecordingSource, runs: Sequence[Run], contenders: Sequence[Contender]
+    path: Path,
+    source: RecordingSource,
+    runs: Sequence[Run],
+    contenders: Sequence[Contender],
+    situation: str | None = None,
 ) -> None:
-    """Draw the gap in which the second of two contenders does better than the first by most.
+    """Draw the gap, in a situation if one is wanted, in which the second of two contenders beats the first by most.
 
     Raises `InputError` for a path that is not writable, and where there is no gap.
     """
     life = runs[0].life
     first, second = ([run for run in runs if (run.life, run.contender) == (life, c.name)] for c in contenders)
-    recording, gap = telling_gap(second, first)
+    recording, gap = telling_gap(second, first, situation)
     labelled = LabelledScene.of(source.scene(recording), contenders[0].config.sensors)
     gaps = next(run.gaps for run in first if run.recording == recording)
     drawn = [drawn_gap(labelled, gaps, gap, contender, life) for contender in contenders]
@@ -90,13 +105,21 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: Sequence[DrawnGap]) ->
     shown = np.flatnonzero((time >= time[gap.start] - BEFORE) & (time <= time[gap.stop] + AFTER))
     way = labelled.position[shown, gap.row]
     known = np.isfinite(way[:, 0])
-    origin, turn = _frame(way[known])
+    road, colours = colours_at(labelled, float(time[gap.stop - 1]))
+    margin, least = (MARGIN, LEAST) if road is None else (ROAD_MARGIN, ROAD_LEAST)
+    origin, turn = _frame(way[known], float(labelled.yaw[gap.start, gap.row]))
     way = (way - origin) @ turn
-    length = float(np.ptp(way[known][:, 0])) + 2 * MARGIN
-    height = max(float(np.ptp(way[known][:, 1])) + MARGIN, LEAST)
+    left, right = way[known][:, 0].min() - margin, way[known][:, 0].max() + margin
+    route = Route.of(labelled, gap.row, gap.start)
+    if route is not None and (line := first_line(road, route)) is not None:
+        right = max(right, float(((line[1].ends - origin) @ turn)[:, 0].max()) + BEYOND_LINE)
+    length = right - left
+    height = max(float(np.ptp(way[known][:, 1])) + margin, least)
     figure = Figure(figsize=(11.0, (11.0 * height / length + 0.6) * len(drawn) + 0.5), layout="constrained")
     axes = figure.subplots(len(drawn), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for ax, each in zip(axes, drawn, strict=True):
+        if road is not None:
+            _draw_road(ax, road, colours, origin, turn)
         _draw_scene(ax, labelled, gap, origin, turn)
         unseen = (shown > gap.start) & (shown < gap.stop)
         ax.plot(*np.where(unseen[:, None], np.nan, way).T, color="#555555", linewidth=3.0, zorder=2)
@@ -106,19 +129,19 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: Sequence[DrawnGap]) ->
         error = f"mean error in the gap {each.outcome.error:.2f} m"
         ax.set_title(f"{each.name}: {fate}, {error}", loc="left", fontsize=10)
         ax.set(aspect="equal", ylabel="m")
-        ax.set_xlim(way[known][:, 0].min() - MARGIN, way[known][:, 0].max() + MARGIN)
+        ax.set_xlim(left, right)
         ax.set_ylim(way[known][:, 1].mean() - height / 2, way[known][:, 1].mean() + height / 2)
         ax.grid(color="#e6e6e6", linewidth=0.6)
         ax.set_axisbelow(True)
     axes[-1].set_xlabel(f"m; {labelled.label[gap.row]} without detections for {time[gap.stop] - time[gap.start]:.1f} s")
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    figure.legend(handles=_legend(road is not None), loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     return figure
 
 
-def _frame(way: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _frame(way: FloatArray, yaw: float) -> tuple[FloatArray, FloatArray]:
     """Origin (2,), and the rotation (2, 2), to be applied from the right, that turns the way to the right."""
     offset = way[-1] - way[0]
-    angle = np.arctan2(offset[1], offset[0]) if np.hypot(*offset) > 1.0 else 0.0
+    angle = np.arctan2(offset[1], offset[0]) if np.hypot(*offset) > 1.0 else np.nan_to_num(yaw)
     c, s = np.cos(angle), np.sin(angle)
     return way[0], np.array([[c, -s], [s, c]])
 
@@ -126,6 +149,15 @@ def _frame(way: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _widened(unseen: BoolArray) -> FloatArray:
     """With the moments beside, so that lines meet."""
     return np.asarray(unseen | np.append(unseen[1:], False) | np.append(False, unseen[:-1]))
+
+
+def _draw_road(ax: Any, road: RoadMap, colours: Mapping[str, str], origin: FloatArray, turn: FloatArray) -> None:
+    """Lanes, and stop lines in the colours of their lights."""
+    for lane in road.lanes:
+        ax.plot(*((np.array(lane.centre) - origin) @ turn).T, color="#bcd0e0", linewidth=0.8, zorder=0)
+    for line in road.stop_lines:
+        colour = LIGHTS.get(colours.get(line.light, ""), "#808080")
+        ax.plot(*((line.ends - origin) @ turn).T, color=colour, linewidth=3.0, solid_capstyle="butt", zorder=2)
 
 
 def _draw_scene(ax: Any, labelled: LabelledScene, gap: Gap, origin: FloatArray, turn: FloatArray) -> None:
@@ -159,21 +191,23 @@ def _draw_tracks(
             places.append(at)
             if gap.start < k < gap.stop and time[k] - time[gap.start] >= seconds - 1e-6:
                 seconds += 1.0
-                ring = at + ellipse_95(drawn.tracks[k].position_covariance[row[0]]) @ turn
+                ring = at + ellipse(drawn.tracks[k].position_covariance[row[0]], RING) @ turn
                 ax.plot(*ring.T, color=colour, linewidth=1.0, alpha=0.8, zorder=5)
         if places:
             ax.plot(*np.array(places).T, "-o", color=colour, markersize=3, linewidth=1.2, zorder=6)
             ax.annotate(f"track {name}", places[0], xytext=(0, 9), textcoords="offset points", color=colour, fontsize=8)
 
 
-def _legend() -> list[Any]:
+def _legend(with_road: bool) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
+    road = [Line2D([], [], color=LIGHTS["red"], linewidth=3.0, label="stop line: colour of its light")]
     return [
         Line2D([], [], color="#555555", linewidth=3.0, label="labels, detected"),
         Line2D([], [], color="#555555", linewidth=2.0, linestyle=":", label="labels, no detection"),
         Patch(facecolor="#f3dcc4", edgecolor="#b5651d", label="the object at the end of the gap"),
         Patch(facecolor="#d8d8d8", label="other objects then"),
-        Line2D([], [], color=COLOURS[0], marker="o", markersize=3, label="track; ring: 95 % ellipse"),
+        Line2D([], [], color=COLOURS[0], marker="o", markersize=3, label="track; ring: 90 % ellipse"),
+        *(road if with_road else ()),
     ]

@@ -35,7 +35,8 @@ TURN = np.radians(20.0)
 LINE_REACH = 60.0  # m
 REPORT_AGE = 3.0  # s: a light shows what it was last seen to show for so long
 LIGHT_REACH = 3.0  # m, from a light of the map to its report
-CLOSED = ("traffic_light_red", "traffic_light_amber")
+REPORT = "traffic_light_"
+CLOSED = ("red", "amber")
 TOUCHING = 1.0  # m: objects this close are no leaders but errors of labels
 
 
@@ -94,6 +95,12 @@ def _way_to(line: StopLine, route: Route) -> float:
 
 def lights_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, frozenset[str]]:
     """The road map at a time, and the names of its lights that were last reported closed."""
+    road, shown = colours_at(labelled, time)
+    return road, frozenset(name for name, colour in shown.items() if colour in CLOSED)
+
+
+def colours_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, Mapping[str, str]]:
+    """The road map at a time, and the colours of its lights by their names, where these were reported lately."""
     road: RoadMap | None = None
     shown: dict[str, str] = {}
     recent: list[Boxes] = []
@@ -104,12 +111,12 @@ def lights_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, fro
         if frame.timestamp >= time - REPORT_AGE:
             recent.append(boxes)
     if road is None or not road.lights:
-        return road, frozenset()
+        return road, {}
     lights = np.array([light.position for light in road.lights])
     for boxes in recent:
-        for k in np.flatnonzero(np.char.startswith(boxes.label, "traffic_light_")).tolist():
+        for k in np.flatnonzero(np.char.startswith(boxes.label, REPORT)).tolist():
             away = np.hypot(*(lights - boxes.position[k, :2]).T)
             nearest = int(away.argmin())
             if away[nearest] <= LIGHT_REACH:
-                shown[road.lights[nearest].name] = str(boxes.label[k])
-    return road, frozenset(name for name, label in shown.items() if label in CLOSED)
+                shown[road.lights[nearest].name] = str(boxes.label[k]).removeprefix(REPORT)
+    return road, shown

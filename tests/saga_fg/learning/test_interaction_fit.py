@@ -34,11 +34,20 @@ def last_error(sample, rules):
 
 
 def test_the_known_rate_is_found_again_and_lowers_errors_on_other_recordings():
-    fitted = fit_interactions(gaps_of(1), SETTINGS, (FOLLOW,), iterations=10)
+    fitted = fit_interactions(gaps_of(1), SETTINGS, (FOLLOW,), iterations=10, prior=0.02)
     behind = EdgeFeatures(*(np.array([v]) for v in (GAP, 0.0, 0.0, GAP, 0.0, 8.0, 8.0, 1.0, 1.0)))
     assert fitted.rules[0].strength(behind)[0] == pytest.approx(RATE, rel=0.5)
     other = gaps_of(2)
     assert last_error(other, fitted.rules) < 0.9 * last_error(other, ())
+
+
+def test_the_stronger_the_prior_the_nearer_the_template():
+    sample = gaps_of(1, pairs=2)
+    away = [
+        abs(math.log(fit_interactions(sample, SETTINGS, (FOLLOW,), 4, prior).rules[0].rate / FOLLOW.rate))
+        for prior in (0.02, 0.4, 10.0)
+    ]
+    assert away[0] > away[1] > away[2]
 
 
 def test_a_search_can_begin_where_another_ended():
