@@ -34,6 +34,7 @@ from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
 from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
 from saga_fg.model.edge_rules import Neighbours
+from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Scene
@@ -73,7 +74,8 @@ def _independent(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfi
     """Without edges, the noise fitted on scenes of the cell."""
     config = sampled_config(settings, ())
     objects = measured_trajectories(scenes, config.sensors)
-    return config.with_acceleration_noise(fit_acceleration_noise_by_class(objects))
+    noise = fit_acceleration_noise_by_class(objects)
+    return config.with_motions({label: ConstantVelocity(q) for label, q in noise.items()})
 
 
 def _learned(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfig:
@@ -82,7 +84,8 @@ def _learned(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfig:
     fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,), DEGREES)
     if not fitted.rules:
         return _independent(settings, scenes)
-    config = sampled_config(settings, fitted.rules).with_acceleration_noise(fitted.acceleration_noise)
+    motions = {label: ConstantVelocity(q) for label, q in fitted.acceleration_noise.items()}
+    config = sampled_config(settings, fitted.rules).with_motions(motions)
     return replace(config, tracker=replace(config.tracker, explained_noise=fitted.explained_noise))
 
 

@@ -14,7 +14,7 @@ from pipelines.configuration import load_settings, read_settings
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.learned_interactions import LearnedInteractions
-from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import Sensor
 from saga_fg.settings import settings_group
 from saga_fg.tracking import (
@@ -62,11 +62,10 @@ class TrackConfig:
         association = replace(self.tracker.association, method=method)
         return replace(self, tracker=replace(self.tracker, association=association))
 
-    def with_acceleration_noise(self, noise: Mapping[str, float]) -> TrackConfig:
-        """Return a copy with constant velocity and this noise (m^2/s^3) by class; `default` serves the rest."""
+    def with_motions(self, motions: Mapping[str, ConstantVelocity | Curvilinear]) -> TrackConfig:
+        """Return a copy with these motions by class; `default` serves the rest."""
         classes = dict(self.tracker.classes)
-        for label, q in noise.items():
-            motion = ConstantVelocity(acceleration_noise=q)
+        for label, motion in motions.items():
             classes[label] = replace(class_settings(classes, ClassSettings, label), motion=motion)
         return replace(self, tracker=replace(self.tracker, classes=classes))
 

@@ -45,8 +45,8 @@ def gaps(
         str | None,
         typer.Option(
             "--contenders",
-            help="Of saga, kf, constant velocity, turn, stationary, stationary + turn and centerpoint, with commas.  "
-            "[default: all that differ]",
+            help="Of saga, without trails, without lights, kf, constant velocity, turn, stationary, stationary + turn "
+            "and centerpoint, with commas.  [default: all that differ]",
         ),
     ] = None,
     against: Annotated[str, typer.Option("--against", help="The contender that all others are compared with.")] = "kf",

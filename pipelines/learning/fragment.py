@@ -8,10 +8,12 @@ from typing import Any
 import yaml
 
 from pipelines.learning.noise import LearnedNoise
+from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.by_class import class_settings
 
 LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view", "confusion")
+KINDS: dict[type, str] = {ConstantVelocity: "constant_velocity", Curvilinear: "curvilinear"}
 DIGITS = 4
 
 
@@ -26,14 +28,10 @@ def learned_fragment(learned: LearnedNoise, origin: str) -> str:
         tracker["class_groups"] = [list(group) for group in learned.config.tracker.class_groups]
     if learned.classes:
         classes = learned.config.tracker.classes
+        motions = {label: class_settings(classes, ClassSettings, label).motion for label in learned.classes}
         tracker["classes"] = {
-            label: {
-                "motion": {
-                    "kind": "constant_velocity",
-                    **_rounded(asdict(class_settings(classes, ClassSettings, label).motion)),
-                }
-            }
-            for label in learned.classes
+            label: {"motion": {"kind": KINDS[type(motion)], **_rounded(asdict(motion))}}
+            for label, motion in motions.items()
         }
     data: dict[str, Any] = {"sensors": sensors, **({"tracker": tracker} if tracker else {})}
     text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)

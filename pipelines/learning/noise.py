@@ -7,7 +7,7 @@ settings assigns detections to objects; then once more with the settings learned
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from saga_fg.learning import (
     DetectionSample,
     MeasuredTrajectory,
     fit_acceleration_noise_by_class,
+    fit_curvilinear_by_class,
     fit_sensor,
     fit_trajectory_noise,
     learn_confusion,
@@ -28,7 +29,7 @@ from saga_fg.learning import (
     sample_with_tracker,
     sample_with_truth,
 )
-from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.motion import ConstantVelocity, Curvilinear, Motion
 from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
 from saga_fg.tracking import ClassSettings, Tracker
 from saga_fg.types.by_class import DEFAULT, class_settings
@@ -89,9 +90,18 @@ def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
     for name, tables in (learn_confusion(kept, config.sensors, groups) if groups else {}).items():
         learned[name] = replace(learned[name], confusion={**learned[name].confusion, **tables})
     config = replace(config, sensors={**config.sensors, **learned})
-    objects = measured_trajectories(kept, config.sensors)
-    noise = fit_acceleration_noise_by_class(objects) if _enough(objects) else {}
-    return _with_process_noise(config, noise, pooled)
+    motions = learned_motions(measured_trajectories(kept, config.sensors), config)
+    return _with_motions(config, motions, pooled)
+
+
+def learned_motions(
+    objects: Mapping[str, Sequence[MeasuredTrajectory]], config: TrackConfig
+) -> dict[str, ConstantVelocity | Curvilinear]:
+    """The motions of classes whose objects were measured, of the kinds that they are configured with."""
+    if not any(len(found) >= 3 for same in objects.values() for found in same):
+        return {}
+    noise = fit_acceleration_noise_by_class(objects)
+    return _of_constant_velocity(config, noise) | fit_curvilinear_by_class(objects, lambda c: _motion(config, c))
 
 
 def _from_tracker(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
@@ -110,7 +120,12 @@ def _from_tracker(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
     for name, sample in pooled.items():
         base = sensor_model(config.sensors, name)
         sensors[name] = fit_sensor(sample, replace(base, noise={**base.noise, **noise.get(name, {})}), GATE)
-    return _with_process_noise(replace(config, sensors={**config.sensors, **sensors}), process, pooled)
+    config = replace(config, sensors={**config.sensors, **sensors})
+    objects: dict[str, list[MeasuredTrajectory]] = {}
+    for one in trajectories:
+        objects.setdefault(one.label, []).append(one.measured(config.sensors))
+    curvilinear = fit_curvilinear_by_class(objects, lambda c: _motion(config, c))
+    return _with_motions(config, _of_constant_velocity(config, process) | curvilinear, pooled)
 
 
 def _trajectory_noise(
@@ -134,18 +149,23 @@ def _trajectory_noise(
     return noise, process
 
 
-def _enough(objects: dict[str, list[MeasuredTrajectory]]) -> bool:
-    return any(len(found) >= 3 for same in objects.values() for found in same)
+def _motion(config: TrackConfig, label: str) -> Motion:
+    return class_settings(config.tracker.classes, ClassSettings, label).motion
 
 
-def _with_process_noise(
-    config: TrackConfig, noise: dict[str, float], samples: dict[str, DetectionSample]
-) -> LearnedNoise:
-    """The process noise of the classes that move at constant velocity; others keep theirs."""
-    of_class = {
-        label: q
+def _of_constant_velocity(config: TrackConfig, noise: Mapping[str, float]) -> dict[str, ConstantVelocity | Curvilinear]:
+    """The noise of the classes that move at constant velocity."""
+    return {
+        label: ConstantVelocity(acceleration_noise=q)
         for label, q in noise.items()
-        if isinstance(class_settings(config.tracker.classes, ClassSettings, label).motion, ConstantVelocity)
+        if isinstance(_motion(config, label), ConstantVelocity)
     }
+
+
+def _with_motions(
+    config: TrackConfig,
+    motions: Mapping[str, ConstantVelocity | Curvilinear],
+    samples: dict[str, DetectionSample],
+) -> LearnedNoise:
     counts = {name: len(sample.detections) for name, sample in samples.items()}
-    return LearnedNoise(config.with_acceleration_noise(of_class), counts, tuple(of_class))
+    return LearnedNoise(config.with_motions(motions), counts, tuple(motions))

@@ -1,6 +1,7 @@
 """Learn from recordings: noise, scores and detection probability of sensors, process noise, and interactions."""
 
 from saga_fg.learning.class_confusion import learn_confusion
+from saga_fg.learning.curvilinear_motion import fit_curvilinear, fit_curvilinear_by_class
 from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.hidden_objects import GapPrediction, GapSettings, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
@@ -44,6 +45,8 @@ __all__ = [
     "SampledObjects",
     "fit_acceleration_noise",
     "fit_acceleration_noise_by_class",
+    "fit_curvilinear",
+    "fit_curvilinear_by_class",
     "fit_interactions",
     "fit_position_noise",
     "fit_score_calibration",

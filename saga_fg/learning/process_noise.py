@@ -26,11 +26,16 @@ WRONG_REACH = 4.0  # m
 
 @dataclass(frozen=True, eq=False)
 class MeasuredTrajectory:
-    """Measured positions of one object: time (T,) s, not decreasing; position (T, 2) m; R (T, 2, 2) m^2."""
+    """Measured positions of one object: time (T,) s, not decreasing; position (T, 2) m; R (T, 2, 2) m^2.
+
+    yaw, yaw_noise  (T,) rad, measured headings and their standard deviations, NaN where unknown: everywhere if left out
+    """
 
     time: FloatArray
     position: FloatArray
     R: FloatArray
+    yaw: FloatArray = None  # type: ignore[assignment]  # an array from construction on
+    yaw_noise: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         time = checked("time", self.time, (None,))
@@ -38,6 +43,9 @@ class MeasuredTrajectory:
             raise InputError(f"time[{int(np.argmax(np.diff(time) < 0)) + 1}]: expected times that do not decrease")
         position, R = checked("position", self.position, (len(time), 2)), checked("R", self.R, (len(time), 2, 2))
         vars(self).update(time=time, position=position, R=R)
+        for name in ("yaw", "yaw_noise"):
+            given = getattr(self, name)
+            vars(self)[name] = np.full(len(time), np.nan) if given is None else np.asarray(given, dtype=np.float64)
 
     def __len__(self) -> int:
         return len(self.time)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
+from saga_fg.learning.process_noise import MeasuredTrajectory
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
@@ -46,6 +47,18 @@ class DetectedTrajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def measured(self, sensors: Mapping[str, Sensor]) -> MeasuredTrajectory:
+        """The positions and headings, with the noise that the sensors' models give them."""
+        R, yaw_noise = np.empty((len(self), 2, 2)), np.empty(len(self))
+        origin = np.where(np.isfinite(self.origin), self.origin, self.position)
+        for name in np.unique(self.sensor).tolist():
+            rows = np.flatnonzero(self.sensor == name)
+            model, label = sensor_model(sensors, name), np.full(len(rows), self.label)
+            p = model.calibrated(self.logit[rows], label)
+            R[rows] = model.position_covariance(label, self.position[rows], p, origin[rows])
+            (yaw_noise[rows],) = model.deviations(label, "yaw")
+        return MeasuredTrajectory(self.time, self.position, R, self.yaw, yaw_noise)
 
 
 class _Linked(NamedTuple):

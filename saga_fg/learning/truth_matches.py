@@ -84,22 +84,24 @@ def sample_with_truth(
 def measured_trajectories(
     scenes: Iterable[Scene], sensors: Mapping[str, Sensor], gate: float = 2.0, step: float = 0.05
 ) -> dict[str, list[MeasuredTrajectory]]:
-    """Class -> the measured positions of each of its objects, by the nearest detection of the class within `gate` m.
+    """Class -> the measured positions and headings of each of its objects, by the nearest detection of the class within
+    `gate` m.
 
     Of detections of one object closer in time than `step` s only the first is taken. Their covariances are those of the
     sensors' models. Raises `InputError` for a scene without ground truth.
     """
     found: dict[str, list[MeasuredTrajectory]] = {}
     for scene in scenes:
-        objects: dict[tuple[str, str], list[tuple[float, FloatArray, FloatArray]]] = {}
+        objects: dict[tuple[str, str], list[tuple[float, FloatArray, FloatArray, float, float]]] = {}
         for matched in match_to_truth(scene, sensors, gate):
             truth, sensor = matched.annotations, sensor_model(sensors, matched.frame.sensor)
             time = matched.frame.timestamp + sensor.time_offset
-            R = sensor.detection_covariance(matched.detections, matched.origin)
+            boxes, R = matched.detections.boxes, sensor.detection_covariance(matched.detections, matched.origin)
+            (yaw_noise,) = sensor.deviations(boxes.label, "yaw")
             for j, i in zip(matched.detection.tolist(), matched.truth.tolist(), strict=True):
                 rows = objects.setdefault((str(truth.boxes.label[i]), str(truth.id[i])), [])
                 if not rows or time - rows[-1][0] >= step:
-                    rows.append((time, matched.detections.boxes.position[j, :2], R[j]))
+                    rows.append((time, boxes.position[j, :2], R[j], boxes.yaw[j], yaw_noise[j]))
         for (label, _), rows in objects.items():
             found.setdefault(label, []).append(MeasuredTrajectory(*map(np.array, zip(*rows, strict=True))))
     return found

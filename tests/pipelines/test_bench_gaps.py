@@ -30,6 +30,7 @@ from pipelines.config import Family, load_config
 from saga_fg import Annotations, Boxes, Detections, Frame, InputError, Scene, Tracks
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.turning import CoordinatedTurn
 
 SHORT = replace(SimulatorSettings(), duration=12.0, warm_up=5.0)
@@ -249,6 +250,14 @@ def test_classical_contenders_differ_in_motion_alone() -> None:
     assert not Contender.of(contenders("kitti")["saga"], base).same_as(Contender("classical", "kf", base))
 
 
+def test_parts_of_the_graph_are_contenders_where_they_are_configured() -> None:
+    base = load_config("heterogeneous")
+    rules = contenders("heterogeneous")["without lights"].config(base).tracker.edges
+    assert {type(rule) for rule in base.tracker.edges} - {type(rule) for rule in rules} == {RedLight}
+    assert contenders("traffic")["without trails"].config(load_config("traffic")).tracker.trails.memory == 0
+    assert load_config("traffic").tracker.trails.memory > 0
+
+
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
     drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
     kf = Contender.of(contenders("file")["kf"], load_config("file"))
@@ -288,7 +297,7 @@ def test_places_are_sites_and_settings() -> None:
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
     config = load_config("simulated")
-    fitted = config.with_acceleration_noise({"default": 0.5, "truck": 0.25})
+    fitted = config.with_motions({"default": ConstantVelocity(0.5), "truck": ConstantVelocity(0.25)})
     classes = fitted.tracker.classes
     assert classes["truck"].motion.acceleration_noise == 0.25
     assert classes["default"].motion.acceleration_noise == 0.5

@@ -11,7 +11,10 @@ from typing import Any, Literal
 from pipelines.bench.gaps.gap import LONGEST
 from pipelines.bench.variants import Variant, changed
 from pipelines.config import TrackConfig
+from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
+from saga_fg.model.road.starting import GreenLight
+from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.by_class import class_settings
@@ -63,6 +66,11 @@ def _moving(family: str | Path, turn: bool) -> Callable[[Mapping[str, ClassSetti
     return change
 
 
+def _without_lights(edges: tuple[EdgeRule, ...]) -> tuple[EdgeRule, ...]:
+    """Without the rules by which lights act at their stop lines."""
+    return tuple(edge for edge in edges if not isinstance(edge, RedLight | GreenLight))
+
+
 def _classical(family: str | Path, name: str, stationary: bool, turn: bool) -> Variant:
     prior = {"tracker.stationarity.prior": 0.5 if stationary else 0.0}
     return Variant(name, "kf", prior | {"tracker.classes": _moving(family, turn)})
@@ -72,6 +80,8 @@ def contenders(family: str | Path) -> dict[str, Variant]:
     """All, by name, for the settings of a kind of data."""
     found = (
         Variant("saga"),
+        Variant("without trails", changes={"tracker.trails.memory": 0.0}),
+        Variant("without lights", changes={"tracker.edges": _without_lights}),
         Variant("kf", "kf"),
         _classical(family, "constant velocity", stationary=False, turn=False),
         _classical(family, "turn", stationary=False, turn=True),

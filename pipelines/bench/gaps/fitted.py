@@ -11,9 +11,10 @@ from pipelines.bench.gaps.boosted import boosted_runs
 from pipelines.bench.gaps.learned import LEARNED, learn_interactions
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
+from pipelines.learning import learned_motions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learning import fit_acceleration_noise_by_class, measured_trajectories
+from saga_fg.learning import measured_trajectories
 
 Fit = Literal["noise", "edges", "boosted"]
 FITS: tuple[Fit, ...] = ("noise", "edges", "boosted")
@@ -85,10 +86,10 @@ def bench_splits(
 
 
 def _with_fitted_noise(source: RecordingSource, split: Split, base: TrackConfig) -> Contender:
-    """kf with the process noise of some annotated recordings."""
+    """kf with the motions of some annotated recordings."""
     scenes = (source.scene(name) for name in split.train)
-    noise = fit_acceleration_noise_by_class(measured_trajectories(scenes, base.sensors))
-    return Contender("kf, fitted noise", "kf", base.with_acceleration_noise(noise))
+    motions = learned_motions(measured_trajectories(scenes, base.sensors), base)
+    return Contender("kf, fitted noise", "kf", base.with_motions(motions))
 
 
 def _with_learned_edges(
