@@ -6,6 +6,7 @@ from benchmarks.fusion import fusion
 from benchmarks.joint import joint
 from benchmarks.metrics import metrics
 from benchmarks.scaling import scaling
+from benchmarks.signals import signals
 from benchmarks.smoothing import smoothing
 from benchmarks.streaming import streaming
 from benchmarks.synthetic import synthetic
@@ -13,7 +14,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (fusion, joint, metrics, scaling, smoothing, streaming, synthetic):
+for command in (fusion, joint, metrics, scaling, signals, smoothing, streaming, synthetic):
     app.command()(command)
 
 

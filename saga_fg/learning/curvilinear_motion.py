@@ -1,13 +1,14 @@
 r"""Curvilinear motion by maximum likelihood of the next detection, and of detections after gaps of 1 to 3 s.
 
-    theta* = argmin_theta  mean_innovations l(e, S) + sum_h mean_gaps l(e, S) + |log theta - log theta_0|^2 / 2n
+    theta* = argmin_theta  mean_innovations l(e, S) + sum_h mean_gaps l(e, S) + |log theta - log theta_0|^2 / 2m
     l(e, S) = log det S / 2 + (nu + 2) / 2 log(1 + e^T S^-1 e / (nu - 2)),      nu = `TAILS`
 
-e and S are the innovations, and their covariances, of the filters of n objects, each its own; theta holds the noise and
-the time constants of `Curvilinear`, and theta_0 those of the start. l is Student's t of covariance S, so that single
-wrong detections count little, and with many degrees of freedom, so that covariances cover rare turns. The gaps are what
-the time constants show in: the next detection hardly depends on them. The motion is that of the tracker
-(`saga_fg.model.known_course`, `saga_fg.tracking.turn_rate`), and all objects are filtered side by side.
+e and S are the innovations, and their covariances, of the filters of the objects, each its own; theta holds the noise
+and the time constants of `Curvilinear`, and theta_0 those of the start. The prior counts as if there were m =
+`INDEPENDENT` objects and no more: those of one place do alike, and differ from those of another. l is Student's t of
+covariance S, so that single wrong detections count little, and with many degrees of freedom, so that covariances cover
+rare turns. The gaps are what the time constants show in: the next detection hardly depends on them. The motion is that
+of the tracker (`saga_fg.model.known_course`, `saga_fg.tracking.turn_rate`), and all objects are filtered side by side.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ FOLLOWED, SPACING = 1.5, 1.0  # s in view before a gap, and between gaps
 STEP = 0.5  # s, of predictions through a gap
 TAILS = 30.0  # degrees of freedom
 MOST, FEWEST = 300, 20  # objects used of a class, evenly spread; and those that a fit needs
+INDEPENDENT = 10  # objects
 EVALUATIONS = 80
 INITIAL_SPEED_DEVIATION = 8.0  # m/s
 _NEAR = 0.06  # s between a detection and the end of a gap
@@ -184,7 +186,7 @@ def _most_likely(likelihood: CurvilinearLikelihood, start: Curvilinear) -> Curvi
         return replace(start, **dict(zip(LEARNED, values, strict=True)))
 
     def cost(theta: FloatArray) -> float:
-        prior = 0.5 * ((theta - first) ** 2).sum() / len(likelihood.count)
+        prior = 0.5 * ((theta - first) ** 2).sum() / INDEPENDENT
         return float(likelihood.loss(motion(theta)) + prior)
 
     simplex = np.vstack([first, first + 0.5 * np.eye(len(first)) * np.where(first + 0.5 < high, 1, -1)])

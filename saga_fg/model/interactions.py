@@ -66,7 +66,7 @@ class NodeTable:
     existence: FloatArray | None = None
     open: FloatArray | None = None
     lanes: Mapping[int, tuple[LaneAcross, ...]] = field(default_factory=dict)
-    derived: dict[object, Any] = field(default_factory=dict, repr=False)
+    derived: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.id)

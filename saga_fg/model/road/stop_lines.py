@@ -38,6 +38,20 @@ class Approach(NamedTuple):
 
 def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     """The approaches of vehicles `target` (E,) to stop lines `source` (E,)."""
+    wanted = target * len(nodes) + source
+    if "approach" in nodes.derived:
+        pairs, known = nodes.derived["approach"]
+        at = np.searchsorted(pairs, wanted).clip(max=max(len(pairs) - 1, 0))
+        if len(pairs) and (pairs[at] == wanted).all():
+            found: Approach = known.select(at)
+            return found
+    found = _approach(nodes, target, source)
+    order = np.argsort(wanted)
+    nodes.derived["approach"] = wanted[order], found.select(order)
+    return found
+
+
+def _approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     offset = nodes.position[source] - nodes.position[target]
     u = facing = unit(nodes.heading[target])
     way = np.einsum("ei,ei->e", offset, u)
@@ -47,8 +61,13 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     comes = (np.abs(aside) < np.hypot(*(left - right).T) / 2) & aligned & (way > 0)
     crossing, nearest = -aside, np.full(len(target), np.inf)
     for line in np.unique(source).tolist() if nodes.lanes else ():
-        rows = np.flatnonzero(source == line)
+        of_line = np.flatnonzero(source == line)
+        place = nodes.position[target[of_line]]
         for lane in nodes.lanes.get(line, ()):
+            low, high = lane.centre.min(axis=0) - lane.width, lane.centre.max(axis=0) + lane.width
+            rows = of_line[((place >= low) & (place <= high)).all(axis=1)]
+            if len(rows) == 0:
+                continue
             at = feet(lane.centre, nodes.position[target[rows]])
             inside = (np.abs(at.e) <= np.minimum(lane.width / 2, nearest[rows])) & on_it(lane.centre, at.s)
             inside &= np.einsum("ei,ei->e", at.direction, facing[rows]) > 0

@@ -65,9 +65,8 @@ def test_what_is_learned_is_near_the_truth_and_better_on_other_objects(monkeypat
     start = replace(TRUTH, acceleration_noise=3.0, jerk_noise=0.05)
     learned = fit_curvilinear(drawn(rng, TRUTH, 30, moments=40), start)
     others = CurvilinearLikelihood.of(drawn(rng, TRUTH, 30, moments=40))
-    assert others.loss(learned) < others.loss(start) - 0.3
-    assert others.loss(learned) < others.loss(TRUTH) + 0.1
-    assert learned.acceleration_noise < 1.0
+    assert others.loss(learned) < (others.loss(start) + others.loss(TRUTH)) / 2
+    assert TRUTH.acceleration_noise / 2 < learned.acceleration_noise < start.acceleration_noise / 1.5
 
 
 def test_too_few_objects_teach_nothing():

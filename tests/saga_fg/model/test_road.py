@@ -190,7 +190,7 @@ def test_where_a_lane_ends_vehicles_go_straight_on_to_the_line():
     assert short is not None
     assert before is not None
     for lanes in ((), (short,), (short, before)):
-        assert RedLight().pairs(replace(nodes, lanes={1: lanes}, derived={})).target.tolist() == [0]
+        assert RedLight().pairs(replace(nodes, lanes={1: lanes})).target.tolist() == [0]
 
 
 def test_the_queue_brakes_through_following():
@@ -226,7 +226,7 @@ def test_the_way_to_a_line_is_along_the_lane():
     crossing = LaneAcross.of(Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light"))
     assert crossing is not None
     assert len(RedLight().pairs(with_line).target) == 0  # straight on it would miss the line
-    with_line = replace(with_line, lanes={2: (crossing,)}, derived={})
+    with_line = replace(with_line, lanes={2: (crossing,)})
     assert RedLight().pairs(with_line).target.tolist() == [0]
     at = feet(lane, nodes.position[:1])
     arc, speed = 50 * 1.2 - 1 - at.s[0], 8.0 * (at.direction[0] @ (np.cos(0.2), np.sin(0.2)))
