@@ -95,15 +95,16 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
 
 def own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
     """F (d, d) and Q (d, d) of a node without edges over `dt` s."""
-    return linear_motion(node_type.generator, node_type.diffusion, dt, node_type.nilpotency)
-
-
-def linear_motion(
-    generator: FloatArray, diffusion: FloatArray, dt: float, nilpotency: int | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """F = exp(A dt) and Q = int_0^dt exp(A s) Qc exp(A s)^T ds of a generator A (d, d) and a diffusion Qc (d, d)."""
-    (F,), Q = _phi_and_noise(generator[None], diffusion[None], dt, 0, nilpotency)
+    F, Q = linear_motions(node_type.generator[None], node_type.diffusion[None], dt, node_type.nilpotency)
     return F[0], Q[0]
+
+
+def linear_motions(
+    generators: FloatArray, diffusions: FloatArray, dt: float, nilpotency: int | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """F = exp(A dt) and Q = int_0^dt exp(A s) Qc exp(A s)^T ds of generators A and diffusions Qc, all (m, d, d)."""
+    (F,), Q = _phi_and_noise(generators, diffusions, dt, 0, nilpotency)
+    return F, Q
 
 
 def _move_by_modes(

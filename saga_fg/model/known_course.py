@@ -36,7 +36,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.model.discretisation import linear_motion
+from saga_fg.model.discretisation import linear_motions
 from saga_fg.model.motion import Curvilinear, NodeType
 from saga_fg.model.scene_graph import MatchedMotion
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -94,8 +94,11 @@ class KnownCourses(Columns):
         assert isinstance(motion, Curvilinear)
         tau = max(motion.turn_time, _LEAST_TIME)
         theta = self.rate * tau * -np.expm1(-dt / tau)
-        (F_along, Q_along), (F_across, Q_across) = (linear_motion(*axis, dt) for axis in (motion.along, motion.across))
-        Q_white = linear_motion(motion.across[0], np.diag([0.0, 1.0, 0.0]), dt)[1]
+        (A_1, Qc_1), (A_2, Qc_2) = motion.along, motion.across
+        white = np.diag([0.0, 1.0, 0.0])
+        (F_along, F_across, _), (Q_along, Q_across, Q_white) = linear_motions(
+            np.stack([A_1, A_2, A_2]), np.stack([Qc_1, Qc_2, white]), dt
+        )
         u = _unit(self.heading)
         ahead = u[:, :, None] * u[:, None]
         aside = np.eye(2) - ahead
