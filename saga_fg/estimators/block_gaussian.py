@@ -6,8 +6,6 @@ from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
 
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
@@ -35,7 +33,7 @@ class BlockGaussian:
 
     def over(self, partition: Partition) -> BlockGaussian:
         """Change the partition; nodes that it separates lose their correlation."""
-        if partition is self.partition:
+        if partition is self.partition or np.array_equal(partition.label, self.partition.label):
             return self
         rows = np.arange(len(self.layout))
         return BlockGaussian(partition, self.mean, regrouped(self.blocks, self.partition, partition, rows))
@@ -71,26 +69,31 @@ class BlockGaussian:
 
     def decoupled(self) -> BlockGaussian:
         """Separate the parts of components that are no longer correlated, long after the last interaction."""
+        return self.over(self.uncorrelated(_UNCORRELATED))
+
+    def uncorrelated(self, tolerance: float) -> Partition:
+        """The partition into parts that no correlation above `tolerance` ties."""
         partition, layout = self.partition, self.layout
         if partition.count == len(layout):
-            return self
+            return partition
         node_of = np.repeat(np.arange(len(layout)), layout.dims)
         a, b = [], []
         for places, P in zip(partition.groups, self.blocks, strict=True):
-            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            tied = np.abs(P) > _UNCORRELATED * sigma[:, :, None] * sigma[:, None, :]
             node, (c, s) = node_of[places], places.shape
             d = int(layout.dims[node[0, 0]])
+            if s == d and (node == node[:, :1]).all():  # nodes on their own
+                continue
+            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+            tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
             if s % d == 0 and (layout.dims[node] == d).all():  # node by node where all are of one size
                 tied = np.asarray(tied.reshape(c, s // d, d, s // d, d).any(axis=(2, 4)))
                 node = node[:, ::d]
             k, i, j = np.nonzero(tied)
-            a.append(node[k, i])
-            b.append(node[k, j])
-        i, j = np.concatenate(a), np.concatenate(b)
-        pairs = scipy.sparse.coo_array((np.ones(len(i), dtype=bool), (i, j)), shape=(len(layout), len(layout)))
-        count, label = connected_components(pairs, directed=False)
-        return self if count == partition.count else self.over(Partition(layout, label.astype(np.int64)))
+            once = i < j
+            a.append(node[k[once], i[once]])
+            b.append(node[k[once], j[once]])
+        parts = Partition.apart(layout).joined(np.concatenate(a), np.concatenate(b))
+        return partition if parts.count == partition.count else parts
 
     def covariances(self, rows: IntArray) -> FloatArray:
         """(k, d, d) of the nodes at `rows`, whose states have equal size d."""

@@ -201,10 +201,14 @@ class Dynamics:
         return parts
 
 
-def predict(x: BlockGaussian, dynamics: Dynamics) -> BlockGaussian:
-    """The prior after the interval. Raises `InputError` where it is not finite."""
-    partition = dynamics.joined(x.partition).packed
-    mean, blocks = dynamics.propagated(x.over(partition))
+def predict(x: BlockGaussian, dynamics: Dynamics, partition: Partition | None = None) -> BlockGaussian:
+    """The prior after the interval. Raises `InputError` where it is not finite.
+
+    partition: components that F does not leave; nodes that it separates lose their correlation. None: those joined by F
+    """
+    x = x.over((dynamics.joined(x.partition) if partition is None else partition).packed)
+    partition = x.partition
+    mean, blocks = dynamics.propagated(x)
     mean += dynamics.b
     dynamics.add_noise(partition, blocks)
     if not (np.isfinite(mean).all() and all(np.isfinite(block).all() for block in blocks)):

@@ -10,13 +10,16 @@ measured so rarely, or left its neighbours so long ago, that its correlation has
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.bounds import Bounds
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
@@ -50,10 +53,21 @@ class JointKalmanFilter(LatestMarginals):
     """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask_providers`, once a frame, for factors on the newest variables: an extended Kalman filter
+    tolerance  correlation up to which nodes are taken for independent, and neighbours for independent inputs; 0: none
+    most       largest number of nodes whose correlations are kept together, the strongest; None: any number
+
+    Without bounds, as by default, the filter is exact.
     """
 
-    def __init__(self, providers: Sequence[FactorProvider] = ()) -> None:
+    def __init__(
+        self, providers: Sequence[FactorProvider] = (), tolerance: float = 0.0, most: int | None = None
+    ) -> None:
+        if not 0 <= tolerance < 1:
+            raise InputError(f"tolerance: expected a number from 0 to below 1, got {tolerance!r}")
+        if most is not None and most < 1:
+            raise InputError(f"most: expected a number of nodes >= 1, got {most!r}")
         self.providers = tuple(providers)
+        self.bounds = Bounds(tolerance, most or sys.maxsize) if tolerance or most else None
         self._state = BlockGaussian.empty()
         self._predictions = 0
         self._time = 0.0
@@ -102,7 +116,10 @@ class JointKalmanFilter(LatestMarginals):
     def predict(self, transition: Transition) -> None:
         dynamics = self._auxiliary.dynamics(transition, self._state)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
-        self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
+        if self.bounds is None:
+            self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
+        else:
+            self._state = predict(self._state, *self.bounds.applied(self._state, dynamics))
         self._predictions += 1
         self._time += transition.dt
 

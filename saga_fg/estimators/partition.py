@@ -138,6 +138,25 @@ class Partition:
             return self
         return Partition(self.layout, _united(self.count, a[across], b[across])[self.label])
 
+    def joined_up_to(self, a: IntArray, b: IntArray, most: int) -> Partition:
+        """Join the components of labels a[k] and b[k], pair by pair, to at most `most` nodes each."""
+        if len(a) == 0:
+            return self
+        if len(self.label) <= most:
+            return Partition(self.layout, _united(self.count, a, b)[self.label])
+        root, size = list(range(self.count)), np.bincount(self.label).tolist()
+        for one, other in zip(a.tolist(), b.tolist(), strict=True):
+            while root[one] != one:
+                root[one] = one = root[root[one]]
+            while root[other] != other:
+                root[other] = other = root[root[other]]
+            if one != other and size[one] + size[other] <= most:
+                first, second = min(one, other), max(one, other)
+                root[second], size[first] = first, size[one] + size[other]
+        for k, parent in enumerate(root):  # a parent comes before its children
+            root[k] = root[parent]
+        return Partition(self.layout, _without_gaps(np.array(root, dtype=np.int64))[self.label])
+
     @cached_property
     def packed(self) -> Partition:
         """Put small components of several nodes together whose sizes few others have.

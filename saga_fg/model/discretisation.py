@@ -123,7 +123,7 @@ def _move_by_modes(
             continue
         own = record.predicted(dt, graph.diffusion_scale[rows])[1]
         alone = np.eye(own.F.shape[1])
-        back = scipy.linalg.expm(-graph.types[rows[0]].generator * dt) if coupled[rows].any() else alone
+        back = _exponential(-graph.types[rows[0]].generator * dt) if coupled[rows].any() else alone
         place = np.full(len(graph), -1)
         place[rows] = np.arange(len(rows))
         G = np.empty_like(own.F)
@@ -260,7 +260,21 @@ def _van_loan(M: FloatArray, C: FloatArray, A: FloatArray, dt: float) -> FloatAr
     m, d_i, d_j = C.shape
     block = np.zeros((m, d_i + d_j, d_i + d_j))
     block[:, :d_i, :d_i], block[:, :d_i, d_i:], block[:, d_i:, d_i:] = M, C, A
-    return np.asarray(scipy.linalg.expm(block * dt)[:, :d_i, d_i:])
+    return _exponential(block * dt)[:, :d_i, d_i:]
+
+
+def _exponential(Z: FloatArray) -> FloatArray:
+    """exp(Z) of matrices (..., d, d): the Taylor series of Z / 2^s, squared s times."""
+    norm = float(np.abs(Z).sum(axis=-1).max(initial=0.0))
+    doublings = max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS))) if 0 < norm < math.inf else 0
+    Z = Z / 2**doublings
+    eye = np.eye(Z.shape[-1])
+    result = eye + Z / _TAYLOR_DEGREE
+    for j in range(_TAYLOR_DEGREE - 1, 0, -1):
+        result = eye + Z @ result / j
+    for _ in range(doublings):
+        result = result @ result
+    return np.asarray(result)
 
 
 def _merged(F: list[Blocks], n: int) -> tuple[Blocks, ...]:

@@ -14,10 +14,14 @@ from typing import Self
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.chi_square import chi_square_quantile
 from saga_fg.numerics.columns import Columns
+
+_DENSE = 10_000  # pairs of rivals up to which one matrix of all is the fastest
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +97,26 @@ def least_total(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
         return paying
     rows, r = np.unique(row[rival], return_inverse=True)
     columns, c = np.unique(column[rival], return_inverse=True)
-    dense, number = np.zeros((len(rows), len(columns))), np.full((len(rows), len(columns)), -1)
-    dense[r, c], number[r, c] = gain[rival], rival
-    chosen = number[linear_sum_assignment(dense)]
-    alone[chosen[chosen >= 0]] = True
+    if len(rows) * len(columns) <= _DENSE:
+        parts = [np.arange(len(rival))]
+    else:  # one assignment for each set of rivals, in which nobody shares a row or a column with others
+        n, m = len(rows), len(columns)
+        _, part = connected_components(coo_array((np.ones(len(r)), (r, n + c)), (n + m, n + m)), directed=False)
+        order = np.argsort(part[r], kind="stable")
+        parts = np.split(order, np.flatnonzero(np.diff(part[r][order])) + 1)
+    for part in parts:
+        alone[_assigned(r[part], c[part], gain[rival[part]], rival[part])] = True
     return np.asarray(paying[alone])
+
+
+def _assigned(row: IntArray, column: IntArray, gain: FloatArray, number: IntArray) -> IntArray:
+    """The numbers of the pairs of the assignment of least total gain."""
+    rows, r = np.unique(row, return_inverse=True)
+    columns, c = np.unique(column, return_inverse=True)
+    dense, numbers = np.zeros((len(rows), len(columns))), np.full((len(rows), len(columns)), -1)
+    dense[r, c], numbers[r, c] = gain, number
+    chosen = numbers[linear_sum_assignment(dense)]
+    return np.asarray(chosen[chosen >= 0])
 
 
 def cheapest_first(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:

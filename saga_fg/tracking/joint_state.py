@@ -16,6 +16,7 @@ import numpy as np
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise, own_motion
+from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.motion import Motion, NodeType
@@ -24,8 +25,8 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, d
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.kinematics import Kinematics, RelativePositions
-from saga_fg.tracking.names import EstimatorName
 from saga_fg.tracking.out_of_sequence import moved_to_present
+from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.frame import Frame
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m
@@ -35,17 +36,18 @@ TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | Grap
 
 
 def new_estimator(
-    name: EstimatorName, lag: float, providers: Sequence[FactorProvider] = (), nonlinear: bool = False
+    settings: TrackerSettings, providers: Sequence[FactorProvider], rules: Sequence[EdgeRule]
 ) -> TrackEstimator:
-    """A fresh estimator; `lag` (s) is the fixed-lag smoother's.
+    """A fresh estimator.
 
     With `providers`, or where objects move nonlinearly, iSAM2 and the smoother are a running graph.
     """
+    name = settings.estimator
     if name == "kalman":
-        return JointKalmanFilter(providers)
-    if providers or nonlinear:
-        return GraphFilter(providers, lag if name == "fixed-lag" else 0.0, relinearised=True)
-    return FixedLagSmoother(lag) if name == "fixed-lag" else IncrementalFilter()
+        return JointKalmanFilter(providers, settings.tolerance, settings.max_component)
+    if providers or settings.nonlinear(tuple(rules)):
+        return GraphFilter(providers, settings.lag if name == "fixed-lag" else 0.0, relinearised=True)
+    return FixedLagSmoother(settings.lag) if name == "fixed-lag" else IncrementalFilter()
 
 
 class JointTrackState:

@@ -260,6 +260,16 @@ class TrackerSettings(Settings):
         "kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph "
         "of the last `lag` seconds, exact for late frames",
     )
+    tolerance: Fraction = setting(
+        0.01,
+        "correlation up to which the estimator kalman takes objects for independent; usual 0 to 0.1; 0: never; higher: "
+        "faster in crowds, interactions of objects in plain view count less",
+    )
+    max_component: PositiveInt = setting(
+        64,
+        "largest number of objects whose correlations the estimator kalman keeps together, the strongest; usual 30 to "
+        "200; higher: nearer to exact where hundreds interact, slower",
+    )
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, of saga_fg.providers or your own"
     )

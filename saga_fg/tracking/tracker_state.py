@@ -104,7 +104,7 @@ class TrackerState:
     def clear(self) -> None:
         """Remove all tracks, the map and the vehicle; ids go on."""
         settings = self.settings
-        estimator = new_estimator(settings.estimator, settings.lag, self.providers, settings.nonlinear(self.rules))
+        estimator = new_estimator(settings, self.providers, self.rules)
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
         self.table = TrackTable.empty(len(self.class_groups))
         read = MAP_CLASSES if self.providers else classes_read(self.rules)

@@ -24,7 +24,8 @@ ESTIMATORS = ["kalman", "isam2", "fixed-lag"]
 
 
 def tracker(estimator="kalman", **values):
-    return Tracker(TrackerSettings(CLASSES, estimator=estimator, **values), SENSORS)
+    """Without bounds, so that all estimators are exact."""
+    return Tracker(TrackerSettings(CLASSES, estimator=estimator, tolerance=0.0, **values), SENSORS)
 
 
 def traffic(seed, late=0.0):

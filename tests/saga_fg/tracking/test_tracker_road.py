@@ -207,8 +207,9 @@ def test_every_estimator_tracks_the_road_alike(estimator):
     frames = [
         replace(f, detections=Detections.concatenate([f.detections, cones()])) for f in queue_frames(duration=1.5)
     ]
-    one = tracked(frames)
-    other = tracked(frames, replace(SETTINGS, estimator=estimator))
+    exact = replace(SETTINGS, tolerance=0.0)
+    one = tracked(frames, exact)
+    other = tracked(frames, replace(exact, estimator=estimator))
     for horizon in (0.0, 1.0):
         a, b = one.tracks(1.4 + horizon), other.tracks(1.4 + horizon)
         assert a.id.tolist() == b.id.tolist()
