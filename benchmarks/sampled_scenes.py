@@ -7,6 +7,7 @@ group, or an object alone, is hidden, as behind a lorry. The tracker knows neith
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,13 +87,14 @@ def sampled_config(settings: SceneSettings, edges: tuple[Following | Neighbours,
         initiation_score=0.0,
         nms_distance=0.0,
         max_distance=30.0,
-        max_coasting=4 * settings.hidden_for,
+        max_deviation=math.inf,
     )
     tracker = TrackerSettings(
         classes={DEFAULT: of_class},
         edges=(settings.rule,) if edges is None else edges,
         association=AssociationSettings(clutter_area=CLUTTER_AREA, existence_weight=0.1, score_weight=1.0),
         existence=ExistenceSettings(report_above=0.9, confirm_above=0.95),
+        max_coasting=4 * settings.hidden_for,
         report_coasting=2 * INTERVAL,
         max_out_of_view=4 * settings.hidden_for,
     )

@@ -52,6 +52,7 @@ class Range:
 Finite = Annotated[float, Range()]
 Positive = Annotated[float, Range(0, above=True)]
 PositiveOrInf = Annotated[float, Range(0, above=True, infinite=True)]
+NonNegativeOrInf = Annotated[float, Range(0, infinite=True)]
 NonNegative = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
 PositiveInt = Annotated[int, Range(0, above=True)]

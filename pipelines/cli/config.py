@@ -16,7 +16,7 @@ FIRST = {
         "tracker.min_hits",
         "tracker.estimator",
         "tracker.classes.*.motion",
-        "tracker.classes.*.max_coasting",
+        "tracker.classes.*.max_deviation",
         "sensors.*.noise.*.position",
     ),
     "smoothing": (

@@ -3,7 +3,7 @@
 A table's second and later entries repeat the keys but not the comments. Entries that the defaults hold and the
 settings do not are written as `null`, which takes them away when the text is read over the defaults.
 
-A selection names settings by dotted keys, `*` for every entry of a table: `tracker.classes.*.max_coasting`.
+A selection names settings by dotted keys, `*` for every entry of a table: `tracker.classes.*.max_deviation`.
 """
 
 from __future__ import annotations

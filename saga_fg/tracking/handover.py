@@ -63,7 +63,7 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     new = np.flatnonzero(detected & resolved & (detections > 1) & (detections <= settings.confirming_detections))
     if len(new) == 0:
         return new, new, new
-    old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.association.relink_within))
+    old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.max_coasting))
     same = state.class_groups.same_group
     others = same(table.label[new], table.label[new]).sum(axis=1)
     i, j = np.nonzero(

@@ -168,16 +168,14 @@ class Journal:
         assert last is not None
         for row in np.flatnonzero(~np.isin(last.table.id, now.table.id)).tolist():
             event = self._event("deleted", last, int(last.table.id[row]), row)
-            of_class = class_settings(settings.classes, ClassSettings, event["label"])
             coasting = float(last.timestamp - last.table.last_detected[row])
-            out_of_view = float(last.timestamp - last.table.last_in_view[row])
             existence = float(last.table.existence[row])
-            if coasting > of_class.max_coasting:
-                reason = f"not detected for longer than {of_class.max_coasting:g} s, nor likely to be found again"
-            elif out_of_view > settings.max_out_of_view:
-                reason = f"outside every sensor's view for longer than {settings.max_out_of_view:g} s"
-            elif existence < settings.existence.delete_below:
+            if coasting > settings.max_coasting:
+                reason = f"not detected for longer than {settings.max_coasting:g} s"
+            elif not last.table.confirmed[row] and existence < settings.existence.delete_below:
                 reason = f"existence below {settings.existence.delete_below:g} before it was confirmed"
+            elif coasting > 0:
+                reason = "its place is no longer known well enough to report it or to find it again"
             else:
                 reason = "another track took its place"
             self._write(event | {"coasting": coasting, "existence": existence, "reason": reason})

@@ -32,6 +32,12 @@ class Kinematics(NamedTuple):
         """(n,) standard deviation of the velocity in a mean direction, m/s."""
         return speed_deviation(self.P_velocity)
 
+    @property
+    def deviation(self) -> FloatArray:
+        """(n,) standard deviation of the position in the direction in which it is largest, m."""
+        middle, half = (self.P[:, 0, 0] + self.P[:, 1, 1]) / 2, (self.P[:, 0, 0] - self.P[:, 1, 1]) / 2
+        return np.asarray(np.sqrt(middle + np.hypot(half, self.P[:, 0, 1])))
+
     def within_limits(self, origin: FloatArray) -> BoolArray:
         """(n,) which states are finite and inside the limits of detections; positions are from `origin` (2,).
 

@@ -69,7 +69,7 @@ def relinkable(state: TrackerState) -> BoolArray:
     none = np.zeros((len(table), 2))
     peaks = _log_density(none, state.kinematics().P), _log_density(none, table.stationarity.P)
     log_odds = log_survival(state) + _mixed(state, np.arange(len(table)), *peaks) + math.log(area(state))
-    within = table.coasting(state.time) <= association.relink_within
+    within = table.coasting(state.time) <= state.settings.max_coasting
     return np.asarray(within & (log_odds >= least_log_odds(state)))
 
 

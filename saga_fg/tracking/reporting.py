@@ -1,4 +1,6 @@
-r"""Report: the tracks of sufficient existence that were detected recently, with a score and a calibrated covariance.
+r"""Report: the tracks of sufficient existence that are detected, or whose place is known well enough.
+
+Each has a score and a calibrated covariance:
 
     score       p ( hits / (opportunities + prior_opportunities) )^w        when detected; while coasting times r
     P_reported  = ( c (1 + h (1 - p)) )^2 P + ( b (1 + g (1 - p)) )^2 u u^T
@@ -38,12 +40,20 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
 def reported_rows(state: TrackerState) -> IntArray:
     """Rows of the tracks to be reported."""
     table, settings = state.table, state.settings
+    coasting = table.coasting(state.time)
+    carried = (coasting <= settings.report_coasting) & known_places(state)
     return np.flatnonzero(
         (~table.tentative | (settings.tentative_score_factor > 0))
         & (table.confirmed | (table.existence >= settings.existence.report_above))
-        & (table.coasting(state.time) <= settings.report_coasting)
+        & ((coasting == 0) | carried)
         & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
     )
+
+
+def known_places(state: TrackerState) -> BoolArray:
+    """(n,) tracks whose places, should they move, are known to the `max_deviation` of their class."""
+    (most,) = state.class_values(state.table.label, "max_deviation")
+    return np.asarray(state.kinematics().deviation <= most)
 
 
 def reported_score(

@@ -22,6 +22,7 @@ from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.settings import (
     Fraction,
     NonNegative,
+    NonNegativeOrInf,
     Positive,
     PositiveInt,
     PositiveOrInf,
@@ -84,10 +85,10 @@ class ClassSettings(Settings):
     max_distance: PositiveOrInf = setting(
         4.0, "largest distance between a prediction and its detection, whatever the gate says, m; usual 1.5 to 12"
     )
-    max_coasting: PositiveOrInf = setting(
-        1.2,
-        "delete a track this long after its last detection, s, unless it can be re-linked; usual 1 to 2; higher: "
-        "doubtful tracks live longer",
+    max_deviation: PositiveOrInf = setting(
+        1.5,
+        "keep and report a track without detections while the standard deviation of its position is below this in "
+        "every direction, m; usual 1 to 4; higher: hidden objects are reported for longer, at less certain places",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
@@ -128,11 +129,6 @@ class AssociationSettings(Settings):
         0.9,
         "re-link a track that was not detected with a detection that would initiate another one, from this "
         "probability on; usual 0.8 to 0.99; higher: fewer wrong links, more lost identities, 1: never",
-    )
-    relink_within: NonNegative = setting(
-        6.0,
-        "keep a track beyond max_coasting, up to this long after its last detection, while its place is known "
-        "well enough to re-link it, s; usual 3 to 10; higher: longer occlusions, more tracks",
     )
 
     def __post_init__(self) -> None:
@@ -295,20 +291,27 @@ class TrackerSettings(Settings):
     )
     confirming_detections: PositiveInt = setting(
         3,
-        "detections that confirm a track initiated by a sensor with `initiation: confirmed`, and from which on a "
-        "hidden track is kept for `association.relink_within`; usual 2 to 5; higher: fewer doubtful tracks",
+        "detections that confirm a track initiated by a sensor with `initiation: confirmed`, and up to which a track "
+        "may hand over to an earlier one; usual 2 to 5; higher: fewer doubtful tracks",
     )
     clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
     max_delay: NonNegative = setting(
         0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
     )
+    max_coasting: PositiveOrInf = setting(
+        6.0,
+        "delete a track this long after its last detection, however well its place is known, s; usual 3 to 10; higher: "
+        "longer occlusions, more tracks",
+    )
+    report_coasting: NonNegativeOrInf = setting(
+        math.inf,
+        "report no track for longer than this after its last detection, s; .inf: for as long as `max_deviation` lets "
+        "it; higher: fewer gaps, more false positives",
+    )
     max_out_of_view: PositiveOrInf = setting(
         0.5,
-        "report a track for this long after it left every sensor's field of view, and keep it no longer unless it can "
-        "be re-linked, s; usual 0.2 to 2; higher: reported for longer",
-    )
-    report_coasting: NonNegative = setting(
-        0.6, "report a track for this long after its last detection, s; higher: fewer gaps, more false positives"
+        "report a track for this long after it left every sensor's field of view, s; usual 0.2 to 2; higher: reported "
+        "for longer",
     )
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:

@@ -79,8 +79,9 @@ class Tracker:
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.observer = observer
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        max_coastings = [c.max_coasting for c in self.settings.classes.values() if math.isfinite(c.max_coasting)]
-        max_jump = max(self.settings.clock.max_jump, *max_coastings, 0.0)
+        max_jump = self.settings.clock.max_jump
+        if math.isfinite(self.settings.max_coasting):
+            max_jump = max(max_jump, self.settings.max_coasting)
         self._clock = replace(self.settings.clock, max_jump=max_jump)
         self._state = TrackerState(self.settings, self.rules, self.providers)
         self._last_step_failed = False

@@ -176,8 +176,7 @@ class TrackerState:
             self.remove(np.ones(len(self), dtype=bool))
             self.start = timestamp - self.time
         elif verdict == "set_ahead":
-            coasting = self.table.coasting(self.relative(timestamp))
-            self.remove(coasting > self.class_values(self.table.label, "max_coasting")[0])
+            self.remove(self.table.coasting(self.relative(timestamp)) > self.settings.max_coasting)
         if verdict != "accepted":
             log.warning("the clock was set from %.3f s to %.3f s by %s", before, timestamp, sensor)
         return True

@@ -233,7 +233,7 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family)
     for variant in contenders(family).values():
         config = with_life(variant.config(base), "kept")
         config.new_tracker(variant.method)
-        assert {each.max_coasting for each in config.tracker.classes.values()} == {LIFE}
+        assert config.tracker.max_coasting == LIFE
         assert with_life(config, "shipped") is config
 
 
@@ -245,7 +245,7 @@ def test_classical_contenders_differ_in_motion_alone() -> None:
     assert turn.stationarity.prior == 0.5
     alone = contenders("kitti")["constant velocity"].config(base).tracker
     assert alone.stationarity.prior == 0
-    assert alone.classes["default"].max_coasting == base.tracker.classes["default"].max_coasting
+    assert alone.classes["default"].max_deviation == base.tracker.classes["default"].max_deviation
     assert Contender.of(contenders("kitti")["kf"], base).same_as(Contender("classical", "kf", base))
     assert not Contender.of(contenders("kitti")["saga"], base).same_as(Contender("classical", "kf", base))
 

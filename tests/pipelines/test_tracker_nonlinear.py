@@ -10,10 +10,9 @@ from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 
 SETTINGS = """
 estimator: {estimator}
-report_coasting: 3.0
 classes:
-  car: {{motion: {{kind: {motion}}}, max_coasting: 5.0}}
-  pedestrian: {{motion: {{kind: constant_velocity, acceleration_noise: 0.3}}, max_coasting: 5.0}}
+  car: {{motion: {{kind: {motion}}}, max_deviation: .inf}}
+  pedestrian: {{motion: {{kind: constant_velocity, acceleration_noise: 0.3}}, max_deviation: .inf}}
 edges: [{edges}]
 """
 ESTIMATORS = ("kalman", "isam2", "fixed-lag")

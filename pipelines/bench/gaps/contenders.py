@@ -23,8 +23,9 @@ Life = Literal["kept", "shipped"]
 LIVES: tuple[Life, ...] = ("kept", "shipped")
 LIFE = LONGEST + 1.0  # s: for so long tracks that are kept alive live without a detection
 KEPT_ALIVE: Mapping[str, Any] = {
-    "tracker.report_coasting": LIFE,
-    "tracker.classes.*.max_coasting": LIFE,
+    "tracker.report_coasting": inf,
+    "tracker.max_coasting": LIFE,
+    "tracker.classes.*.max_deviation": inf,
     "tracker.max_out_of_view": inf,
     "tracker.existence.delete_below": 0.0,
     "tracker.existence.report_above": 0.0,

@@ -163,13 +163,12 @@ def hidden_follower(seed: int) -> list[tuple[Frame, float, bool]]:
 
 def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[Any, ...] = ()) -> float:
     """RMS error of the follower's place while it is hidden, m."""
-    classes = {"default": ClassSettings(motion=ConstantVelocity(acceleration_noise=1.0), max_coasting=3.0)}
+    classes = {"default": ClassSettings(motion=ConstantVelocity(acceleration_noise=1.0), max_deviation=20.0)}
     settings = TrackerSettings(
         classes=classes,
         edges=(Following(rate=1.0),),
         estimator=estimator,
         ego=ego,
-        report_coasting=5.0,
         max_out_of_view=5.0,
     )
     squares = []

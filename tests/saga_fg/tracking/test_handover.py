@@ -14,7 +14,7 @@ from saga_fg.tracking.stationarity import StationaritySettings
 from tests.saga_fg.traffic_frames import frame, run
 
 SETTINGS = TrackerSettings(
-    {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_coasting=1.0, max_distance=3.0)},
+    {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_deviation=1.0, max_distance=3.0)},
     edges=(),
     association=AssociationSettings(clutter_area=3000.0),
     stationarity=StationaritySettings(prior=0.5),

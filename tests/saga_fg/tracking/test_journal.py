@@ -74,10 +74,10 @@ def test_what_another_track_took_is_named() -> None:
 def test_ends_have_a_reason() -> None:
     detected = (frame(0.1 * k, 0.0, score=0.99) for k in range(2))
     settings = replace(SETTINGS, association=AssociationSettings(relink_above=1.0))
-    events, _ = run(*detected, *(frame(0.1 * k) for k in range(2, 20)), settings=settings)
+    events, _ = run(*detected, *(frame(0.1 * k) for k in range(2, 30)), settings=settings)
     (deleted,) = of_kind(events, "deleted")
     assert deleted["confirmed"]
-    assert deleted["reason"].startswith("not detected for longer than 1.2 s")
+    assert deleted["reason"].startswith("its place is no longer known well enough")
     events, _ = run(frame(0.0, 0.0, score=0.2), *(frame(0.1 * k) for k in range(1, 9)))
     assert of_kind(events, "deleted")[0]["reason"].startswith("existence below 0.02")
 

@@ -19,8 +19,8 @@ from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 HORIZONS = [0.5, 1.0, 2.0, 5.0]
 LED = Following(interaction=SharedVelocity(along_heading=True), rate=1.0)
 CLASSES = {
-    "car": ClassSettings(motion=Curvilinear(turn_time=2.0)),
-    "truck": ClassSettings(motion=ConstantAcceleration(0.5, fading_time=3.0)),
+    "car": ClassSettings(motion=Curvilinear(turn_time=2.0), max_deviation=np.inf),
+    "truck": ClassSettings(motion=ConstantAcceleration(0.5, fading_time=3.0), max_deviation=np.inf),
 }
 
 
@@ -32,7 +32,7 @@ def braking(t):
 
 def followed(estimator="kalman", edges=(LED,), until=3.0, **values):
     """A tracker that has seen the traffic so far, boxes and headings included."""
-    settings = TrackerSettings(CLASSES, edges=edges, estimator=estimator, report_coasting=20.0, **values)
+    settings = TrackerSettings(CLASSES, edges=edges, estimator=estimator, **values)
     tracker = Tracker(settings, {"lidar": Sensor(noise={"default": NoiseModel(position=0.2)})})
     label = ["truck", "car", "car"]
     run(tracker, seen(np.random.default_rng(4), braking, np.arange(0, until, 0.1), label=label, yaw=0.02))

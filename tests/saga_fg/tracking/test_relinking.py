@@ -13,7 +13,7 @@ from saga_fg.tracking.stationarity import StationaritySettings
 from tests.saga_fg.traffic_frames import columns, frame, run
 
 SETTINGS = TrackerSettings(
-    {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_coasting=1.0, max_distance=3.0)},
+    {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_deviation=1.0, max_distance=3.0)},
     edges=(),
     association=AssociationSettings(clutter_area=3000.0),
     stationarity=StationaritySettings(prior=0.5),
@@ -71,7 +71,8 @@ def test_another_class_does_not_take_it():
     tracker = Tracker(SETTINGS)
     run(tracker, [frame(0.1 * k, [(20.0, 5.0)]) for k in range(30)])
     run(tracker, [frame(0.1 * k, []) for k in range(30, 60)])
-    assert tracker.step(frame(6.0, [(20.0, 5.0)], label="truck")).id.tolist() == [2]
+    tracks = tracker.step(frame(6.0, [(20.0, 5.0)], label="truck"))
+    assert tracks.id[tracks.coasting == 0].tolist() == [2]
 
 
 def test_a_class_of_its_group_does():
@@ -125,7 +126,7 @@ def test_estimators_agree(estimator):
 
 def test_a_relinked_track_is_updated_as_any_other():
     """A tracker that assigns the return at once, as its gate is wide, has the same state."""
-    wide = replace(SETTINGS, classes={"default": replace(SETTINGS.classes["default"], max_coasting=10.0)})
+    wide = replace(SETTINGS, classes={"default": replace(SETTINGS.classes["default"], max_deviation=20.0)})
     everything = replace(wide, association=AssociationSettings(relink_above=1.0))
     frames = [frame(0.1 * k, [crossing(0.1 * k)] if not 30 <= k < 65 else []) for k in range(66)]
     relinked, assigned = run(Tracker(SETTINGS), frames)[-1], run(Tracker(everything), frames)[-1]

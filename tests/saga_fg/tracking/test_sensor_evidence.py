@@ -119,8 +119,8 @@ def test_a_sensor_that_falls_silent_keeps_its_field_of_view():
 
 def test_a_car_behind_outlives_an_outage_of_the_lidar_while_the_camera_looks_ahead():
     ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
-    classes = {"default": ClassSettings(max_coasting=3.0)}
-    tracker = Tracker(TrackerSettings(classes, report_coasting=3.0, max_out_of_view=0.5), {"camera": ahead})
+    classes = {"default": ClassSettings(max_deviation=20.0)}
+    tracker = Tracker(TrackerSettings(classes, max_out_of_view=0.5), {"camera": ahead})
     pose = {"world_T_ego": np.eye(4)}
     for k in range(5):
         tracker.step(frame(k / 10, [(-20.0, 0.0)], **pose))

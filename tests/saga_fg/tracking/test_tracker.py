@@ -24,7 +24,9 @@ TENTHS = np.arange(0, 5, 0.1)
 def settings(edges=(), **values):
     """Independent objects of one kind of class settings."""
     existence = {k: values.pop(k) for k in ("report_above", "confirm_above", "delete_below", "lifetime") if k in values}
-    overall = {k: values.pop(k) for k in ("max_delay", "report_coasting", "max_out_of_view") if k in values}
+    overall = {
+        k: values.pop(k) for k in ("max_delay", "max_coasting", "report_coasting", "max_out_of_view") if k in values
+    }
     association = AssociationSettings(relink_above=values.pop("relink_above", 0.9))
     classes = {"default": ClassSettings(**values)}
     return TrackerSettings(
@@ -120,7 +122,7 @@ def test_weak_detections_start_no_track_but_keep_one_alive():
 
 
 def test_a_track_coasts_is_no_longer_reported_and_dies():
-    tracker = Tracker(settings(max_coasting=1.0, report_coasting=0.55, relink_above=1.0))
+    tracker = Tracker(settings(max_coasting=1.0, report_coasting=0.55))
     run(tracker, [frame(t, [(10 * t, 0)]) for t in np.arange(0, 1.05, 0.1)])
     coasting = [tracker.step(frame(1.0 + t, [])) for t in np.arange(0.1, 1.25, 0.1)]
     reported = [len(tracks) for tracks in coasting]
@@ -141,7 +143,7 @@ def test_an_object_seen_again_in_time_keeps_its_id():
 
 def test_ids_are_never_reused():
     rng = np.random.default_rng(4)
-    tracker, met = Tracker(settings(max_coasting=0.3, relink_above=1.0)), {}
+    tracker, met = Tracker(settings(max_coasting=0.3)), {}
     for k in range(60):
         position = rng.uniform(-60, 60, (int(rng.integers(0, 5)), 2))
         for track in tracker.step(frame(0.2 * k, position, score=0.95)):
@@ -157,7 +159,7 @@ def test_doubtful_tracks_end_by_misses_where_the_sensor_looks_and_not_elsewhere(
     pose = {"world_T_ego": np.eye(4)}
     left = []
     for position in ((20.0, 0.0), (-20.0, 0.0)):
-        tracker = Tracker(settings(max_coasting=5.0, report_coasting=5.0), {"camera": ahead})
+        tracker = Tracker(settings(max_deviation=20.0), {"camera": ahead})
         tracker.step(frame(0.0, [position], score=0.3, **pose))
         left.append(len(run(tracker, [frame(t, [], "camera", **pose) for t in (0.1, 0.2, 0.3)])[-1]))
     assert left == [0, 1]
@@ -168,7 +170,7 @@ def test_how_often_nobody_looks_does_not_matter_to_belief():
     sensors = {"blind": Sensor(detection_probability=0.0)}
     scores = []
     for count in (1, 20):
-        tracker = Tracker(settings(max_coasting=5.0, report_coasting=5.0, lifetime=2.0), sensors)
+        tracker = Tracker(settings(max_deviation=20.0, lifetime=2.0), sensors)
         tracker.step(frame(0.0, [(0, 0)], score=0.5))
         scores.append(run(tracker, [frame(t, [], "blind") for t in np.linspace(0, 1, count + 1)[1:]])[-1].score[0])
     assert scores[0] == pytest.approx(0.5 * 0.5 * np.exp(-1.0 / 2.0))
@@ -177,7 +179,7 @@ def test_how_often_nobody_looks_does_not_matter_to_belief():
 
 def test_a_confirmed_track_outlives_misses():
     for score, alive in ((0.95, 1), (0.3, 0)):
-        tracker = Tracker(settings(max_coasting=2.0, report_coasting=2.0, confirm_above=0.9))
+        tracker = Tracker(settings(max_deviation=20.0, confirm_above=0.9))
         tracker.step(frame(0.0, [(0, 0)], score=score))
         assert len(run(tracker, [frame(t, []) for t in np.arange(0.1, 1.0, 0.1)])[-1]) == alive
 

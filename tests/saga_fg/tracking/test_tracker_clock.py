@@ -135,7 +135,7 @@ def test_frames_that_are_sent_again_say_nothing_of_the_clock(make):
 def test_how_far_the_clock_may_jump_can_be_set():
     for settings, expected in (
         (TrackerSettings(clock=ClockSettings(max_jump=100.0)), "accepted"),
-        (TrackerSettings({"default": ClassSettings(max_coasting=80.0)}), "accepted"),  # tracks live that long
+        (TrackerSettings(max_coasting=80.0), "accepted"),  # tracks live that long
         (TrackerSettings(clock=ClockSettings(max_jump=5.0)), "unconfirmed"),
     ):
         tracker = Tracker(settings)
@@ -152,7 +152,7 @@ def test_how_far_the_clock_may_jump_can_be_set():
 
 def test_tracks_that_outlive_a_jump_are_predicted():
     settings = TrackerSettings(
-        {"default": ClassSettings(max_coasting=np.inf)}, max_out_of_view=np.inf, report_coasting=100.0
+        {"default": ClassSettings(max_deviation=np.inf)}, max_coasting=np.inf, max_out_of_view=np.inf
     )
     tracker = Tracker(settings)
     run(tracker, at(0.0, np.arange(10) / 10))

@@ -10,8 +10,8 @@ from saga_fg.tracking import AssociationSettings, ClassSettings
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 PATIENT = {
-    "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_coasting=10.0)},
-    "report_coasting": 10.0,
+    "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_deviation=np.inf)},
+    "max_coasting": 10.0,
     "max_out_of_view": 10.0,
 }
 
@@ -152,7 +152,7 @@ def braking_behind_a_wall(method, estimator="kalman", gap=4.5):
     rng = np.random.default_rng(0)
     edges = (Neighbours(rate=1.0, distance_scale=20.0, speed_scale=np.inf),)
     association = AssociationSettings(method=method, clutter_area=1e4, existence_weight=0.0)
-    far = {"default": ClassSettings(motion=ConstantVelocity(10.0), max_coasting=10.0, max_distance=15.0)}
+    far = {"default": ClassSettings(motion=ConstantVelocity(10.0), max_deviation=np.inf, max_distance=15.0)}
     told = PATIENT | {"classes": far}
     tracker = Tracker(TrackerSettings(edges=edges, association=association, estimator=estimator, **told))
     ids = []

@@ -31,12 +31,11 @@ FOLLOW = Following(interaction=SharedVelocity(), rate=1.0, max_gap=40)
 EDGES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), replace(FOLLOW, cones=ConeGeometry()))
 SETTINGS = TrackerSettings(
     classes={
-        "default": ClassSettings(motion=ConstantVelocity(acceleration_noise=0.5), max_coasting=5.0),
+        "default": ClassSettings(motion=ConstantVelocity(acceleration_noise=0.5), max_deviation=np.inf),
         "traffic_cone": ClassSettings(motion=RandomWalk()),
     },
     edges=EDGES,
     max_step=0.25,
-    report_coasting=5.0,
 )
 SENSORS = {"default": Sensor(colour_accuracy=0.9)}
 
@@ -75,7 +74,7 @@ def test_cars_are_expected_to_brake_for_a_red_light_one_after_the_other():
 @pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
 def test_drivers_without_corners_brake_for_a_red_light_one_after_the_other(estimator):
     edges = RedLight(interaction=SmoothStopping()), replace(FOLLOW, interaction=SmoothDriver(), lateral_scale=3.0)
-    settings = replace(SETTINGS, edges=edges, estimator=estimator, report_coasting=20.0)
+    settings = replace(SETTINGS, edges=edges, estimator=estimator, max_coasting=20.0)
     red, green = (tracked(queue_frames(colour, duration=2.0), settings) for colour in ("red", "green"))
     assert speeds_at(red, 4.9)[1] < speeds_at(green, 4.9)[1] - 2.0
     assert speeds_at(red, 4.9)[2] < speeds_at(green, 4.9)[2] - 1.0

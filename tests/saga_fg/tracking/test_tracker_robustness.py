@@ -227,7 +227,7 @@ def test_a_state_that_is_not_finite_is_deleted_and_the_others_go_on(monkeypatch,
 
 @pytest.mark.parametrize("timestamp", [1e12, 1e300])
 def test_looking_ahead_for_ever(timestamp):
-    tracker = Tracker(TrackerSettings(report_coasting=1e308))
+    tracker = Tracker(TrackerSettings({"default": ClassSettings(max_deviation=np.inf)}))
     run(tracker, traffic())
     assert len(tracker.tracks(timestamp)) == 0
     assert tracker.step(frame(1.0, CARS(1.0))).id.tolist() == [1, 2, 3]
@@ -310,7 +310,7 @@ def test_what_are_no_detections_is_refused(rows):
 @pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, lambda t: pickle.loads(pickle.dumps(t))])
 @pytest.mark.parametrize("estimator", [*ESTIMATORS, "centerpoint"])
 def test_trackers_can_be_copied_and_pickled(estimator, copied):
-    classes = {"default": ClassSettings(max_coasting=2.0)}
+    classes = {"default": ClassSettings(max_deviation=3.0)}
     tracker = GreedyTracker() if estimator == "centerpoint" else Tracker(TrackerSettings(classes, estimator=estimator))
     frames = traffic(20)
     run(tracker, frames[:10])

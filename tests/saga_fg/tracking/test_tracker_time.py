@@ -150,8 +150,10 @@ def test_frames_that_come_too_late_are_left_out_and_counted():
     assert columns(reported) == before
     assert columns(t.tracks(1.0)) == before
     assert t.late_frames == 1
-    assert t.step(frame(0.6, [(100, 100)], "camera")).id.tolist() == [1, 2]
+    assert t.step(frame(0.6, [(100, 100)], "camera", velocity=(0.0, 0.0))).id.tolist() == [1, 2]
     assert t.late_frames == 1
+    t.step(frame(0.6, [(-100, 100)], "camera"))  # may be anywhere by now, and is not reported
+    assert t.assignment.id.tolist() == t.snapshot().table.id[-1:].tolist() == [3]
 
 
 def test_no_delay_is_allowed_if_so_set():
@@ -164,7 +166,7 @@ def test_no_delay_is_allowed_if_so_set():
 
 
 def test_looking_ahead_moves_tracks_by_their_velocity_and_makes_them_less_certain():
-    t = tracker(report_coasting=2.0)
+    t = tracker()
     now = run(t, seen(np.random.default_rng(0), FAST, np.arange(0, 2, 0.1)))[-1]
     ahead = t.tracks(now.timestamp + 0.5)
     assert ahead.timestamp == now.timestamp + 0.5

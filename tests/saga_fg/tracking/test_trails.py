@@ -121,8 +121,8 @@ def test_the_world_may_be_turned_and_moved(turn, x, y):
 # tracks
 
 SENSORS = {"lidar": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.05)})}
-CAR = ClassSettings(Curvilinear(course_time=0.7), max_coasting=6.0)
-ON = TrackerSettings({"default": CAR}, edges=(), report_coasting=6.0, trails=SETTINGS)
+CAR = ClassSettings(Curvilinear(course_time=0.7), max_deviation=np.inf)
+ON = TrackerSettings({"default": CAR}, edges=(), trails=SETTINGS)
 
 
 def driven(settings, follower=3.0, hidden=2.0, gap=2.5, seed=0):

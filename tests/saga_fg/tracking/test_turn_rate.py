@@ -15,9 +15,7 @@ DT, RATE, SPEED = 0.1, 0.3, 8.0
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.03)})}
 MOTION = Curvilinear(turn_time=2.0)
 SHARE = 0.3  # of objects that turn
-TURNS = TrackerSettings(
-    classes={"default": ClassSettings(motion=MOTION, max_coasting=3.0)}, edges=(), report_coasting=3.0
-)
+TURNS = TrackerSettings(classes={"default": ClassSettings(motion=MOTION, max_deviation=20.0)}, edges=())
 NO_TURNS = replace(TURNS, classes={"default": replace(TURNS.classes["default"], motion=replace(MOTION, turn_time=0.0))})
 
 
