@@ -37,13 +37,17 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 
 def main() -> None:
-    """All pictures but for those that need recordings."""
+    """All pictures; those of recordings where the variable SAGA_FG_DATA names their folder."""
     write_concept_pictures(HERE)
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     write_heterogeneous_picture(HERE)
     write_running_graph_pictures(HERE)
-    gap = "bench gaps --sets simulated --scenes 2 --passes 2 --contenders saga,kf --life kept --picture"
-    subprocess.run(["saga-fg", *gap.split(), HERE / "gap.png"], check=True, capture_output=True)
+    if data := os.environ.get("SAGA_FG_DATA"):
+        gap = "bench gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
+        subprocess.run(
+            ["saga-fg", *gap.split(), "--contenders", "saga,kf", "--data", data, "--picture", HERE / "gap.png"],
+            check=True,
+        )
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")

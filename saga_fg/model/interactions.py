@@ -5,7 +5,7 @@ r"""Interaction functions: the triple (A_self, A_other, b) with which an edge j 
 The mathematics of each interaction is written here, once; graphs, filters and factors adapt it. With u_i the unit
 heading of node i and R_ij the rotation from the heading of j to that of i:
 
-    shared velocity    dv_i/dt += rate ( R_ij v_j - v_i )
+    shared velocity    dv_i/dt += rate ( R_ij v_j - v_i ),  da_i/dt -= rate a_i  where a_i is of the state
     car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( u_i.(p_j - p_i) - gap_ij - headway u_i.v_i ) / tau )
     shared course      dv_i/dt += -rate m_j m_j.v_i,  m_j normal to u_j
 
@@ -32,6 +32,7 @@ from saga_fg.types.road_map import LaneAcross
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
+ACCELERATION = ("ax", "ay")
 Needs = tuple[tuple[str, ...], tuple[str, ...]]
 
 
@@ -95,7 +96,10 @@ class Interaction(Protocol):
 
 @dataclass(frozen=True)
 class SharedVelocity:
-    """Consensus of velocities: a node relaxes towards the velocity of its neighbour at the edge's rate."""
+    """Consensus of velocities: a node relaxes towards the velocity of its neighbour at the edge's rate.
+
+    The neighbour decides how fast it is, so that an acceleration of its own fades at the same rate.
+    """
 
     needs: ClassVar[Needs] = (VELOCITY, VELOCITY)
     along_heading: bool = setting(
@@ -106,7 +110,12 @@ class SharedVelocity:
         turn = nodes.heading[target] - nodes.heading[source] if self.along_heading else np.zeros(len(target))
         c, s = np.cos(turn), np.sin(turn)
         R = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-        return velocity_triples(nodes, target, source, by_velocity=-np.eye(2), by_other_velocity=R)
+        triples = velocity_triples(nodes, target, source, by_velocity=-np.eye(2), by_other_velocity=R)
+        own = nodes.types[target[0]]
+        if own.has(ACCELERATION):
+            a = own.index(ACCELERATION)
+            triples.A_self[:, a[:, None], a] = -np.eye(2)
+        return triples
 
 
 @dataclass(frozen=True)

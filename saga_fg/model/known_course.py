@@ -14,6 +14,7 @@ With n the normal of h + theta, and n_m that of h + theta / 2:
 
     v', a'  times  I - n n^T (1 - exp(-k dt))
     p' - p  times  I - n_m n_m^T (1 - (1 - exp(-k dt)) / (k dt))
+    q  is raised by  2 k |v|^2 var(h)           from which the velocity across has the variance |v|^2 var(h) at last
 
 The chord is exact for a constant speed and a constant rate; where the rate fades or the speed changes it is near.
 
@@ -77,15 +78,17 @@ class KnownCourses(Columns):
         mean: FloatArray,
         dt: float,
         settling: FloatArray | None = None,
+        course_variance: FloatArray | float = 0.0,
     ) -> KnownCourses:
         """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2; settling
-        0 if not given."""
+        0 if not given; course_variance (n,) var(h), rad^2."""
         u = _unit(heading)
         speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
         reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
         brake = np.where(reverses, acceleration, 0.0)[:, None] * u
-        lateral_noise = (mean[:, _V] ** 2).sum(axis=1) * rate_variance * 2 * RATE_CORRELATION
         settling = np.zeros(len(ids)) if settling is None else settling
+        uncertain = RATE_CORRELATION * rate_variance + settling * course_variance
+        lateral_noise = (mean[:, _V] ** 2).sum(axis=1) * 2 * uncertain
         return cls(ids, heading, rate, lateral_noise, brake, settling, node_type)
 
     def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, MatchedMotion]:
@@ -106,10 +109,11 @@ class KnownCourses(Columns):
         Q = _planar(Q_along, ahead) + _planar(Q_across + self.lateral_noise[:, None, None] * Q_white, aside)
         b = -(F[:, :, _A] @ self.brake[:, :, None])[:, :, 0]
         chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
-        passed = np.maximum(self.settling * dt, _LEAST)
-        faded = -np.expm1(-passed)
-        chord = _less_across(self.heading + theta / 2, 1 - faded / passed) @ chord
-        turn = _less_across(self.heading + theta, faded) @ turn
+        if self.settling.any():
+            passed = np.maximum(self.settling * dt, _LEAST)
+            faded = -np.expm1(-passed)
+            chord = _less_across(self.heading + theta / 2, 1 - faded / passed) @ chord
+            turn = _less_across(self.heading + theta, faded) @ turn
         F[:, _P, 2:], b[:, _P] = chord @ F[:, _P, 2:], (chord @ b[:, _P, None])[:, :, 0]
         for part in (_V, _A):
             F[:, part], b[:, part] = turn @ F[:, part], (turn @ b[:, part, None])[:, :, 0]

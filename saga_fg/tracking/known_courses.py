@@ -20,6 +20,7 @@ from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.trails import STEP
 
+COURSE_DEVIATION = 0.04  # rad, of a vehicle from the course of its path: it moves within its lane
 _ASTRAY = 0.5  # rad between heading and motion, from which the motion is noise
 _LEAST = 1e-9
 
@@ -42,15 +43,15 @@ def known_courses(state: TrackerState, dt: float, unseen: BoolArray) -> tuple[tu
         rate, variance = table.turn.known(rows, motion.turning_share)
         turns = (motion.turn_time > 0) & (np.hypot(*velocity[rows].T) > MOVING)
         rate, variance = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0)
-        heading, settling = table.box.yaw[rows], np.zeros(len(rows))
+        heading, settling, course_variance = table.box.yaw[rows], np.zeros(len(rows)), np.zeros(len(rows))
         led = np.flatnonzero(unseen[rows]) if motion.course_time > 0 else np.empty(0, dtype=np.int64)
         if len(led):
-            heading[led], turn = _along_paths(state, rows[led], rate[led], dt)
+            heading[led], turn, course_variance[led] = _along_paths(state, rows[led], rate[led], dt)
             after[rows[led]] = wrap_angle(heading[led] + turn)
             rate[led], settling[led] = turn / _turning_time(motion, dt), 1 / motion.course_time
         mean = state.joint.estimator.mean(table.id[rows])
         ids = table.id[rows]
-        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, settling))
+        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, settling, course_variance))
     if turn_time.any():
         table.turn.predict(dt, turn_time)
     return tuple(found), after
@@ -62,8 +63,11 @@ def _turning_time(motion: Curvilinear, dt: float) -> float:
     return -tau * math.expm1(-dt / tau) if tau > 0 else dt
 
 
-def _along_paths(state: TrackerState, rows: IntArray, rate: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Course of the paths (k,), rad, and turn along them within `dt` s (k,), rad, of tracks `rows` (k,)."""
+def _along_paths(
+    state: TrackerState, rows: IntArray, rate: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Course of the paths (k,), rad, turn along them within `dt` s (k,), rad, and variance of the course (k,), rad^2,
+    of tracks `rows` (k,)."""
     table, now = state.table, state.kinematics().select(rows)
     speed = np.hypot(*now.velocity.T)
     way = speed * dt
@@ -74,7 +78,7 @@ def _along_paths(state: TrackerState, rows: IntArray, rate: FloatArray, dt: floa
     k = np.minimum((way / STEP).astype(np.int64), steps - 1)
     start, share, each = paths.heading[:, 0], way / STEP - k, np.arange(len(rows))
     end = paths.heading[each, k] + share * (paths.heading[each, k + 1] - paths.heading[each, k])
-    return start, end - start
+    return start, end - start, COURSE_DEVIATION**2 + paths.disagreement
 
 
 def _course(yaw: FloatArray, variance: FloatArray, now: Kinematics) -> FloatArray:

@@ -60,12 +60,14 @@ class TrailPoints(Columns):
 class Paths(NamedTuple):
     """Predicted paths of n vehicles at m + 1 places, `STEP` m apart, from where they are.
 
-    position (n, m + 1, 2) m; heading (n, m + 1) rad; certainty (n, m + 1) in [0, 1) with which trails give the heading
+    position (n, m + 1, 2) m; heading (n, m + 1) rad; certainty (n, m + 1) in [0, 1) with which trails give the heading;
+    disagreement (n,) variance s^2 of the trails' headings where they are, rad^2
     """
 
     position: FloatArray
     heading: FloatArray
     certainty: FloatArray
+    disagreement: FloatArray
 
 
 @dataclass(eq=False)
@@ -74,37 +76,45 @@ class Trails:
 
     settings: TrailSettings
     points: TrailPoints | None = None
+    latest: TrailPoints | None = None  # of each track, by id
     _tree: cKDTree | None = field(default=None, repr=False)
 
     def update(self, passing: TrailPoints) -> None:
         """Remember where moving tracks are, if that is `SPACING` m from their last point."""
         if self.settings.memory == 0 or len(passing) == 0:
             return
-        if self.points is None:
-            self.points, self._tree = passing, None
-            return
-        new = passing.select(self._moved(passing))
-        old = self.points.time < passing.time[0] - self.settings.memory
-        if len(new) or old.any():
-            self.points, self._tree = self.points.select(~old).append(new), None
+        if self.points is None or self.latest is None:
+            self.points = passing
+        else:
+            new = np.flatnonzero(self._moved(passing, self.latest))
+            if len(new) == 0:
+                return
+            passing, since = passing.select(new), passing.time[0] - self.settings.memory
+            gone = np.isin(self.latest.id, passing.id) | (self.latest.time < since)
+            self.latest = self.latest.select(~gone)
+            self.points = self.points.select(self.points.time >= since).append(passing)
+        latest = passing if self.latest is None else self.latest.append(passing)
+        self.latest, self._tree = latest.select(np.argsort(latest.id)), None
 
-    def _moved(self, passing: TrailPoints) -> BoolArray:
+    @staticmethod
+    def _moved(passing: TrailPoints, latest: TrailPoints) -> BoolArray:
         """(n,) whether tracks are at least `SPACING` m from their latest points, or have none."""
-        points = self.points
-        assert points is not None
-        ids, last = np.unique(points.id[::-1], return_index=True)
-        if len(ids) == 0:
+        at = np.minimum(np.searchsorted(latest.id, passing.id), len(latest) - 1)
+        if len(latest) == 0:
             return np.ones(len(passing), dtype=np.bool_)
-        at = np.minimum(np.searchsorted(ids, passing.id), len(ids) - 1)
-        apart = passing.position - points.position[::-1][last[at]]
-        return np.asarray((ids[at] != passing.id) | (np.hypot(*apart.T) >= SPACING))
+        dx, dy = (passing.position - latest.position[at]).T
+        return np.asarray((latest.id[at] != passing.id) | (dx * dx + dy * dy >= SPACING**2))
 
-    def headings(self, ids: IntArray, position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean of h_j - h (n,), rad, at places (n, 2), world, with headings h (n,), and its certainty c (n,);
-        the trails of tracks `ids` (n,) tell them nothing."""
+    def headings(
+        self, ids: IntArray, position: FloatArray, heading: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean of h_j - h, rad, at places (n, 2), world, with headings h (n,), certainty c, variance s^2: (n,) each.
+
+        The trails of tracks `ids` (n,) tell them nothing.
+        """
         points, settings = self.points, self.settings
         if points is None or len(points) == 0:
-            return np.zeros(len(heading)), np.zeros(len(heading))
+            return np.zeros(len(heading)), np.zeros(len(heading)), np.zeros(len(heading))
         if self._tree is None:
             self._tree = cKDTree(points.position, balanced_tree=False, compact_nodes=False)
         apart, at = self._tree.query(position, k=NEAREST, distance_upper_bound=2 * settings.reach)
@@ -117,21 +127,21 @@ class Trails:
         total = k.sum(axis=1)
         mean = (k * turn).sum(axis=1) / np.maximum(total, _LEAST)
         variance = (k * (turn - mean[:, None]) ** 2).sum(axis=1) / np.maximum(total, _LEAST)
-        return mean, total / (total + PRIOR) / (1 + variance / AGREEMENT**2)
+        return mean, total / (total + PRIOR) / (1 + variance / AGREEMENT**2), variance
 
     def paths(
         self, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
     ) -> Paths:
         """Predict the paths of n tracks at `position` (n, 2), world, with a `curvature` (n,) of their own, 1/m."""
         place, course = position, heading
-        turn, certainty = self.headings(ids, place, course)
+        turn, certainty, disagreement = self.headings(ids, place, course)
         course = course + certainty * turn
         places, courses, certain = [place], [course], [certainty]
         for step in range(steps):
             own = curvature * STEP * np.exp(-(step + 0.5) * STEP / _BEND)
             middle = course + own / 2
             there = place + STEP * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-            turn, certainty = self.headings(ids, there, course)
+            turn, certainty, _ = self.headings(ids, there, course)
             after = course + certainty * turn + (1 - certainty) * own
             middle = (course + after) / 2
             place = place + STEP * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
@@ -139,4 +149,4 @@ class Trails:
             places.append(place)
             courses.append(course)
             certain.append(certainty)
-        return Paths(np.stack(places, axis=1), np.stack(courses, axis=1), np.stack(certain, axis=1))
+        return Paths(np.stack(places, axis=1), np.stack(courses, axis=1), np.stack(certain, axis=1), disagreement)

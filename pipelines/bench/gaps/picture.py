@@ -33,6 +33,7 @@ from saga_fg.types.road_map import RoadMap
 from saga_fg.types.track import Tracks
 
 BEFORE, AFTER = 1.5, 1.0  # s
+LANE = "#bcd0e0"
 MARGIN, LEAST = 8.0, 10.0  # m: before and after the object's way, and the least height of a panel
 ROAD_MARGIN, ROAD_LEAST = 15.0, 16.0  # m: the same where there is a road map
 BEYOND_LINE = 5.0  # m
@@ -134,7 +135,9 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: Sequence[DrawnGap]) ->
         ax.grid(color="#e6e6e6", linewidth=0.6)
         ax.set_axisbelow(True)
     axes[-1].set_xlabel(f"m; {labelled.label[gap.row]} without detections for {time[gap.stop] - time[gap.start]:.1f} s")
-    figure.legend(handles=_legend(road is not None), loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    handles = _legend(road)
+    columns = len(handles) if len(handles) <= 5 else 4
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return figure
 
 
@@ -154,7 +157,7 @@ def _widened(unseen: BoolArray) -> FloatArray:
 def _draw_road(ax: Any, road: RoadMap, colours: Mapping[str, str], origin: FloatArray, turn: FloatArray) -> None:
     """Lanes, and stop lines in the colours of their lights."""
     for lane in road.lanes:
-        ax.plot(*((np.array(lane.centre) - origin) @ turn).T, color="#bcd0e0", linewidth=0.8, zorder=0)
+        ax.plot(*((np.array(lane.centre) - origin) @ turn).T, color=LANE, linewidth=0.8, zorder=0)
     for line in road.stop_lines:
         colour = LIGHTS.get(colours.get(line.light, ""), "#808080")
         ax.plot(*((line.ends - origin) @ turn).T, color=colour, linewidth=3.0, solid_capstyle="butt", zorder=2)
@@ -198,16 +201,18 @@ def _draw_tracks(
             ax.annotate(f"track {name}", places[0], xytext=(0, 9), textcoords="offset points", color=colour, fontsize=8)
 
 
-def _legend(with_road: bool) -> list[Any]:
+def _legend(road: RoadMap | None) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    road = [Line2D([], [], color=LIGHTS["red"], linewidth=3.0, label="stop line: colour of its light")]
+    lane = Line2D([], [], color=LANE, linewidth=0.8, label="centre of a lane")
+    line = Line2D([], [], color=LIGHTS["red"], linewidth=3.0, label="stop line: colour of its light")
     return [
         Line2D([], [], color="#555555", linewidth=3.0, label="labels, detected"),
         Line2D([], [], color="#555555", linewidth=2.0, linestyle=":", label="labels, no detection"),
         Patch(facecolor="#f3dcc4", edgecolor="#b5651d", label="the object at the end of the gap"),
         Patch(facecolor="#d8d8d8", label="other objects then"),
         Line2D([], [], color=COLOURS[0], marker="o", markersize=3, label="track; ring: 90 % ellipse"),
-        *(road if with_road else ()),
+        *((lane,) if road is not None and road.lanes else ()),
+        *((line,) if road is not None and road.stop_lines else ()),
     ]

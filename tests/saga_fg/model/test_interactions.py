@@ -63,6 +63,9 @@ def test_triples_are_the_derivatives_of_the_law(interaction, types, seed):
         p_j, v_j = (x_j[types[1].index(names)] for names in (("x", "y"), ("vx", "vy")))
         change = np.zeros(types[0].dim)
         change[types[0].index(("vx", "vy"))] = acceleration(interaction, nodes, 0, 1, p_i, v_i, p_j, v_j)
+        if isinstance(interaction, SharedVelocity) and types[0].has(("ax", "ay")):
+            at = types[0].index(("ax", "ay"))
+            change[at] = -x_i[at]
         return change
 
     zero_i, zero_j = np.zeros(types[0].dim), np.zeros(types[1].dim)
@@ -160,3 +163,11 @@ def test_interactions_say_which_types_they_act_on():
         )
     assert applies(SharedVelocity.needs, CAR, rider)
     assert not applies(CarFollowing.needs, CAR, rider)
+
+
+def test_shared_velocity_takes_the_acceleration_of_the_follower_not_that_of_the_leader():
+    nodes = node_table(np.random.default_rng(1), (TRAM, TRAM))
+    triples = SharedVelocity().triples(nodes, np.array([0]), np.array([1]))
+    at = TRAM.index(("ax", "ay"))
+    assert triples.A_self[0][np.ix_(at, at)] == pytest.approx(-np.eye(2))
+    assert not triples.A_other[0][at].any()

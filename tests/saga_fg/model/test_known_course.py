@@ -163,3 +163,16 @@ def test_two_half_steps_settle_as_one():
     whole = discretise(graph, dt).F_matrix.toarray()
     assert whole[V, V] == pytest.approx(halves.toarray()[V, V], abs=1e-9)
     assert whole == pytest.approx(halves.toarray(), abs=1e-2)
+
+
+def test_an_uncertain_course_keeps_its_variance_across():
+    """At last the velocity across has the variance |v|^2 var(h), besides that of the lateral acceleration."""
+    speed, k, variance, dt = 8.0, 1.5, 0.01, 0.01
+    quiet = NodeType("car", Curvilinear(acceleration_noise=0.0, lateral_acceleration_noise=0.0, jerk_noise=0.0))
+    none, mean = np.zeros(1), np.array([[0, 0, speed, 0, 0, 0]])
+    record = KnownCourses.of(quiet, np.array([7]), none, none, none, mean, dt, np.array([k]), np.array([variance]))
+    F, _, Q = own(record, dt, quiet)
+    P_across = 0.0
+    for _ in range(1000):
+        P_across = F[3, 3] ** 2 * P_across + Q[3, 3]
+    assert P_across == pytest.approx(speed**2 * variance, rel=0.05)

@@ -171,3 +171,13 @@ def test_trails_are_part_of_a_snapshot():
     first = tracker.step(later).boxes.position
     tracker.restore(before)
     assert np.array_equal(tracker.step(later).boxes.position, first)
+
+
+def test_where_trails_part_the_place_is_less_certain():
+    """A car that is hidden at a fork of two trails may be on either."""
+    trails = along(*arc(np.arange(-20, 40, 1.0)))
+    before = path(trails).disagreement[0]
+    for p in np.arange(-20, 40, 1.0):
+        trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]))
+    assert before == pytest.approx(0.0, abs=1e-9)
+    assert path(trails, *(each[0] for each in arc(np.array([6.0])))).disagreement[0] > 0.01
