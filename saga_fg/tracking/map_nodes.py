@@ -188,7 +188,10 @@ class MapNodes:
         closed, opened = np.zeros(n + m), np.zeros(n + m)
         closed[governed], opened[governed] = self.settings.closed(states), self.settings.open(states)
         lanes = {
-            n + k: tuple(lane._replace(centre=lane.centre - origin) for lane in self.across[name])
+            n + k: tuple(
+                lane.with_line_moved(position[k] + origin - self.place[k].middle)._replace(centre=lane.centre - origin)
+                for lane in self.across[name]
+            )
             for k, name in enumerate(self.name)
             if name in self.across
         }

@@ -119,12 +119,13 @@ class RoadMap(Settings):
 
 class LaneAcross(NamedTuple):
     """A lane that crosses a stop line: its centre line (k, 2), its width, m, and where the middle of the line is along
-    it, s, and to its left, e, m."""
+    it, s, and to its left, e, m; its direction (2,) there."""
 
     centre: FloatArray
     width: float
     s: float
     e: float
+    direction: FloatArray
 
     @classmethod
     def of(cls, lane: Lane, line: StopLine) -> LaneAcross | None:
@@ -133,7 +134,12 @@ class LaneAcross(NamedTuple):
         at = feet(centre, ends.mean(axis=0)[None])
         ahead = at.direction[0] @ (math.cos(line.heading), math.sin(line.heading)) > 0
         crosses = ahead and abs(at.e[0]) <= np.hypot(*(ends[0] - ends[1])) / 2
-        return cls(centre, lane.width, float(at.s[0]), float(at.e[0])) if crosses else None
+        return cls(centre, lane.width, float(at.s[0]), float(at.e[0]), at.direction[0]) if crosses else None
+
+    def with_line_moved(self, by: FloatArray) -> LaneAcross:
+        """The same lane, and the line moved by (2,), m."""
+        along, (x, y) = self.direction @ by, self.direction
+        return self._replace(s=self.s + float(along), e=self.e + float(x * by[1] - y * by[0]))
 
 
 def _require_name(name: str) -> None:

@@ -1,5 +1,7 @@
 """Interaction functions: their triples are the written law, and the law knows no place and no direction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -112,9 +114,7 @@ def test_a_formation_feels_nothing(types):
     """At the present estimate, at equal speeds along the headings, nothing has to change."""
     nodes = node_table(np.random.default_rng(2), types)
     along = np.stack([8.0 * unit(heading) for heading in nodes.heading])
-    nodes = NodeTable(
-        *(along if name == "velocity" else getattr(nodes, name) for name in NodeTable.__dataclass_fields__)
-    )
+    nodes = replace(nodes, velocity=along)
     for interaction in (CarFollowing(), CarFollowing(headway=1.5), SharedVelocity(along_heading=True)):
         A_self, A_other, b = (part[0] for part in interaction.triples(nodes, np.array([0]), np.array([1])))
         x_i, x_j = (state(t, nodes.position[k], nodes.velocity[k]) for k, t in enumerate(types))

@@ -166,7 +166,7 @@ def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[Any, ..
     classes = {"default": ClassSettings(motion=ConstantVelocity(acceleration_noise=1.0), max_deviation=20.0)}
     settings = TrackerSettings(
         classes=classes,
-        edges=(Following(rate=1.0),),
+        edges=(Following(rate=2.0),),
         estimator=estimator,
         ego=ego,
         max_out_of_view=5.0,

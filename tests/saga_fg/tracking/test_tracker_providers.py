@@ -163,7 +163,7 @@ def test_names_that_lead_to_no_provider(name: str, message: str) -> None:
         Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
 
 
-@pytest.mark.parametrize(("name", "size"), [("isam2", 6), ("fixed-lag", 14)])
+@pytest.mark.parametrize(("name", "size"), [("isam2", 6), ("fixed-lag", 16)])
 def test_tracks_come_and_go_in_a_graph_that_stays_small(name: str, size: int) -> None:
     association = AssociationSettings(relink_above=1.0)
     settings = TrackerSettings(estimator=name, lag=0.5, association=association)
