@@ -96,7 +96,7 @@ class KnownCourses(Columns):
         motion = self.node_type.motion
         assert isinstance(motion, Curvilinear)
         tau = max(motion.turn_time, _LEAST_TIME)
-        theta = self.rate * tau * -np.expm1(-dt / tau)
+        theta = self.rate * turning_time(motion, dt)
         (A_1, Qc_1), (A_2, Qc_2) = motion.along, motion.across
         white = np.diag([0.0, 1.0, 0.0])
         (F_along, F_across, _), (Q_along, Q_across, Q_white) = linear_motions(
@@ -121,6 +121,12 @@ class KnownCourses(Columns):
             self, heading=self.heading + theta, rate=self.rate * np.exp(-dt / tau), brake=np.zeros_like(self.brake)
         )
         return later, MatchedMotion(F, b, Q * scale[:, None, None])
+
+
+def turning_time(motion: Curvilinear, dt: float) -> float:
+    """The time, s, in which an undiminished rate turns as far as one that fades does within `dt`."""
+    tau = max(motion.turn_time, _LEAST_TIME)
+    return float(tau * -np.expm1(-dt / tau))
 
 
 def _planar(one_axis: FloatArray, projection: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from saga_fg.model.known_course import KnownCourses
+from saga_fg.model.known_course import KnownCourses, turning_time
 from saga_fg.model.motion import Curvilinear
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
@@ -48,19 +48,13 @@ def known_courses(state: TrackerState, dt: float, unseen: BoolArray) -> tuple[tu
         if len(led):
             heading[led], turn, course_variance[led] = _along_paths(state, rows[led], rate[led], dt)
             after[rows[led]] = wrap_angle(heading[led] + turn)
-            rate[led], settling[led] = turn / _turning_time(motion, dt), 1 / motion.course_time
+            rate[led], settling[led] = turn / turning_time(motion, dt), 1 / motion.course_time
         mean = state.joint.estimator.mean(table.id[rows])
         ids = table.id[rows]
         found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, settling, course_variance))
     if turn_time.any():
         table.turn.predict(dt, turn_time)
     return tuple(found), after
-
-
-def _turning_time(motion: Curvilinear, dt: float) -> float:
-    """The time in which an undiminished rate turns as far as a fading one does in `dt`, s."""
-    tau = motion.turn_time
-    return -tau * math.expm1(-dt / tau) if tau > 0 else dt
 
 
 def _along_paths(

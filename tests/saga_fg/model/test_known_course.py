@@ -8,7 +8,7 @@ import pytest
 from saga_fg import ConstantAcceleration, Curvilinear, NodeType, SceneGraph
 from saga_fg.model.discretisation import discretise, linear_motions
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.known_course import RATE_CORRELATION, KnownCourses
+from saga_fg.model.known_course import RATE_CORRELATION, KnownCourses, turning_time
 from saga_fg.model.scene_graph import Edges
 from saga_fg.model.turning import CoordinatedTurn
 from tests.saga_fg.random_graphs import node_table
@@ -47,6 +47,14 @@ def test_without_acceleration_and_fading_it_is_the_coordinated_turn(rate, dt):
     car = NodeType("car", Curvilinear(turn_time=LONG))
     F, b, _ = own(course(car, rate=rate), dt, car)
     assert F[:4, :4] @ x + b[:4] == pytest.approx(CoordinatedTurn().flow(np.append(x, rate), dt)[:4], abs=1e-6)
+
+
+@pytest.mark.parametrize("turn_time", [0.0, 1.5, LONG])
+@pytest.mark.parametrize("dt", [0.1, 0.5])
+def test_the_turn_of_a_path_is_made_however_turns_fade(turn_time, dt):
+    motion = Curvilinear(turn_time=turn_time)
+    F, _, _ = own(course(car := NodeType("car", motion), rate=0.3 / turning_time(motion, dt), dt=dt), dt, car)
+    assert F[V, V] @ [8.0, 0.0] == pytest.approx([8 * np.cos(0.3), 8 * np.sin(0.3)], abs=1e-6)
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.5])
