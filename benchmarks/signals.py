@@ -30,7 +30,6 @@ SINCE = (0.0, 0.5, 1.0, 2.0, 4.0, np.inf)  # s since the first vehicle was there
 BELIEFS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 SURE = 0.8  # belief that counts as believed
 EVEN = 30.0  # s that all phases last in the even prior
-BRAKES = 0.5  # m/s^2
 
 
 @dataclass(frozen=True, eq=False)

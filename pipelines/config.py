@@ -88,7 +88,7 @@ class TrackConfig:
         return Tracker(self.of_method(method).tracker, self.sensors, observer=observer)
 
     def of_method(self, method: Method) -> TrackConfig:
-        """Return a copy for a method: without edges, unless it is `saga`."""
+        """Return a copy for a method: without edges and trails, unless it is `saga`."""
         if method == "saga":
             return self
         alone = replace(self.tracker, edges=(), trails=replace(self.tracker.trails, memory=0.0))

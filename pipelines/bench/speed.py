@@ -45,7 +45,10 @@ class SpeedBenchSettings:
 
     sizes: tuple[int, ...] = setting((10, 100, 200, 500, 1000, 5000), "numbers of simulated objects; (): none")
     frames: int = setting(60, "largest number of frames of a case that are counted")
-    seconds: float = setting(60.0, "time after which a method is left out of the larger cases of a kind, s")
+    seconds: float = setting(
+        60.0,
+        "end a case after this time, s; a method that took a quarter of it is left out of larger cases of the kind",
+    )
     seed: int = setting(0, "seed of the simulated objects")
 
     def __post_init__(self) -> None:

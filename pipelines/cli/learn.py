@@ -23,7 +23,11 @@ def _interactions(
     config: options.Config = None,
     start: Annotated[
         Path | None,
-        typer.Option("--start", help="File of an earlier result, from which the search begins.", metavar="FILE"),
+        typer.Option(
+            "--start",
+            help="File of an earlier result: search from it, with the prior centred on it, and refit its rules only.",
+            metavar="FILE",
+        ),
     ] = None,
     passes: Annotated[
         int, typer.Option("--passes", min=1, help="Runs with made gaps over each recording that is held out.")
@@ -148,6 +152,7 @@ def noise() -> None:
     """Learn what sensors are like, and how objects move, from recordings.
 
     For each sensor and class: noise of positions (base, along and across the line of sight), velocities, headings and
-    heights, what a score is worth, the chance of detection, the field of view; for each class its process noise. Where
-    there is ground truth, it is used; where there is none, the tracker's own tracks take its place.
+    heights, what a score is worth, the chance of detection, the field of view. For each class: its process noise, and
+    for curvilinear motion how fast accelerations and turns fade (fading_time, turn_time). Where there is ground truth,
+    it is used; where there is none, the tracker's own tracks take its place.
     """

@@ -87,7 +87,7 @@ def g2o(
             errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
     write_pose_graph(output, graph, optimised, rows, blocks, errors)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
-    typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (guess in the file {guess:.6g})")
+    typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (at the start {guess:.6g})")
     if (minimum := optimised.chordal) is not None:
         proven = "the global minimum" if minimum.certified else "not proven to be the global minimum"
         typer.echo(f"chordal cost {minimum.cost:.8g}, {proven}: no poses below {minimum.bound:.8g}")

@@ -39,9 +39,14 @@ APART = 5000.0  # m between gaps: no edge reaches as far
 
 @dataclass(frozen=True)
 class GapSettings:
-    """longest gap and time between its steps, s; how long an object is tracked before; how often gaps start, s;
+    """Choice of the gaps to learn from.
 
-    neighbours: at most so many, within `reach` m
+    longest     length of the longest gap, s
+    step        time between the steps of a gap, s
+    followed    time for which an object is tracked before its gap, s
+    spacing     time between the starts of an object's gaps, s
+    neighbours  largest number of tracks around a hidden one that are kept
+    reach       largest distance of these, m
     """
 
     longest: float = 5.0
@@ -70,7 +75,11 @@ class _Onto(NamedTuple):
 
 
 class GapPrediction(NamedTuple):
-    """At the end of S steps: position (W, S, 2) and its covariance (W, S, 2, 2); NaN where nothing is to be compared"""
+    """Predictions of W hidden objects at the ends of S steps, NaN after an object's last known place.
+
+    position  (W, S, 2), m
+    P         (W, S, 2, 2) covariance of the position, m^2
+    """
 
     position: FloatArray
     P: FloatArray

@@ -106,7 +106,12 @@ class RuleParameters:
 
 @dataclass(frozen=True)
 class FittedInteractions:
-    """rules with their values; loss per place."""
+    """Fitted rules.
+
+    rules  with their fitted values
+    loss   mean negative log-likelihood of a known place, without constants, plus the penalty of the prior; NaN if the
+           rules reach no gap
+    """
 
     rules: tuple[Rule, ...]
     loss: float

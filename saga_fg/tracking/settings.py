@@ -247,7 +247,10 @@ class TrackerSettings(Settings):
     max_step: PositiveOrInf = setting(
         math.inf, "longest prediction step, s; longer intervals are split, with edges of their own; .inf: never split"
     )
-    signals: SignalSettings = settings_group(SignalSettings, "traffic lights of a map")
+    signals: SignalSettings = settings_group(
+        SignalSettings,
+        "traffic lights of a map; traffic tells colours by the first red_light and green_light rule only",
+    )
     road_map: RoadMap | None = settings_group(
         lambda: None, "lights, stop lines, lanes and walls in world coordinates; null: those that frames bring along"
     )

@@ -115,4 +115,5 @@ _COLUMNS = tuple(FirstVehicles.__dataclass_fields__)
 
 
 def _first(rules: Sequence[EdgeRule], kind: type[Rule]) -> Rule | None:
+    """The first rule of a kind, None without one; further rules of the kind do not count for the inference."""
     return next((rule for rule in rules if isinstance(rule, kind)), None)

@@ -51,6 +51,7 @@ def test_the_chordal_minimum_is_certified_and_some_covariances_are_written(tmp_p
     result = CliRunner().invoke(app, [*arguments, "--covariances", "120,30"], catch_exceptions=False)
     assert result.exit_code == 0
     assert "the global minimum: no poses below" in result.stdout
+    assert "(at the start " in result.stdout  # the file has no vertices, so there is no guess in it
     found = json.loads((tmp_path / "out" / "errors.json").read_text())
     assert found["chordal"]["certified"]
     assert found["from the chordal minimum"] == pytest.approx(found[f"from the {found['best']}"], rel=1e-6)

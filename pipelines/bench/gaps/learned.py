@@ -44,7 +44,12 @@ Rules = tuple[Rule, ...]
 
 @dataclass(frozen=True)
 class LearningSettings:
-    """passes with made gaps over each recording that is held out; seed of their choice; gaps to learn from"""
+    """Settings of learning and of its test on recordings held out.
+
+    passes  number of times that each recording held out is tracked, each time with other made gaps
+    seed    of the choice of these gaps
+    gaps    choice of the gaps to learn from
+    """
 
     passes: int = 2
     seed: int = 0
