@@ -85,6 +85,16 @@ def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkey
     assert found.interactions.edges == ()
 
 
+def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeypatch, scenes):
+    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
+    config = load_config("file")
+    tracker = replace(config.tracker, edges=(), trails=replace(config.tracker.trails, memory=60.0))
+    found = learn_interactions(scenes, "two scenes", replace(config, tracker=tracker), settings=QUICK)
+    assert set(found.forms.values()) == {NOWHERE}
+    base, learned = ([run for run in found.runs if run.contender == name] for name in (BASE, LEARNED))
+    assert [run.outcomes for run in base] == [run.outcomes for run in learned]
+
+
 def test_a_search_begins_with_the_rules_of_an_earlier_result(monkeypatch, scenes):
     begun = []
 
