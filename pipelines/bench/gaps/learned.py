@@ -11,9 +11,10 @@ with made gaps (`pipelines.bench.gaps.bench`), on the tracker's own configuratio
     nowhere      none of these
 
 The base motion is the tracker without rules that can be learned: trails, lights and lines stay, as they do beside the
-rules of a file. The form of the least ratio of errors to those of the base motion, whose ratio is 1, is fitted
-to all recordings and written: a tracker given the file is the tracker that was tried. The ratio is the mean over the lengths of the gaps of
-the larger of two ratios, of the means and of the medians, so that neither many small nor few large errors decide alone.
+rules of a file. The form of the least ratio of errors to those of the base motion, whose ratio is 1, is fitted to all
+recordings and written: a tracker given the file is the tracker that was tried. The ratio is the mean over the lengths
+of the gaps of the larger of two ratios, of the means and of the medians, so that neither many small nor few large
+errors decide alone.
 Each group of classes between which there are edges has its own form.
 """
 
