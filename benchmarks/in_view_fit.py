@@ -108,8 +108,8 @@ class _Views:
         rules, q = parameters.valued(x[: len(parameters.start)]), self.noise(parameters, x)
         total, count = 0.0, 0
         for trajectories, alone in self._recordings:
-            gaps = JointView(trajectories, alone, q, self._position_noise, rules, float(x[-1]))
-            log, positions = gaps.log_likelihood()
+            view = JointView(trajectories, alone, q, self._position_noise, rules, float(x[-1]))
+            log, positions = view.log_likelihood()
             total, count = total + log, count + positions
         if count == 0:
             raise InputError("recordings: expected objects that are seen twice")

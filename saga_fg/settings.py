@@ -21,26 +21,28 @@ from saga_fg.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers from `low` to `high`; without `low` itself if `above`, with infinity if `infinite`.
+    """The numbers from `low` to `high`; without `low` if `above`, without `high` if `below`.
 
-    For a tuple it is that of every entry; entries do not fall if `ascending`.
+    Infinity is one of them if `infinite`. For a tuple it is that of every entry; entries do not fall if `ascending`.
     """
 
     low: float = -math.inf
     high: float = math.inf
     above: bool = False
+    below: bool = False
     infinite: bool = False
     ascending: bool = False
 
     def __contains__(self, value: float) -> bool:
-        inside = (self.low < value if self.above else self.low <= value) and value <= self.high
+        inside = self.low < value if self.above else self.low <= value
+        inside = inside and (value < self.high if self.below else value <= self.high)
         return inside and (self.infinite or math.isfinite(value))
 
     @property
     def bounds(self) -> str:
         """Bounds as text, like the end of "a number > 0"; empty if there are none."""
         if self.high < math.inf:
-            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+            return f"{'above' if self.above else 'from'} {self.low:g} to {'below ' * self.below}{self.high:g}"
         return "" if self.low == -math.inf else f"{'>' if self.above else '>='} {self.low:g}"
 
     def __str__(self) -> str:
@@ -55,6 +57,7 @@ PositiveOrInf = Annotated[float, Range(0, above=True, infinite=True)]
 NonNegativeOrInf = Annotated[float, Range(0, infinite=True)]
 NonNegative = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
+FractionBelowOne = Annotated[float, Range(0, 1, below=True)]
 PositiveInt = Annotated[int, Range(0, above=True)]
 NonNegativeInt = Annotated[int, Range(0)]
 

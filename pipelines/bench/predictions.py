@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -30,6 +30,7 @@ EVERY = 1.0  # s between predictions
 GATE = 2.0  # m, between an object and its track
 MOVING = 0.5  # m/s
 DETECTED = 0.15  # s since its latest detection: a track counts as visible
+FEWEST_UNITS = 3  # of scenes that do not overlap, for an interval
 LABEL_GAP = 1.1  # s between labels that are joined by a straight line
 
 
@@ -131,9 +132,12 @@ class PredictionFigure:
 
 
 def prediction_figures(
-    methods: Mapping[str, Sequence[PredictionErrors]], reference: str, seed: int = 0
+    methods: Mapping[str, Sequence[PredictionErrors]], reference: str, units: Sequence[Sequence[int]], seed: int = 0
 ) -> list[PredictionFigure]:
-    """Figures of the errors, scene by scene, of each method; changes come with intervals over scenes."""
+    """Figures of the errors, scene by scene, of each method.
+
+    units  numbers of the scenes; those of one unit are drawn together for the intervals of changes, see `FEWEST_UNITS`
+    """
     figures = []
     for moving, horizon in product((False, True), HORIZONS):
         for name, scenes in methods.items():
@@ -141,12 +145,23 @@ def prediction_figures(
             every = PredictionErrors.concatenate([_nothing(), *mine])
             if len(every) == 0:
                 continue
-            a, b = ([(e.error.sum(), len(e)) for e in errors] for errors in (mine, base))
-            change = paired_bootstrap(a, b, ratio_of_sums, seed=seed) if name != reference else None
+            change = _change(mine, base, units, seed) if name != reference else None
             error, nll = float(every.error.mean()), float(every.nll.mean())
             shares = coverages(every.nees, (0.5, 0.9))
             figures.append(PredictionFigure(moving, horizon, name, len(every), error, change, nll, shares))
     return figures
+
+
+def _change(
+    mine: Sequence[PredictionErrors], base: Sequence[PredictionErrors], units: Sequence[Sequence[int]], seed: int
+) -> Interval:
+    """Of the mean error, relative; without bounds, NaN, for fewer than `FEWEST_UNITS` units."""
+    a, b = (
+        [(sum(errors[row].error.sum() for row in unit), sum(len(errors[row]) for row in unit)) for unit in units]
+        for errors in (mine, base)
+    )
+    found = paired_bootstrap(a, b, ratio_of_sums, seed=seed)
+    return found if len(units) >= FEWEST_UNITS else replace(found, low=math.nan, high=math.nan)
 
 
 def _chosen(scenes: Sequence[PredictionErrors], horizon: float, moving: bool) -> list[PredictionErrors]:

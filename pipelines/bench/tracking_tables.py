@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, calibration, error_summary, errors_by_class
-from pipelines.bench.predictions import PredictionErrors, prediction_figures
+from pipelines.bench.predictions import PredictionFigure, prediction_figures
 from pipelines.bench.tracking import KF, RELATIVE_SWITCHES, SAGA, SetResult, verdict
 
 
@@ -36,7 +37,7 @@ def figures(result: SetResult) -> dict[str, Any]:
             variant: {name: {"difference": each, "verdict": verdict(name, each)} for name, each in found.items()}
             for variant, found in result.differences.items()
         },
-        "predictions": prediction_figures(_predicting(result), KF),
+        "predictions": _predicted(result),
         "calibration": {label: calibration(e) for label, e in errors_by_class(result.errors("saga")).items()},
     }
 
@@ -109,16 +110,19 @@ def _predictions(result: SetResult) -> list[FigureTable]:
             f.method,
             cell(f.predictions, 0),
             cell(f.error, 2),
-            "" if f.change is None else ", ".join(_interval("RMSE", f.change)),
+            ""
+            if f.change is None
+            else ", ".join(_interval("RMSE", f.change)[: 3 if math.isfinite(f.change.low) else 1]),
             cell(f.nll, 2),
             *(cell(100 * share, 0) for share in f.coverage.values()),
         )
-        for f in prediction_figures(_predicting(result), KF)
+        for f in _predicted(result)
     )
     names = ("objects", "s ahead", "method", "predictions", "mean error, m", f"against {KF}, from, to", "NLL")
     title = f"{result.name}: predictions of objects that are detected now"
     return [FigureTable(title, (*names, "in 50 %", "in 90 %"), rows)] if rows else []
 
 
-def _predicting(result: SetResult) -> dict[str, tuple[PredictionErrors, ...]]:
-    return {name: result.variants[name].predictions for name in (KF, SAGA)}
+def _predicted(result: SetResult) -> list[PredictionFigure]:
+    errors = {name: result.variants[name].predictions for name in (KF, SAGA)}
+    return prediction_figures(errors, KF, result.variants[SAGA].score.units)

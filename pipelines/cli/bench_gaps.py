@@ -77,13 +77,13 @@ def gaps(
         ),
     ] = None,
     fit: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--fit",
             help="To --train or the other folds, with commas: the noise of kf, the edges of saga, boosted trees as an "
-            "outside judge (needs the extra [bench]).",
+            "outside judge (needs the extra [bench]).  [default: noise,edges]",
         ),
-    ] = "noise,edges",
+    ] = None,
     labels: Annotated[
         bool, typer.Option("--labels", help="Take the visible annotations for detections, in all sets.")
     ] = False,
@@ -167,7 +167,11 @@ def gaps(
     _check_names(recordings, taught, judged)
     if taught and folds is not None:
         raise InputError("--folds: goes without --train")
-    number, fits = _folds(folds), _fits(fit)
+    number, fits = _folds(folds), _fits(fit or "noise,edges")
+    if fit is not None and not taught and number is None:
+        raise InputError("--fit: expected --train or --folds, there is nothing to fit to")
+    if "boosted" in fits and life == "shipped":
+        raise InputError("--fit boosted: expected --life kept or both, boosted trees do not end tracks")
     splits = {}
     for source in sources:
         found = recordings[source.name]

@@ -12,6 +12,7 @@ from pipelines.cli.bench_gaps import LengthsOption, chosen_lengths
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.tables import JsonFile, MarkdownFile, report
+from saga_fg.errors import InputError
 
 
 def tracking(
@@ -81,6 +82,8 @@ def tracking(
     from pipelines.bench.tracking_tables import figures, tables
     from pipelines.config import load_config
 
+    if lengths is not None and passes == 0:
+        raise InputError("--lengths: expected --passes of 1 or more, they are those of made gaps")
     everything = (*SETS, "simulated") if data is not None else ("simulated",)
     chosen = [recording_set(name, data, scenes, viewpoint) for name in (names("--sets", sets) if sets else everything)]
     if test is not None:

@@ -40,7 +40,7 @@ from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.object_factors import prior_graph
-from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency
+from saga_fg.estimators.overlapping_clusters import ClusterBounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -68,7 +68,7 @@ class BoundedKalmanFilter(LatestMarginals):
         for name, value, least in (("hops", hops, 1), ("core", core, 1), ("patience", patience, 0)):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise InputError(f"{name}: expected a whole number >= {least}, got {value!r}")
-        self._bounds = Bounds(hops, core, patience)
+        self._bounds = ClusterBounds(hops, core, patience)
         self._clusters = OverlappingClusters.empty()
         self._state = BlockGaussian.empty()
         self._time = 0.0

@@ -20,7 +20,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
-class Bounds:
+class ComponentBounds:
     """Which nodes become, or stay, one component.
 
     tolerance  correlation up to which nodes count as independent

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.bounds import Bounds
+from saga_fg.estimators.bounds import ComponentBounds
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
@@ -67,7 +67,7 @@ class JointKalmanFilter(LatestMarginals):
         if most is not None and most < 1:
             raise InputError(f"most: expected a number of nodes >= 1, got {most!r}")
         self.providers = tuple(providers)
-        self.bounds = Bounds(tolerance, most or sys.maxsize) if tolerance or most else None
+        self.bounds = ComponentBounds(tolerance, most or sys.maxsize) if tolerance or most else None
         self._state = BlockGaussian.empty()
         self._predictions = 0
         self._time = 0.0

@@ -27,7 +27,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
-class Bounds:
+class ClusterBounds:
     """Limits of clusters.
 
     hops: from a node of the halo to the nearest owned one; core: nodes that a new cluster owns; patience: steps that a
@@ -122,7 +122,7 @@ class OverlappingClusters:
         )
         return draft._renumbered(source)
 
-    def updated(self, graph: scipy.sparse.csr_array, bounds: Bounds) -> tuple[OverlappingClusters, IntArray]:
+    def updated(self, graph: scipy.sparse.csr_array, bounds: ClusterBounds) -> tuple[OverlappingClusters, IntArray]:
         """Return the clusters for another graph (n, n), symmetric, with ones on the diagonal; and the old copy of each.
 
         A node enters a cluster as a copy of its owned copy; nodes that enter together come from one cluster as far as
@@ -156,7 +156,7 @@ class OverlappingClusters:
         np.minimum.at(first, joint, self.owner)
         return first[joint]
 
-    def _with_singletons_merged(self, graph: scipy.sparse.csr_array, bounds: Bounds) -> IntArray:
+    def _with_singletons_merged(self, graph: scipy.sparse.csr_array, bounds: ClusterBounds) -> IntArray:
         """Return the owners, with clusters of one node merged by parts of the graph."""
         alone = np.bincount(self.cluster)[self.owner] == 1
         nodes = np.flatnonzero(alone)
@@ -168,7 +168,7 @@ class OverlappingClusters:
         owner[nodes] = self.owner[nodes[first]][label]
         return owner
 
-    def _reassigned_owners(self, graph: scipy.sparse.csr_array, owner: IntArray, bounds: Bounds) -> IntArray:
+    def _reassigned_owners(self, graph: scipy.sparse.csr_array, owner: IntArray, bounds: ClusterBounds) -> IntArray:
         """Return the owners, with nodes handed to owners of more of their neighbours, one from and to each cluster."""
         n, count = len(owner), int(owner.max()) + 1
         votes = graph @ scipy.sparse.csr_array((np.ones(n), (np.arange(n), owner)), shape=(n, count))

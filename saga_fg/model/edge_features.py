@@ -1,49 +1,46 @@
 """Features of a pair of nodes for edge rules: position and motion of the source of an edge relative to its target.
 
-    ahead, lateral   offset of the source along and across the target's heading (left is positive), m
-    turn             heading of the target less that of the source, in [-pi, pi), rad
-
-The functions take arrays of any shape, NumPy's or JAX's (`xp`), so that a learned rule is trained on the features
-it is used with.
+ahead, lateral   offset of the source along and across the target's heading (left is positive), m
+turn             heading of the target less that of the source, in [-pi, pi), rad
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from saga_fg.model.interactions import NodeTable
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
 class EdgeEnds(NamedTuple):
     """One end of edges: position (..., 2) m, velocity (..., 2) m/s, heading (...) rad, has_moved (...) from 0 to 1."""
 
-    position: Any
-    velocity: Any
-    heading: Any
-    has_moved: Any
+    position: FloatArray
+    velocity: FloatArray
+    heading: FloatArray
+    has_moved: FloatArray
 
 
 class EdgeFeatures(NamedTuple):
     """Features of edges (...), see the module; distance m, velocity_difference m/s, speeds m/s, has_moved 0 to 1."""
 
-    ahead: Any
-    lateral: Any
-    turn: Any
-    distance: Any
-    velocity_difference: Any
-    target_speed: Any
-    source_speed: Any
-    target_moved: Any
-    source_moved: Any
+    ahead: FloatArray
+    lateral: FloatArray
+    turn: FloatArray
+    distance: FloatArray
+    velocity_difference: FloatArray
+    target_speed: FloatArray
+    source_speed: FloatArray
+    target_moved: FloatArray
+    source_moved: FloatArray
 
 
-def edge_features(target: EdgeEnds, source: EdgeEnds, xp: Any = np) -> EdgeFeatures:
+def edge_features(target: EdgeEnds, source: EdgeEnds) -> EdgeFeatures:
     """The features of edges between ends whose shapes broadcast."""
     offset, difference = source.position - target.position, source.velocity - target.velocity
-    c, s = xp.cos(target.heading), xp.sin(target.heading)
+    c, s = np.cos(target.heading), np.sin(target.heading)
     ahead = offset[..., 0] * c + offset[..., 1] * s
     lateral = offset[..., 1] * c - offset[..., 0] * s
     turn = (target.heading - source.heading + np.pi) % (2 * np.pi) - np.pi
@@ -52,10 +49,10 @@ def edge_features(target: EdgeEnds, source: EdgeEnds, xp: Any = np) -> EdgeFeatu
         ahead,
         lateral,
         turn,
-        _norm(offset, xp),
-        _norm(difference, xp),
-        _norm(target.velocity, xp) + none,
-        _norm(source.velocity, xp) + none,
+        _norm(offset),
+        _norm(difference),
+        _norm(target.velocity) + none,
+        _norm(source.velocity) + none,
         target.has_moved + none,
         source.has_moved + none,
     )
@@ -71,6 +68,6 @@ def _ends(nodes: NodeTable, rows: IntArray) -> EdgeEnds:
     return EdgeEnds(nodes.position[rows], nodes.velocity[rows], nodes.heading[rows], moved)
 
 
-def _norm(vector: Any, xp: Any) -> Any:
+def _norm(vector: FloatArray) -> FloatArray:
     """Length of (..., 2), with a derivative at zero."""
-    return xp.sqrt(vector[..., 0] ** 2 + vector[..., 1] ** 2 + 1e-12)
+    return np.asarray(np.sqrt(vector[..., 0] ** 2 + vector[..., 1] ** 2 + 1e-12))

@@ -21,6 +21,7 @@ from saga_fg.model.stability import require_stable
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.settings import (
     Fraction,
+    FractionBelowOne,
     NonNegative,
     NonNegativeOrInf,
     Positive,
@@ -259,7 +260,7 @@ class TrackerSettings(Settings):
         "kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph "
         "of the last `lag` seconds, exact for late frames",
     )
-    tolerance: Fraction = setting(
+    tolerance: FractionBelowOne = setting(
         0.01,
         "correlation up to which the estimator kalman takes objects for independent; usual 0 to 0.1; 0: never; higher: "
         "faster in crowds, interactions of objects in plain view count less",

@@ -396,6 +396,8 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--train", "scene-0001", "--plot", "gaps.png"], "set simulated: expected recordings to judge"),
         (["--passes", "0", "--plot", "gaps.png"], "--plot: expected --passes of 1 or more"),
         (["--fit", "edge"], "--fit: expected some of noise, edges, boosted, got 'edge'"),
+        (["--fit", "edges"], "--fit: expected --train or --folds"),
+        (["--fit", "boosted", "--folds", "2", "--life", "shipped"], "--fit boosted: expected --life kept or both"),
         (["--of", "red"], "--of: expected --picture, and one of all, moving,"),
         (["--folds", "1"], "--folds: expected a number of 2 or more, or place, got '1'"),
         (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),

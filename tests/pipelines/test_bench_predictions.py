@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from data_tools.metrics import Interval
 from pipelines.bench.predictions import HORIZONS, PredictionErrors, PredictionRecorder, prediction_figures
 from saga_fg import Annotations, Boxes, PredictedTracks, Scene, Tracker, Tracks
 from saga_fg.numerics.arrays import FloatArray
@@ -81,7 +82,7 @@ def test_figures_by_horizon_and_motion() -> None:
         nees = np.array([0.1, 2.0, 4.0, 9.0])
         return PredictionErrors(np.full(4, 2.0), scale * np.arange(1.0, 5.0), nees, nees, np.array([True, False] * 2))
 
-    found = prediction_figures({"kf": [errors(1.0)] * 3, "saga": [errors(0.5)] * 3}, "kf")
+    found = prediction_figures({"kf": [errors(1.0)] * 3, "saga": [errors(0.5)] * 3}, "kf", [[0], [1], [2]])
     assert [(f.moving, f.horizon, f.method, f.predictions) for f in found] == [
         (False, 2.0, "kf", 12),
         (False, 2.0, "saga", 12),
@@ -94,5 +95,24 @@ def test_figures_by_horizon_and_motion() -> None:
     assert found[1].change.estimate == pytest.approx(-0.5)
     assert found[0].coverage == {0.5: 0.25, 0.9: 0.75}  # within 1.39 and 4.61
     assert found[0].nll == pytest.approx(3.775)
-    assert prediction_figures({"kf": []}, "kf") == []
+    assert prediction_figures({"kf": []}, "kf", []) == []
     assert max(HORIZONS) == 5.0
+
+
+def test_scenes_that_overlap_are_drawn_together_and_two_units_have_no_interval() -> None:
+    def errors(error: float) -> PredictionErrors:
+        one = np.ones(1)
+        return PredictionErrors(one, error * one, one, one, np.array([False]))
+
+    def change(scenes: int, units: list[list[int]]) -> Interval:
+        methods = {"kf": [errors(1.0)] * scenes, "saga": [errors(0.5), errors(1.5)] * (scenes // 2)}
+        found = prediction_figures(methods, "kf", units)[1].change
+        assert found is not None
+        assert found.estimate == pytest.approx(0.0)
+        return found
+
+    apart, together = change(6, [[row] for row in range(6)]), change(6, [[0, 1], [2, 3], [4, 5]])
+    assert apart.low < -0.1 < 0.1 < apart.high
+    assert (together.low, together.high) == pytest.approx((0.0, 0.0)), "the units are alike"
+    few = change(4, [[0, 1], [2, 3]])
+    assert np.isnan([few.low, few.high]).all()

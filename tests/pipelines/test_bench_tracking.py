@@ -214,6 +214,7 @@ def test_mistakes_are_one_line() -> None:
     for arguments, expected in (
         (("--sets", "moon"), "unknown set 'moon'"),
         (("--sets", "kitti"), "expected --data DIR"),
+        (("--sets", "simulated", "--lengths", "2"), "--lengths: expected --passes of 1 or more"),
     ):
         result = CliRunner().invoke(app, ["bench", "tracking", *arguments])
         assert result.exit_code == 2

@@ -85,6 +85,24 @@ def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkey
     assert found.interactions.edges == ()
 
 
+def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeypatch, scenes):
+    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
+    config = load_config("file")
+    tracker = replace(config.tracker, edges=(), trails=replace(config.tracker.trails, memory=60.0))
+    config, tried = replace(config, tracker=tracker), []
+
+    def bench(source, recordings, contenders, *args, **kwargs):
+        tried.extend(contenders)
+        return bench_gaps(source, recordings, contenders, *args, **kwargs)
+
+    monkeypatch.setattr(learned_module, "bench_gaps", bench)
+    found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
+    assert set(found.forms.values()) == {NOWHERE}
+    written = config.with_interactions(found.interactions)
+    base = [each.config.of_method(each.method) for each in tried if each.name == BASE]
+    assert [each.tracker for each in base] == [written.tracker] * 2
+
+
 def test_a_search_begins_with_the_rules_of_an_earlier_result(monkeypatch, scenes):
     begun = []
 

@@ -8,11 +8,13 @@ with made gaps (`pipelines.bench.gaps.bench`), on the tracker's own configuratio
     hidden       edges are weighted by their information gain, low into objects in view, and fitted with it
     refitted     the rules of the configuration, fitted
     shipped      the rules of the configuration
-    nowhere      none: the base motion alone
+    nowhere      none of these
 
-The form of the least ratio of errors to those of the base motion, whose ratio is 1, is fitted to all recordings and
-written: a tracker given the file is the tracker that was tried. The ratio is the mean over the lengths of the gaps of
-the larger of two ratios, of the means and of the medians, so that neither many small nor few large errors decide alone.
+The base motion is the tracker without rules that can be learned: trails, lights and lines stay, as they do beside the
+rules of a file. The form of the least ratio of errors to those of the base motion, whose ratio is 1, is fitted to all
+recordings and written: a tracker given the file is the tracker that was tried. The ratio is the mean over the lengths
+of the gaps of the larger of two ratios, of the means and of the medians, so that neither many small nor few large
+errors decide alone.
 Each group of classes between which there are edges has its own form.
 """
 
@@ -210,8 +212,8 @@ def _trials(
     for part in parts:
         if not part.tested:
             continue
-        contenders = [Contender(BASE, "kf", config), Contender(SHIPPED, "saga", config)]
-        for form in dict.fromkeys(form for rules in part.rules.values() for form in rules):
+        contenders = [Contender(SHIPPED, "saga", config)]
+        for form in (BASE, *dict.fromkeys(form for rules in part.rules.values() for form in rules)):
             rules = tuple(rule for own in part.rules.values() for rule in own.get(form, ()))
             learned = LearnedInteractions(
                 learned_from=origin, edges=rules, explained_noise=config.tracker.explained_noise

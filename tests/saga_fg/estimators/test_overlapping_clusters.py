@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.overlapping_clusters import Bounds, OverlappingClusters, adjacency, bisected
+from saga_fg.estimators.overlapping_clusters import ClusterBounds, OverlappingClusters, adjacency, bisected
 
 
 def random_adjacency(seed, n, degree=2.0):
@@ -64,7 +64,7 @@ def test_parts_of_a_lattice_are_compact():
 def test_a_cover_follows_changing_graphs(seed, n, hops, core, patience):
     """After every step: each node owned once, all within reach in the halo, others for no longer than patience."""
     rng = np.random.default_rng(seed)
-    bounds, clusters = Bounds(hops, core, patience), fresh(n)
+    bounds, clusters = ClusterBounds(hops, core, patience), fresh(n)
     for step in range(5):
         if step == 3:
             gone = rng.permutation(n)[: n // 3]
@@ -93,7 +93,7 @@ def test_a_cover_follows_changing_graphs(seed, n, hops, core, patience):
 def test_a_node_out_of_reach_stays_in_the_halo_for_a_while():
     chain = adjacency(8, np.arange(7), np.arange(1, 8))
     cut = adjacency(8, np.array([0, 1, 2, 4, 5, 6]), np.array([1, 2, 3, 5, 6, 7]))
-    bounds = Bounds(hops=2, core=4, patience=2)
+    bounds = ClusterBounds(hops=2, core=4, patience=2)
     clusters, _ = fresh(8).updated(chain, bounds)
     sizes = [np.bincount(clusters.cluster).tolist()]
     for graph in (cut, cut, cut, chain):
@@ -103,7 +103,7 @@ def test_a_node_out_of_reach_stays_in_the_halo_for_a_while():
 
 
 def test_a_node_is_handed_over_to_the_owner_of_its_neighbours():
-    bounds = Bounds(hops=2, core=4, patience=0)
+    bounds = ClusterBounds(hops=2, core=4, patience=0)
     clusters, _ = fresh(8).updated(adjacency(8, np.arange(7), np.arange(1, 8)), bounds)
     assert len(set(clusters.owner[:4].tolist())) == len(set(clusters.owner[4:].tolist())) == 1
     moved = adjacency(8, np.array([0, 1, 3, 3, 4, 5, 6]), np.array([1, 2, 4, 5, 5, 6, 7]))
@@ -112,9 +112,11 @@ def test_a_node_is_handed_over_to_the_owner_of_its_neighbours():
 
 
 def test_where_bounds_cover_the_graph_there_is_no_halo():
-    clusters, _ = fresh(9).updated(grid(3, 3), Bounds(hops=9, core=1, patience=0))
+    clusters, _ = fresh(9).updated(grid(3, 3), ClusterBounds(hops=9, core=1, patience=0))
     assert clusters.cluster.tolist() == [0] * 9
-    clusters, source = clusters.updated(adjacency(9, np.empty(0, dtype=int), np.empty(0, dtype=int)), Bounds(9, 1, 0))
+    clusters, source = clusters.updated(
+        adjacency(9, np.empty(0, dtype=int), np.empty(0, dtype=int)), ClusterBounds(9, 1, 0)
+    )
     assert clusters.cluster.tolist() == [0] * 9, "what was correlated stays so"
     assert source.tolist() == list(range(9))
 

@@ -52,9 +52,10 @@ def test_the_stronger_the_prior_the_nearer_the_template():
 
 def test_a_search_can_begin_where_another_ended():
     sample = gaps_of(1, pairs=3)
-    first = fit_interactions(sample, SETTINGS, (FOLLOW,), iterations=8)
-    again = fit_interactions(sample, SETTINGS, first.rules, iterations=1)
+    first = fit_interactions(sample, SETTINGS, (FOLLOW,), iterations=8, prior=0.0)
+    again, anew = (fit_interactions(sample, SETTINGS, rules, 1, prior=0.0) for rules in (first.rules, (FOLLOW,)))
     assert again.loss <= first.loss + 1e-9
+    assert again.loss < anew.loss - 1e-3, "one iteration from the template does not get there"
 
 
 def test_where_nobody_follows_rules_change_nothing():
