@@ -113,7 +113,7 @@ class HotaOfScenes:
         self._scenes = [self._metric.eval_sequence(scene.sequence()) for scene in compared]
 
     def __call__(self, rows: Sequence[int]) -> float:
-        """Of the scenes with these numbers, which may occur more than once."""
+        """HOTA of scenes by their numbers, which may occur more than once."""
         found = self._metric.combine_sequences({str(n): self._scenes[row] for n, row in enumerate(rows)})
         return float(np.mean(found["HOTA"]))
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from data_tools.metrics import Interval, paired_bootstrap
 from data_tools.metrics.bootstrap import ratio_of_sums
-from data_tools.metrics.consistency import coverages, nees
+from data_tools.metrics.consistency import coverages, nees, negative_log_density
 from data_tools.metrics.matching import match_scene
 from saga_fg import PredictedTracks, Scene, Tracker, Tracks
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -87,7 +87,7 @@ class _Truth:
         return np.asarray((1 - share) * self._position[after - 1, objects] + share * self._position[after, objects])
 
     def errors(self, tracks: Tracks, predicted: PredictedTracks) -> PredictionErrors:
-        """Of the predictions of one moment."""
+        """Errors of the predictions made at one moment."""
         moment = self._moments[int(np.argmin(np.abs(self._scene.timestamps - tracks.timestamp)))]
         visible = tracks.select((tracks.coasting <= DETECTED) & np.isin(tracks.id, predicted.id))
         pairs = match_scene([moment], [visible], GATE)[0]
@@ -100,7 +100,7 @@ class _Truth:
             known = np.isfinite(then[:, 0]) & np.isfinite(now[:, 0])
             error, P = (predicted.position[k, rows] - then)[known], predicted.position_covariance[k, rows[known]]
             distance = nees(error, P)
-            nll = (distance + np.linalg.slogdet(2 * math.pi * P)[1]) / 2
+            nll = negative_log_density(distance, P)
             moving = np.hypot(*(then - now)[known].T) > MOVING * horizon
             parts.append(PredictionErrors(np.full(len(error), horizon), np.hypot(*error.T), nll, distance, moving))
         return PredictionErrors.concatenate(parts)
@@ -155,7 +155,7 @@ def prediction_figures(
 def _change(
     mine: Sequence[PredictionErrors], base: Sequence[PredictionErrors], units: Sequence[Sequence[int]], seed: int
 ) -> Interval:
-    """Of the mean error, relative; without bounds, NaN, for fewer than `FEWEST_UNITS` units."""
+    """Relative change of the mean error; its bounds are NaN for fewer than `FEWEST_UNITS` units."""
     a, b = (
         [(sum(errors[row].error.sum() for row in unit), sum(len(errors[row]) for row in unit)) for unit in units]
         for errors in (mine, base)

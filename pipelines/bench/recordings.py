@@ -64,7 +64,7 @@ class Score:
     cluster: tuple[str, ...] = ()
 
     def with_hota(self) -> Score:
-        """The same with HOTA of cars among the headline figures, where it can be had of any scenes."""
+        """The same score, with HOTA of cars among the headline figures where it is known."""
         if self.hota_of is None:
             return self
         hota, others = self.hota_of(), self.figures_of
@@ -251,7 +251,7 @@ class ChosenRecordings:
 
     @property
     def clusters(self) -> Mapping[str, str]:
-        """Those of the set."""
+        """The clusters of the whole set."""
         return self.whole.clusters
 
     def score(self, runs: Runs) -> Score:

@@ -22,8 +22,8 @@ from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects
-from saga_fg.model.edge_rules import VEHICLES, Following, Neighbours
-from saga_fg.model.interactions import CarFollowing, SharedVelocity
+from saga_fg.model.edge_rules import VEHICLES, Neighbours, traffic_rules
+from saga_fg.model.interactions import CarFollowing
 from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.tracking import TrackerSettings
 
@@ -47,16 +47,7 @@ MOVED = 0.01  # m; edges that move a prediction by less do not reach it
 MOST_GAPS = 300  # a random sample to learn from; more only take longer
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
-_LED = Following(
-    SharedVelocity(),
-    rate=3.0,
-    max_gap=60.0,
-    gap_scale=16.0,
-    lateral_scale=1.2,
-    min_separation=0.8,
-    classes=ROAD_USERS,
-    leaders="moving",
-)
+_LED = replace(traffic_rules()[0], classes=ROAD_USERS, information_gain=None)
 TEMPLATE: tuple[Rule, ...] = (
     _LED,
     replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.5, leaders="stationary"),

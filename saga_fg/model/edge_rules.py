@@ -230,9 +230,12 @@ class Repulsion(Settings):
         return closest._replace(rate=np.full(len(closest.rate), self.rate))
 
 
+HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
+"""Edges act on objects that are hidden, and hardly on others."""
+
+
 def traffic_rules() -> tuple[Following, Neighbours]:
     """The default rules: a hidden vehicle follows a leader that moves, and people walk in groups."""
-    hidden = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
     leader = Following(
         SharedVelocity(),
         rate=3.0,
@@ -241,7 +244,7 @@ def traffic_rules() -> tuple[Following, Neighbours]:
         lateral_scale=1.2,
         min_separation=0.8,
         leaders="moving",
-        information_gain=hidden,
+        information_gain=HIDDEN,
     )
     group = Neighbours(
         classes=("pedestrian",),
@@ -251,7 +254,7 @@ def traffic_rules() -> tuple[Following, Neighbours]:
         heading_scale=3.0,
         speed_scale=1.0,
         min_speed=0.2,
-        information_gain=hidden,
+        information_gain=HIDDEN,
     )
     return leader, group
 

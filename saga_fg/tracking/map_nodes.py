@@ -132,15 +132,15 @@ class MapNodes:
 
     @property
     def infers(self) -> bool:
-        """Whether states of lights are inferred from traffic."""
-        return bool(self.beliefs) and self.settings.heedless < 1
+        """True if states of lights are inferred from traffic."""
+        return bool(self.beliefs) and self.settings.non_compliance < 1
 
     def infer(self, ids: IntArray, velocity: FloatArray, variance: FloatArray, time: float) -> None:
         """Update the states of the lights by tracks (k,) detected at `time`, s, with velocities (k, 2) of variances
         (k,)."""
-        before, belief = self.drivers.told, dict(self.beliefs)
+        before, belief = self.drivers.log_likelihood, dict(self.beliefs)
         self.drivers = self.drivers.updated(ids, velocity, variance, time, self.settings)
-        change = self.drivers.told - before
+        change = self.drivers.log_likelihood - before
         for k in np.flatnonzero(change.any(axis=1)).tolist():
             light = self.light[-1 - int(self.drivers.line[k])]  # ids count down from -1
             belief[light] = updated(belief[light], change[k])

@@ -11,9 +11,9 @@ estimate at the first of the two: in red and amber that of `RedLight`, in green 
 have not reacted yet in the state `starting`. The exponent is linear in dv, so that the noise of the estimated speeds
 does not add up over the frames.
 
-A share h of the drivers does not heed the light: they turn at red, or cannot leave at green. So no vehicle says more
-than a factor 1 / h. All lines of a light gain by what is inferred, and by colours that are reported as well. Hidden
-vehicles tell nothing.
+A share h of the drivers does not comply with the light: they turn at red, or cannot leave at green. So no vehicle
+says more than a factor 1 / h. All lines of a light gain by what is inferred, and by colours that are reported as well.
+Hidden vehicles tell nothing.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from saga_fg.model.road.starting import GreenLight
 from saga_fg.model.road.stop_lines import coming_vehicles
 from saga_fg.model.road.stopping import RedLight, halting
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
 from saga_fg.types.signal import STATES, SignalSettings
 
 LONGEST = 1.0  # s between two detections of a vehicle
@@ -38,12 +39,12 @@ Rule = TypeVar("Rule")
 
 
 @dataclass(frozen=True, eq=False)
-class FirstVehicles:
+class FirstVehicles(Columns):
     """First vehicles before lines as last detected.
 
     id, line (n,) of the tracks and of the nodes of the lines; time (n,) s; speed (n,) along direction (n, 2), m/s;
     variance (n,) of the speed; expected (n, 4) accelerations in each state of the light, m/s^2; weight (n,)
-    probability that the track exists; told (n, 4) L
+    probability that the track exists; log_likelihood (n, 4) L
     """
 
     id: IntArray
@@ -54,20 +55,13 @@ class FirstVehicles:
     variance: FloatArray
     expected: FloatArray
     weight: FloatArray
-    told: FloatArray
+    log_likelihood: FloatArray
 
     @classmethod
     def none(cls) -> FirstVehicles:
         """No vehicle."""
         ids, times, states = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, len(STATES)))
         return cls(ids, ids, times, times, np.empty((0, 2)), times, states, times, states)
-
-    def __len__(self) -> int:
-        return len(self.id)
-
-    def select(self, rows: IntArray | BoolArray) -> FirstVehicles:
-        """Some of them."""
-        return FirstVehicles(*(getattr(self, name)[rows] for name in _COLUMNS))
 
     def later(self, nodes: NodeTable, rules: Sequence[EdgeRule], detected: BoolArray, time: float) -> FirstVehicles:
         """Those of a node table whose tracks, its first rows, were `detected` at `time`, and others seen shortly
@@ -85,15 +79,15 @@ class FirstVehicles:
         waiting = np.where(halting(v, first.front), 0.0, free)
         exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
         same = (ids[:, None] == self.id) & (line[:, None] == self.line)
-        told = np.where(same.any(axis=1)[:, None], same.astype(np.float64) @ self.told, 0.0)
+        log_likelihood = np.where(same.any(axis=1)[:, None], same.astype(np.float64) @ self.log_likelihood, 0.0)
         expected = np.column_stack([closed, closed, waiting, free])
         variance = nodes.velocity_variance[first.target]
         then = np.full(len(v), time)
         now = FirstVehicles(
-            ids, line, then, v, first.approach.direction, variance, expected, exists[first.target], told
+            ids, line, then, v, first.approach.direction, variance, expected, exists[first.target], log_likelihood
         )
         kept = self.select(~np.isin(self.id, nodes.id[: len(detected)][detected]) & (self.time > time - LONGEST))
-        return FirstVehicles(*(np.concatenate([getattr(each, name) for each in (kept, now)]) for name in _COLUMNS))
+        return kept.append(now)
 
     def updated(
         self, ids: IntArray, velocity: FloatArray, variance: FloatArray, time: float, settings: SignalSettings
@@ -105,13 +99,10 @@ class FirstVehicles:
         T, own = time - self.time[mine], settings.driver_noise * (time - self.time[mine])
         V = np.maximum(self.variance[mine] + own - variance[row], own)
         change = self.expected[mine] * T[:, None]
-        told = self.told.copy()
-        told[mine] += (self.weight[mine] / V)[:, None] * change * (dv[:, None] - change / 2)
-        told -= told.max(axis=1, keepdims=True, initial=-np.inf) if len(told) else 0.0
-        return replace(self, told=np.maximum(told, np.log(settings.heedless)))
-
-
-_COLUMNS = tuple(FirstVehicles.__dataclass_fields__)
+        log_likelihood = self.log_likelihood.copy()
+        log_likelihood[mine] += (self.weight[mine] / V)[:, None] * change * (dv[:, None] - change / 2)
+        log_likelihood -= log_likelihood.max(axis=1, keepdims=True, initial=-np.inf) if len(log_likelihood) else 0.0
+        return replace(self, log_likelihood=np.maximum(log_likelihood, np.log(settings.non_compliance)))
 
 
 def _first(rules: Sequence[EdgeRule], kind: type[Rule]) -> Rule | None:

@@ -58,7 +58,7 @@ class SignalSettings(Settings):
         "spectral density of the acceleration of drivers before a line about that of the rules, m^2/s^3; usual 0.5 to "
         "4; higher: colours are inferred from traffic more slowly",
     )
-    heedless: Annotated[float, Range(0, 1, above=True)] = setting(
+    non_compliance: Annotated[float, Range(0, 1, above=True)] = setting(
         0.1,
         "share of drivers who do not drive as the light tells them, as they turn at red or cannot leave at green; "
         "usual 0.05 to 0.3; higher: one vehicle tells less; 1: colours are not inferred from traffic",

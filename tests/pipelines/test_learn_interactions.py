@@ -12,7 +12,6 @@ import pipelines.bench.gaps.learned as learned_module
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps
 from pipelines.bench.gaps.learned import (
     BASE,
-    HIDDEN,
     LEARNED,
     NOWHERE,
     SHIPPED,
@@ -26,7 +25,7 @@ from pipelines.config import load_config, load_interactions
 from pipelines.configuration import read_settings, write_settings
 from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, GapSettings, fit_interactions
-from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
 from saga_fg.model.interactions import CarFollowing
 from saga_fg.model.learned_interactions import LearnedInteractions
 from tests.saga_fg.following_pairs import RATE, following_pairs

@@ -1,4 +1,4 @@
-"""What is known of a hidden object without a filter: features of a regressor.
+"""Features of a regressor that predicts hidden objects without a filter.
 
 Of the object, from its own detections before the gap: speed, acceleration, turn rate, and class. Ahead of it, on the
 arc that it is on: the gap to its leader and the leader's motion, as far as the leader is detected during the gap, and

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from data_tools.metrics.consistency import nees
+from data_tools.metrics.consistency import nees, negative_log_density
 from data_tools.metrics.matching import match_scene
 from pipelines.bench.gaps.gap import LONGEST, SHORTEST, Gap, reached
 from pipelines.bench.gaps.labelled import LabelledScene
@@ -157,9 +157,9 @@ class JudgedRun:
             return None
         error = self.tracks[moment].boxes.position[at, :2] - truth
         covariance = self.tracks[moment].position_covariance[at]
-        squared = float(nees(error[None], covariance[None])[0])
-        nll = 0.5 * (squared + float(np.linalg.slogdet(2 * np.pi * covariance)[1])) if np.isfinite(squared) else squared
-        return Prediction(float(np.hypot(*error)), squared, nll)
+        squared = nees(error[None], covariance[None])
+        nll = negative_log_density(squared, covariance[None])
+        return Prediction(float(np.hypot(*error)), float(squared[0]), float(nll[0]))
 
     def _position(self, track: int, moment: int) -> FloatArray | None:
         for k in range(moment, -1, -1):

@@ -31,13 +31,11 @@ from pipelines.config import TrackConfig
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
-from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.types.dataset import Scene
 
-HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
 BASE, SHIPPED, LEARNED = "base motion", "shipped edges", "learned edges"
 NOWHERE = "nowhere"
 PLACE_NOISE = 0.1  # m: differences below it do not count

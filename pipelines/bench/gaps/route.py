@@ -48,7 +48,7 @@ class Route:
         return cls(ends, way, np.arctan2(step[:, 1], step[:, 0]))
 
     def project(self, place: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of places (N, 2): the way to the nearest point (N,), the distance to its left (N,), the direction there (N,).
+        """Arc length (N,), m, lateral offset (N,), m, left is positive, and direction (N,), rad, of places (N, 2).
 
         NaN for places of NaN. The way of places behind the start is negative.
         """

@@ -86,7 +86,7 @@ def _figure(situation: str, length: float, runs: Sequence[Run], base: Sequence[R
 
 
 def _values(run: Run, situation: str, length: float, value: Callable[[Prediction], float]) -> FloatArray:
-    """Of the gaps in the situation, NaN where the track is lost."""
+    """Values of the gaps in the situation, NaN where the track is lost."""
     found = [
         outcome.predicted.get(length)
         for outcome, at in zip(run.outcomes, run.situations, strict=True)

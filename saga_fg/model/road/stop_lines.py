@@ -94,7 +94,7 @@ class ComingVehicles(NamedTuple):
         )
 
     def first(self) -> ComingVehicles:
-        """Those that no other of them precedes in its lane."""
+        """The first vehicle of each lane."""
         crossing, way = self.approach.crossing, self.approach.way
         one_lane = (self.source[:, None] == self.source) & (np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE)
         return self.select(~(one_lane & (way < way[:, None])).any(axis=1))

@@ -171,7 +171,7 @@ class RedLight(Settings):
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def able(self, coming: ComingVehicles) -> ComingVehicles:
-        """Those that can stop before the line, or halt at it."""
+        """Coming vehicles that can stop before the line, or halt at it."""
         can = (coming.front > 0) & (coming.speed**2 <= 2 * self.max_deceleration * coming.front)
         return coming.select(can | halting(coming.speed, coming.front))
 

@@ -70,18 +70,21 @@ class ChordalMinimum:
 
 def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
     """The minimum of the chordal cost by the staircase; start: poses (N, d + 1, d + 1)."""
-    cost, d, n = ChordalCost.of(graph), graph.dim, len(graph)
-    found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2))
-    lowest = lowest_eigenvalue(cost, frames.Y)
-    proofs = [(frames.cost + n * d * lowest.value, lowest.value, d)]
-    while lowest.direction is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS:
-        frames = descend(cost, _escaped(cost, frames, lowest.direction))
+    cost, d = ChordalCost.of(graph), graph.dim
+    proofs: list[tuple[float, float, int]] = []  # bound, eigenvalue, dimensions
+
+    def direction_down(frames: Frames) -> FloatArray | None:
+        n, _, r = frames.Y.shape
         lowest = lowest_eigenvalue(cost, frames.Y)
-        proofs.append((frames.cost + n * d * lowest.value, lowest.value, frames.Y.shape[2]))
+        proofs.append((frames.cost + n * d * lowest.value, lowest.value, r))
+        return lowest.direction
+
+    found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2))
+    while (direction := direction_down(frames)) is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS:
+        frames = descend(cost, _escaped(cost, frames, direction))
     if frames is not found:
         found = min(found, descend(cost, rounded_rotations(frames.Y)), key=lambda each: each.cost)
-        lowest = lowest_eigenvalue(cost, found.Y)
-        proofs.append((found.cost + n * d * lowest.value, lowest.value, d))
+        direction_down(found)
     bound, eigenvalue, dimensions = max(proofs)
     return ChordalMinimum(_poses(graph, cost, found.Y), found.cost, bound, eigenvalue, dimensions)
 

@@ -58,7 +58,7 @@ class ChordalCost:
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Self:
-        """Of all measurements of a graph."""
+        """The cost of all measurements of a graph."""
         d, (kappa, tau) = graph.dim, edge_weights(graph)
         T = graph.first_T_second
         A = edge_matrix(graph, -T.swapaxes(1, 2), np.broadcast_to(np.eye(d + 1), T.shape))

@@ -11,11 +11,15 @@ vector, translation) in space.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _ORTHONORMAL = 1e-6
 
@@ -98,22 +102,26 @@ class PoseGraph:
 
     def components(self) -> IntArray:
         """Return the connected component (N,) of each pose, numbered from 0 in the order of their first poses."""
-        from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        ones = np.ones(len(self.first))
-        _, label = connected_components(coo_array((ones, (self.first, self.second)), shape=(len(self), len(self))))
+        _, label = connected_components(_joined(self))
         _, first_row, part = np.unique(label, return_index=True, return_inverse=True)
         return np.asarray(np.argsort(np.argsort(first_row))[part], dtype=np.int64)
 
 
-def _dead_reckoned(graph: PoseGraph) -> FloatArray:
+def _joined(graph: PoseGraph) -> csr_array:
+    """Sparse matrix (N, N) with an entry for each measured pair."""
     from scipy.sparse import coo_array
+
+    entries = (np.ones(len(graph.first)), (graph.first, graph.second))
+    return coo_array(entries, shape=(len(graph), len(graph))).tocsr()
+
+
+def _dead_reckoned(graph: PoseGraph) -> FloatArray:
     from scipy.sparse.csgraph import breadth_first_order
 
     first, second = graph.first.tolist(), graph.second.tolist()
-    joined = coo_array((np.ones(len(first)), (graph.first, graph.second)), shape=(len(graph), len(graph)))
-    order, before = breadth_first_order(joined.tocsr(), 0, directed=False)
+    order, before = breadth_first_order(_joined(graph), 0, directed=False)
     edge_of = dict(zip(zip(first, second, strict=True), range(len(first)), strict=True))
     poses = graph.world_T_pose.copy()
     for row in order[1:].tolist():

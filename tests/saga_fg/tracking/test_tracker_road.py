@@ -125,10 +125,10 @@ def test_an_unreported_light_is_believed_by_who_stops_and_who_goes():
     assert starting["green"] > before["green"] + 0.15
 
 
-def test_two_vehicles_tell_more_than_one_and_heedless_drivers_nothing():
+def test_two_vehicles_tell_more_than_one_and_drivers_who_do_not_comply_nothing():
     one, two = (believed(light_frames(lambda time: 3.0, road_map=wide(width), width=width)) for width in (1, 2))
     assert two["red"] + two["amber"] > one["red"] + one["amber"]
-    off = replace(SETTINGS, signals=replace(SETTINGS.signals, heedless=1.0))
+    off = replace(SETTINGS, signals=replace(SETTINGS.signals, non_compliance=1.0))
     untold = believed(light_frames(lambda time: 3.0), settings=off)
     assert untold["red"] == pytest.approx(SETTINGS.signals.stationary[0], abs=1e-6)
 

@@ -10,12 +10,12 @@ from dataclasses import replace
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 
 from saga_fg import Boxes, Detection, Detections, Frame, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import JointKalmanFilter
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import ClassSettings
+from saga_fg.tracking import ClassSettings, ClockSettings
 from saga_fg.tracking import tracker as tracker_module
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
@@ -77,6 +77,7 @@ def written(timestamp, places, corruption):
     epoch=st.sampled_from([0.0, 1.7e9]),
     max_step=st.sampled_from([np.inf, 0.05]),
 )
+@example(corruptions=[("timestamp", [0.75, 0.0, 0.0])], epoch=0.0, max_step=np.inf)
 def test_a_valid_frame_is_tracked_after_whatever_came_before(estimator, corruptions, epoch, max_step):
     logging.disable(logging.WARNING)
     if estimator == "centerpoint":
@@ -89,7 +90,8 @@ def test_a_valid_frame_is_tracked_after_whatever_came_before(estimator, corrupti
                 tracker.step(written(epoch + 0.1 * k, CARS(0.1 * k), corruption))
             except InputError:
                 continue
-        times = epoch + 0.1 * (len(corruptions) + np.arange(3))
+        # late frames are left out until their clock is believed, and a track is reported from its second hit on
+        times = epoch + 0.1 * (len(corruptions) + np.arange(ClockSettings().reset_after + 1))
         tracks = [tracker.step(frame(t, FAR, sensor="radar")) for t in times.tolist()][-1]
     finally:
         logging.disable(logging.NOTSET)
