@@ -28,13 +28,17 @@ from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking import TrackerSettings
+from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.prediction import predict
 from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.tracking.trails import TrailPoints, Trails, TrailSettings
 from saga_fg.types.dataset import Scene
 
 APART = 5000.0  # m between gaps: no edge reaches as far
+LATER = 1e9  # s between recordings: no trail is remembered for as long
+LARGEST_ID = 10**9  # of tracks
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class GapSettings:
     step: float = 0.5
     followed: float = 1.5
     spacing: float = 1.0
-    neighbours: int = 8
+    neighbours: int = 24
     reach: float = 60.0
 
 
@@ -69,7 +73,7 @@ class _Onto(NamedTuple):
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         """The edges into the first nodes."""
-        pairs = self.rule.pairs(nodes)
+        pairs = self.rule.pairs(replace(nodes, acted=np.arange(len(nodes)) < self.wanted))
         mine = pairs.target < self.wanted
         return Pairs(pairs.target[mine], pairs.source[mine], pairs.rate[mine])
 
@@ -86,23 +90,25 @@ class GapPrediction(NamedTuple):
 
 
 class _Shared(NamedTuple):
-    """Shared by all gaps: the tracks of the recordings, and the step, s."""
+    """Shared by all gaps: the tracks of the recordings, the step, s, and the trails that the tracks leave."""
 
     tracks: RecordedTracks
     step: float
+    trails: TrailPoints
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenObjects(Columns):
     """W gaps of S steps, each with at most M tracks around.
 
-    start       (W,) row of the hidden track in `recorded`; label (W,) of the object
+    start       (W,) row of the hidden track in `recorded`; time (W,), s; label (W,) of the object
     neighbours  (W, S, M) rows when a step starts, -1: none; lag (W, S), s, from their moment to the start of the step
     place       (W, S, 2) of the object at the end of each step, NaN where unknown
-    recorded    the tracks of the recordings, and the step
+    recorded    the tracks of the recordings, the step, and the trails
     """
 
     start: IntArray
+    time: FloatArray
     label: StrArray
     neighbours: IntArray
     lag: FloatArray
@@ -125,14 +131,20 @@ class HiddenObjects(Columns):
         """The gaps of several recordings."""
         recorded = RecordedTracks.concatenate([part.recorded.tracks for part in parts])
         first = np.cumsum([0, *(len(part.recorded.tracks.mean) for part in parts)])
+        after = LATER * np.arange(len(parts))
+        points = [part.recorded.trails for part in parts]
+        trails = TrailPoints.concatenate(
+            [replace(own, time=own.time + t) for own, t in zip(points, after, strict=True)]
+        )
         moved = [
             replace(
                 part,
                 start=part.start + n,
+                time=part.time + t,
                 neighbours=np.where(part.neighbours >= 0, part.neighbours + n, -1),
-                recorded=_Shared(recorded, part.recorded.step),
+                recorded=_Shared(recorded, part.recorded.step, trails),
             )
-            for part, n in zip(parts, first, strict=False)
+            for part, n, t in zip(parts, first, after, strict=False)
         ]
         return cls.concatenate(moved)
 
@@ -150,11 +162,12 @@ class HiddenObjects(Columns):
         last = S - self.known[:, ::-1].argmax(axis=1)
         order = np.argsort(np.where(self.known.any(axis=1), -last, 1), kind="stable")
         active = [int((last[self.known.any(axis=1)] > s).sum()) for s in range(S)]
-        recorded, step = self.recorded
+        recorded, step, _ = self.recorded
         side = int(np.ceil(np.sqrt(max(W, 1))))
         shift = APART * np.stack(np.divmod(np.arange(W), side), axis=1) - recorded.mean[self.start, :2]
         hidden = _placed(recorded.select(self.start[order]), np.arange(W), shift[order], 0.0)
         state = TrackerState(settings, ())
+        state.trails.points = self._trails(settings.trails.memory, shift[order], order)
         for s in range(S):
             n = active[s]
             if n == 0:
@@ -177,6 +190,19 @@ class HiddenObjects(Columns):
             found.position[rows, s], found.P[rows, s] = now.position[:n] - shift[rows], now.P[:n]
             hidden = RecordedTracks(state.table.select(slice(0, n)), marginals.means[:n], marginals.covariances[:n])
         return found
+
+    def _trails(self, memory: float, shift: FloatArray, order: IntArray) -> TrailPoints:
+        """The trails that the gaps `order` (W,) begin with, each shifted (W, 2) to its place."""
+        points, parts = self.recorded.trails, []
+        own, place = self.recorded.tracks.table.id[self.start], self.recorded.tracks.mean[self.start, :2]
+        for k, row in enumerate(order.tolist() if memory > 0 else ()):
+            lately = slice(*np.searchsorted(points.time, [self.time[row] - memory, self.time[row] + 1e-6]))
+            found = points.select(lately)
+            near = np.abs(found.position - place[row]).max(axis=1, initial=0.0) < APART / 4
+            found = found.select(near & (found.id != own[row]))
+            ids, position = found.id + (k + 1) * LARGEST_ID, found.position + shift[k]
+            parts.append(replace(found, id=ids, position=position, time=found.time - self.time[row]))
+        return TrailPoints.concatenate(parts) if parts else points.select(slice(0, 0))
 
 
 def _placed(tracks: RecordedTracks, ids: IntArray, shift: FloatArray, time: float) -> RecordedTracks:
@@ -214,7 +240,7 @@ def hidden_objects(
         if time - latest >= settings.spacing - 1e-6:
             latest = time
             starts.append(k)
-    columns: list[tuple[IntArray, StrArray, IntArray, FloatArray, FloatArray]] = []
+    columns: list[tuple[IntArray, FloatArray, StrArray, IntArray, FloatArray, FloatArray]] = []
     for k in starts:
         times = moments[k] + settings.step * np.arange(steps + 1)
         followed = -parts[k].table.initiated >= settings.followed - 1e-6
@@ -234,7 +260,23 @@ def hidden_objects(
             nearest = np.argsort(apart, axis=1)[:, : settings.neighbours]
             there = np.isfinite(np.take_along_axis(apart, nearest, axis=1))
             near[:, s, : nearest.shape[1]] = np.where(there, first[m] + nearest, -1)
-        columns.append((first[k] + rows, parts[k].table.label[rows], near, lag, place))
-    start, label, near, lag, place = (np.concatenate(column) for column in zip(*columns, strict=True))
-    found = HiddenObjects(start, label, near, lag, place, _Shared(recorded, settings.step))
+        time = np.full(len(rows), moments[k])
+        columns.append((first[k] + rows, time, parts[k].table.label[rows], near, lag, place))
+    start, begin, label, near, lag, place = (np.concatenate(column) for column in zip(*columns, strict=True))
+    shared = _Shared(recorded, settings.step, _trails(parts, moments))
+    found = HiddenObjects(start, begin, label, near, lag, place, shared)
     return found if len(found) else None
+
+
+def _trails(parts: Sequence[RecordedTracks], moments: FloatArray) -> TrailPoints:
+    """The trails of all tracks at their moments, by time."""
+    trails = Trails(TrailSettings(memory=LATER))
+    for part, time in zip(parts, moments, strict=True):
+        speed = np.hypot(*part.mean[:, 2:4].T)
+        moving = part.select((part.table.last_detected >= -1e-6) & (speed > MOVING))
+        v, times = moving.mean[:, 2:4], np.full(len(moving), time)
+        trails.update(
+            TrailPoints(moving.table.id, moving.mean[:, :2], np.arctan2(v[:, 1], v[:, 0]), np.hypot(*v.T), times)
+        )
+    none = np.empty(0)
+    return trails.points or TrailPoints(none.astype(np.int64), np.empty((0, 2)), none, none, none)

@@ -23,6 +23,7 @@ from scipy.optimize import minimize
 from saga_fg.errors import InputError
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects
 from saga_fg.model.edge_rules import VEHICLES, Neighbours, traffic_rules
+from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing
 from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.tracking import TrackerSettings
@@ -37,8 +38,19 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "lateral_scale": (0.3, 5.0),
     "heading_scale": (0.05, 3.0),
     "speed_scale": (0.1, 10.0),
+    "free_speed": (5.0, 60.0),
+    "headway": (0.3, 4.0),
+    "standstill_gap": (0.5, 8.0),
+    "acceleration": (0.1, 4.0),
+    "deceleration": (0.3, 6.0),
+    "time_constant": (0.3, 30.0),
 }
-"""Bounds of rates and widths; an infinite width stays infinite. Others: a tenth to ten times the template's value."""
+"""Bounds of parameters; an infinite one stays infinite. Others: a tenth to ten times the template's value."""
+LAWS: dict[type, tuple[str, ...]] = {
+    IntelligentDriver: ("free_speed", "headway", "standstill_gap", "acceleration", "deceleration"),
+    CarFollowing: ("time_constant", "headway"),
+}
+"""Parameters of drivers' laws that are learned; the time constant of an `IntelligentDriver` scales its rate alone."""
 PRIOR = 0.4  # weight of a unit of squared difference from the template, against the mean over the gaps
 TAILS = 3.0  # degrees of freedom of the innovations
 PLACE_DEVIATION = 0.1  # m, of labels
@@ -66,7 +78,10 @@ TEMPLATE: tuple[Rule, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class RuleParameters:
-    """n parameters of some rules: `names` tell rule and setting of each, `start` (n,) logarithms, `bounds` of these."""
+    """n parameters of some rules: `names` tell rule and setting of each, `start` (n,) logarithms, `bounds` of these.
+
+    A setting of a rule's interaction is told by "interaction.NAME".
+    """
 
     rules: tuple[Rule, ...]
     names: tuple[tuple[int, str], ...]
@@ -75,13 +90,16 @@ class RuleParameters:
 
     @classmethod
     def of(cls, rules: Sequence[Rule]) -> Self:
-        """All rates and widths that are finite and above 0, clipped to their bounds."""
+        """All rates, widths and parameters of laws that are finite and above 0, clipped to their bounds."""
         names, values, bounds = [], [], []
         for k, rule in enumerate(rules):
-            for name in (field.name for field in fields(rule)):
-                value = getattr(rule, name)
-                if (name == "rate" or name.endswith("_scale")) and isinstance(value, float) and 0 < value < math.inf:
-                    low, high = BOUNDS.get(name, (value / 10, value * 10))
+            own = [field.name for field in fields(rule) if field.name == "rate" or field.name.endswith("_scale")]
+            found = {name: getattr(rule, name) for name in own}
+            law = LAWS.get(type(rule.interaction), ())
+            found |= {f"interaction.{name}": getattr(rule.interaction, name) for name in law}
+            for name, value in found.items():
+                if isinstance(value, float) and 0 < value < math.inf:
+                    low, high = BOUNDS.get(name.removeprefix("interaction."), (value / 10, value * 10))
                     names.append((k, name))
                     values.append(min(max(value, low), high))
                     bounds.append((math.log(low), math.log(high)))
@@ -90,9 +108,14 @@ class RuleParameters:
     def valued(self, x: FloatArray) -> tuple[Rule, ...]:
         """The rules with parameters x (n,)."""
         values: list[dict[str, Any]] = [{} for _ in self.rules]
+        laws: list[dict[str, Any]] = [{} for _ in self.rules]
         for (k, name), value in zip(self.names, np.exp(x), strict=True):
-            values[k][name] = float(value)
-        return tuple(replace(rule, **changes) for rule, changes in zip(self.rules, values, strict=True))
+            of_law = name.startswith("interaction.")
+            (laws if of_law else values)[k][name.removeprefix("interaction.")] = float(value)
+        return tuple(
+            replace(rule, interaction=replace(rule.interaction, **law) if law else rule.interaction, **changes)
+            for rule, law, changes in zip(self.rules, laws, values, strict=True)
+        )
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ class Neighbours(Settings):
         else:  # the velocity of a new track is not known well enough
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= nodes.has_moved == 0 if nodes.has_moved is not None else False
-        target, source = close_pairs(nodes.position, able, self.max_distance)
+        target, source = pairs_within(nodes.position, able & nodes.acted, able, self.max_distance)
         rate = weighted_by_gain(
             self.strength(features_of(nodes, target, source)), self.information_gain, nodes, target, source
         )
@@ -167,35 +167,48 @@ class Following(Settings):
         share = np.ones_like(f.ahead) if self.parked else f.target_moved
         if self.leaders != "any":
             share = share * (f.source_moved if self.leaders == "moving" else 1 - f.source_moved)
-        exponent = (f.turn / self.heading_scale) ** 2 + (lateral_of_arc(f) / self.lateral_scale) ** 2
+        exponent = (f.turn / self.heading_scale) ** 2 + (f.lateral / self.lateral_scale) ** 2
         rate = self.rate * np.exp(-f.ahead / self.gap_scale - exponent / 2)
         return np.where(self.in_lane(f), share * rate, 0.0)
 
     def in_lane(self, f: EdgeFeatures) -> BoolArray:
         """Mask (...) of the sources ahead in the lane of their targets, near enough to lead or to be in between."""
-        lane = (np.abs(lateral_of_arc(f)) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
+        lane = (np.abs(f.lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
         return np.asarray(lane & (f.ahead > 0) & (f.distance <= self.max_gap))
 
     def remoteness(self, f: EdgeFeatures) -> FloatArray:
         """Measure, m, that is least for the leader among all vehicles ahead."""
-        return np.asarray(f.ahead + 10 * np.abs(lateral_of_arc(f)))
+        return np.asarray(f.ahead + 10 * np.abs(f.lateral))
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        able = of_classes(nodes.label, self.classes)
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
-        target, source = close_pairs(seen.position, able, self.max_gap)
-        bend = math.tan(min(3 * self.heading_scale, 1.5) / 2)
-        front = in_front(seen, target, source, 3 * self.lateral_scale, bend)
-        target, source = target[front], source[front]
+        target, source = self._ahead(seen)
         features = features_of(seen, target, source)
         near = self.min_separation * (nodes.length[target] + nodes.length[source]) / 2
-        between = self.in_lane(features) & (features.ahead >= near) & ~of_classes(nodes.label, self.towed)[target]
+        between = self.in_lane(features) & (features.ahead >= near)
         ahead = np.flatnonzero(between)
         exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
         rate = weighted_by_gain(self.strength(features), self.information_gain, nodes, target, source)[ahead]
         rate = rate * _none_before(target[ahead], self.remoteness(features)[ahead], exists[source[ahead]])
         target, source, led = target[ahead], source[ahead], rate > 0
         return Pairs(target[led], source[led], rate[led])
+
+    def _ahead(self, nodes: NodeTable) -> tuple[IntArray, IntArray]:
+        """All pairs that may be in a lane: target rows, source rows."""
+        able = of_classes(nodes.label, self.classes)
+        follows = able & ~of_classes(nodes.label, self.towed) & nodes.acted
+        if not self.parked and nodes.has_moved is not None:
+            follows = follows & (nodes.has_moved > 0)
+        target, source = pairs_within(nodes.position, follows, able, self.max_gap)
+        bent = np.zeros(len(nodes), dtype=np.bool_)
+        if nodes.paths is not None:
+            bent[nodes.paths.row] = True
+        c, s, (x, y) = np.cos(nodes.heading), np.sin(nodes.heading), nodes.position.T
+        dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
+        ahead, widest = dx * c + dy * s, math.tan(min(3 * self.heading_scale, 1.5) / 2)
+        straight = (ahead > 0) & (np.abs(dy * c - dx * s) <= 3 * self.lateral_scale + widest * ahead)
+        front = np.flatnonzero(straight | bent[target])
+        return target[front], source[front]
 
 
 @dataclass(frozen=True)
@@ -259,27 +272,17 @@ def traffic_rules() -> tuple[Following, Neighbours]:
     return leader, group
 
 
-def lateral_of_arc(f: EdgeFeatures) -> FloatArray:
-    """Lateral offsets (...), m, from the arc of a bend; a leader on it is off by ahead tan(turn / 2)."""
-    return np.asarray(f.lateral + f.ahead * np.tan(np.clip(f.turn, -1.5, 1.5) / 2))
-
-
-def close_pairs(position: FloatArray, able: BoolArray, radius: float) -> tuple[IntArray, IntArray]:
-    """All ordered pairs of able nodes within `radius` m: target rows, source rows."""
-    rows = np.flatnonzero(able)
-    if len(rows) < 2:
+def pairs_within(
+    position: FloatArray, targets: BoolArray, sources: BoolArray, radius: float
+) -> tuple[IntArray, IntArray]:
+    """All pairs (E,) of different rows of two masks (n,) within `radius` m: target rows, source rows."""
+    to, of = np.flatnonzero(targets), np.flatnonzero(sources)
+    if len(to) == 0 or len(of) < 2:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    pairs = cKDTree(position[rows]).query_pairs(radius, output_type="ndarray")
-    a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
-    return np.concatenate([a, b]), np.concatenate([b, a])
-
-
-def in_front(nodes: NodeTable, target: IntArray, source: IntArray, lateral: float, slope: float) -> IntArray:
-    """Indices of the pairs whose source is ahead of the target, off by at most `lateral` m and `slope` m a metre."""
-    c, s, (x, y) = np.cos(nodes.heading), np.sin(nodes.heading), nodes.position.T
-    dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
-    ahead = dx * c + dy * s
-    return np.flatnonzero((ahead > 0) & (np.abs(dy * c - dx * s) <= lateral + slope * ahead))
+    near = cKDTree(position[to]).sparse_distance_matrix(cKDTree(position[of]), radius, output_type="ndarray")
+    target, source = to[near["i"]], of[near["j"]]
+    different = target != source
+    return target[different], source[different]
 
 
 def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:

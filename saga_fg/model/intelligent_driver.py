@@ -2,10 +2,10 @@ r"""The Intelligent Driver Model as an interaction function: following a leader,
 
     f(v, s, w) = a [ 1 - (v / v_free)^4 - (s* / s)^2 ],      s* = s0 + max(0, v T + v (v - w) / (2 sqrt(a b)))
 
-is the acceleration at speed v with the gap s, bumper to bumper, to a leader of speed w (Treiber, Hennecke, Helbing
-2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line to stop at is a stationary leader. Vehicles do not
-reverse, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with the full acceleration, linearised at the
-estimate (v', s', w'):
+is the acceleration at speed v with the gap s along the path, bumper to bumper, to a leader of speed w (Treiber,
+Hennecke, Helbing 2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line to stop at is a stationary leader.
+Vehicles do not reverse, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with the full acceleration,
+linearised at the estimate (v', s', w'):
 
     dv_i/dt += rate tau u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
 
@@ -116,11 +116,11 @@ class IntelligentDriver(Settings):
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
         v, w = speed_along(nodes, target, u_i), speed_along(nodes, source, u_j)
-        distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u_i)
-        f = self.following(v, distance - (nodes.length[target] + nodes.length[source]) / 2, w)
+        way = nodes.along(target, source)
+        f = self.following(v, way.ahead - (nodes.length[target] + nodes.length[source]) / 2, w)
         at_rest = f._replace(value=f.value - f.by_leader * w)
         from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
-        return accelerated(nodes, target, source, u_i, v, at_rest, self.time_constant, from_leader)
+        return accelerated(nodes, target, source, u_i, v, at_rest, self.time_constant, from_leader, unit(way.direction))
 
 
 def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
@@ -137,13 +137,17 @@ def accelerated(
     f: Linearised,
     tau: float,
     by_leader: FloatArray | None = None,
+    onward: FloatArray | None = None,
 ) -> Triples:
-    """The triples of an acceleration f along u (E, 2), linearised at the speeds v (E,) and the distances along u.
+    """The triples of an acceleration f along u (E, 2), linearised at the speeds v (E,) and the gap along a path.
 
-    by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out
+    by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out; onward: direction (E, 2) of
+    the path at the source, u if not given
     """
+    onward = u if onward is None else onward
     along = tau * u[:, :, None] * u[:, None, :]
-    distance = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], u)
+    gap = (nodes.position[source] * onward - nodes.position[target] * u).sum(axis=1)
     by_gap, by_speed = along * f.by_gap[:, None, None], along * f.by_speed[:, None, None]
-    constant = tau * u * (f.value - f.by_speed * v - f.by_gap * distance)[:, None]
-    return velocity_triples(nodes, target, source, -by_gap, by_speed, by_gap, by_leader, constant)
+    by_source = tau * u[:, :, None] * onward[:, None, :] * f.by_gap[:, None, None]
+    constant = tau * u * (f.value - f.by_speed * v - f.by_gap * gap)[:, None]
+    return velocity_triples(nodes, target, source, -by_gap, by_speed, by_source, by_leader, constant)

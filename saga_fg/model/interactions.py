@@ -6,8 +6,11 @@ The mathematics of each interaction is written here, once; graphs, filters and f
 heading of node i and R_ij the rotation from the heading of j to that of i:
 
     shared velocity    dv_i/dt += rate ( R_ij v_j - v_i ),  da_i/dt -= rate a_i  where a_i is of the state
-    car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( u_i.(p_j - p_i) - gap_ij - headway u_i.v_i ) / tau )
+    car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( s_ij - gap_ij - headway u_i.v_i ) / tau )
     shared course      dv_i/dt += -rate m_j m_j.v_i,  m_j normal to u_j
+
+s_ij is the way along the path of i (`saga_fg.model.paths`), linearised at the estimate: it changes by
+t_j.dp_j - u_i.dp_i, with t_j the direction of the path at j. On a straight path it is u_i.(p_j - p_i).
 
 Car-following is Helly's linear law (Helly 1959); with the gap taken from the present estimate it keeps the formation.
 """
@@ -21,6 +24,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 
 from saga_fg.model.motion import NodeType
+from saga_fg.model.paths import Along, Paths, along_paths
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.settings import (
     NonNegative,
@@ -47,8 +51,9 @@ class NodeTable:
     where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
     or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
     unknown; existence (n,) probability that a node is a real object, None: all are; open (n,) the weight with which a
-    stop line lets waiting vehicles go; lanes: by row of a stop line, the lanes that cross it; derived: values that
-    rules share, kept with the table
+    stop line lets waiting vehicles go; lanes: by row of a stop line, the lanes that cross it; paths: predicted ones,
+    of nodes that may not go straight; acted (n,) mask of the nodes that others may act on, True: all; derived: values
+    that rules share, kept with the table
     """
 
     id: IntArray
@@ -67,10 +72,16 @@ class NodeTable:
     existence: FloatArray | None = None
     open: FloatArray | None = None
     lanes: Mapping[int, tuple[LaneAcross, ...]] = field(default_factory=dict)
+    paths: Paths | None = None
+    acted: BoolArray | Literal[True] = True
     derived: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.id)
+
+    def along(self, target: IntArray, source: IntArray) -> Along:
+        """Where nodes `source` (E,) are on the paths of nodes `target` (E,)."""
+        return along_paths(self.position, self.heading, self.paths, target, source)
 
 
 class Triples(NamedTuple):
@@ -140,24 +151,29 @@ class CarFollowing(Settings):
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
-        along = u_i[:, :, None] * u_i[:, None, :]
+        way = nodes.along(target, source)
+        t_j = unit(way.direction)
+        along, onward = u_i[:, :, None] * u_i[:, None, :], u_i[:, :, None] * t_j[:, None, :]
+        constant = self._gap(nodes, target, source, way.ahead, u_i) - way.ahead
+        constant += ((nodes.position[source] * t_j) - (nodes.position[target] * u_i)).sum(axis=1)
         return velocity_triples(
             nodes,
             target,
             source,
             by_position=-along / self.time_constant,
             by_velocity=-along * (1 + self.headway / self.time_constant),
-            by_other_position=along / self.time_constant,
+            by_other_position=onward / self.time_constant,
             by_other_velocity=u_i[:, :, None] * u_j[:, None, :],
-            constant=-u_i * (self._gap(nodes, target, source, u_i) / self.time_constant)[:, None],
+            constant=-u_i * (constant / self.time_constant)[:, None],
         )
 
-    def _gap(self, nodes: NodeTable, target: IntArray, source: IntArray, u_i: FloatArray) -> FloatArray:
+    def _gap(
+        self, nodes: NodeTable, target: IntArray, source: IntArray, ahead: FloatArray, u_i: FloatArray
+    ) -> FloatArray:
         """Desired distance between the centres at speed zero, m (E,)."""
         if self.gap == "standstill":
             return np.asarray(self.standstill_gap + (nodes.length[target] + nodes.length[source]) / 2)
-        distance = ((nodes.position[source] - nodes.position[target]) * u_i).sum(axis=1)
-        return np.asarray(distance - self.headway * (nodes.velocity[target] * u_i).sum(axis=1))
+        return np.asarray(ahead - self.headway * (nodes.velocity[target] * u_i).sum(axis=1))
 
 
 @dataclass(frozen=True)

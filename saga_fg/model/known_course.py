@@ -6,6 +6,7 @@ and across u by A_2, in which an acceleration fades at once (`Curvilinear`). Its
     F0 = exp(A_1 dt) (x) u u^T + exp(A_2 dt) (x) (I - u u^T)
     theta = c tau (1 - exp(-dt / tau))                        c: turn rate at the start, tau: its time constant
     x0 = x with  a <- a - brake u                             brake: u . a of a vehicle that would else reverse, or 0
+    (F0 x0)_v += r dt u,   (F0 x0)_p += r dt^2 / 2 u          r: acceleration to the speed of earlier traffic, or 0
     v' = R(theta) (F0 x0)_v,   a' = R(theta) (F0 x0)_a
     p' = p + sin(theta / 2) / (theta / 2) R(theta / 2) ((F0 x0)_p - p)
 
@@ -14,7 +15,7 @@ With n the normal of h + theta, and n_m that of h + theta / 2:
 
     v', a'  times  I - n n^T (1 - exp(-k dt))
     p' - p  times  I - n_m n_m^T (1 - (1 - exp(-k dt)) / (k dt))
-    q  is raised by  2 k |v|^2 var(h)           from which the velocity across has the variance |v|^2 var(h) at last
+    q  is raised by  2 k s^2                    from which the velocity across has the variance s^2 at last
 
 The chord is exact for a constant speed and a constant rate; where the rate fades or the speed changes it is near.
 
@@ -57,6 +58,7 @@ class KnownCourses(Columns):
     lateral_noise  (n,) q above, m^2/s^3
     brake          (n, 2) mean acceleration that is taken away, m/s^2
     settling       (n,) k above, 1/s, 0 for velocities across that stay
+    pull           (n,) r above, m/s^2
     """
 
     ids: IntArray
@@ -65,6 +67,7 @@ class KnownCourses(Columns):
     lateral_noise: FloatArray
     brake: FloatArray
     settling: FloatArray
+    pull: FloatArray
     node_type: NodeType
 
     @classmethod
@@ -78,18 +81,20 @@ class KnownCourses(Columns):
         mean: FloatArray,
         dt: float,
         settling: FloatArray | None = None,
-        course_variance: FloatArray | float = 0.0,
+        across: FloatArray | float = 0.0,
+        pull: FloatArray | None = None,
     ) -> KnownCourses:
         """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2; settling
-        0 if not given; course_variance (n,) var(h), rad^2."""
+        0 if not given; across (n,) variance of the velocity across, (m/s)^2; pull 0 if not given."""
         u = _unit(heading)
         speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
         reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
         brake = np.where(reverses, acceleration, 0.0)[:, None] * u
         settling = np.zeros(len(ids)) if settling is None else settling
-        uncertain = RATE_CORRELATION * rate_variance + settling * course_variance
-        lateral_noise = (mean[:, _V] ** 2).sum(axis=1) * 2 * uncertain
-        return cls(ids, heading, rate, lateral_noise, brake, settling, node_type)
+        square = (mean[:, _V] ** 2).sum(axis=1)
+        lateral_noise = 2 * (RATE_CORRELATION * rate_variance * square + settling * across)
+        pull = np.zeros(len(ids)) if pull is None else pull
+        return cls(ids, heading, rate, lateral_noise, brake, settling, pull, node_type)
 
     def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, MatchedMotion]:
         """dt seconds later, and the motions until then; scale (n,) of the process noise."""
@@ -108,6 +113,9 @@ class KnownCourses(Columns):
         F = _planar(F_along, ahead) + _planar(F_across, aside)
         Q = _planar(Q_along, ahead) + _planar(Q_across + self.lateral_noise[:, None, None] * Q_white, aside)
         b = -(F[:, :, _A] @ self.brake[:, :, None])[:, :, 0]
+        pull = self.pull[:, None] * u
+        b[:, _P] += dt * dt / 2 * pull
+        b[:, _V] += dt * pull
         chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
         if self.settling.any():
             passed = np.maximum(self.settling * dt, _LEAST)

@@ -23,23 +23,34 @@ class Feet(NamedTuple):
 
 
 def feet(polyline: FloatArray, places: FloatArray) -> Feet:
-    """The feet on a polyline (k, 2) of places (m, 2); its first and last pieces run on straight."""
-    start, step = polyline[:-1], np.diff(polyline, axis=0)
-    length = np.hypot(*step.T)
-    t = step / length[:, None]
+    """The feet of places (m, 2) on a polyline (k, 2), or each on its own (m, k, 2).
+
+    The first and last pieces run on straight. The direction turns evenly from the middle of a piece to the next one's.
+    """
+    start, step = polyline[..., :-1, :], np.diff(polyline, axis=-2)
+    length = np.hypot(step[..., 0], step[..., 1])
+    t = step / length[..., None]
     offset = places[:, None] - start
-    along = np.einsum("mki,ki->mk", offset, t)
-    low, high = np.zeros(len(step)), length.copy()
-    low[0], high[-1] = -np.inf, np.inf
+    along = offset[..., 0] * t[..., 0] + offset[..., 1] * t[..., 1]
+    low, high = np.zeros_like(length), length.copy()
+    low[..., 0], high[..., -1] = -np.inf, np.inf
     along = np.clip(along, low, high)
     nearest = start + along[..., None] * t
     k = np.argmin(((places[:, None] - nearest) ** 2).sum(axis=-1), axis=1)
-    rows = np.arange(len(places))
-    point = nearest[rows, k]
+    rows, last = np.arange(len(places)), length.shape[-1] - 1
+    length, t = np.broadcast_to(length, along.shape), np.broadcast_to(t, offset.shape)
+    point, along, own = nearest[rows, k], along[rows, k], t[rows, k]
     apart = places - point
-    e = t[k, 0] * apart[:, 1] - t[k, 1] * apart[:, 0]
-    s = np.concatenate([[0.0], np.cumsum(length)])[k] + along[rows, k]
-    return Feet(point, s, e, direction_at(polyline, s))
+    e = own[:, 0] * apart[:, 1] - own[:, 1] * apart[:, 0]
+    s = np.cumsum(length, axis=1)[rows, k] - length[rows, k] + along
+    beyond = along - length[rows, k] / 2
+    other = np.clip(k + np.where(beyond < 0, -1, 1), 0, last)
+    next_to = t[rows, other]
+    turn = np.arctan2(own[:, 0] * next_to[:, 1] - own[:, 1] * next_to[:, 0], (own * next_to).sum(axis=1))
+    turn *= 2 * np.abs(beyond) / (length[rows, k] + length[rows, other])
+    c, sine = np.cos(turn), np.sin(turn)
+    direction = np.stack([c * own[:, 0] - sine * own[:, 1], sine * own[:, 0] + c * own[:, 1]], axis=-1)
+    return Feet(point, s, e, direction)
 
 
 def on_it(polyline: FloatArray, s: FloatArray) -> BoolArray:

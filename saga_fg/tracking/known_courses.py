@@ -1,37 +1,63 @@
 """Courses of vehicles that are known when the state is predicted: seen in headings, or of the path that they are on.
 
 A track that is not detected goes on along its path: that of earlier traffic where there is any
-(`saga_fg.tracking.trails`), else that of its own heading and turn. Both are found anew for every interval and recorded
-with it (`saga_fg.model.known_course`).
+(`saga_fg.tracking.trails`), else that of its own heading and turn. On it, it takes on the speed of earlier traffic, and
+its leaders are found. All is found anew for every interval and recorded with it (`saga_fg.model.known_course`).
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 
 from saga_fg.model.known_course import KnownCourses, turning_time
 from saga_fg.model.motion import Curvilinear
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.model.paths import Paths
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.trails import STEP
 
-COURSE_DEVIATION = 0.04  # rad, of a vehicle from the course of its path: it moves within its lane
+ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
+LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
+WIDEST = 0.3  # rad, of a course, however slow the vehicle
+FLOW_TIME = 3.0  # s, in which a vehicle takes on the speed of earlier traffic
+STEPS = 20  # of a path, as far as leaders are looked for
 _ASTRAY = 0.5  # rad between heading and motion, from which the motion is noise
 _LEAST = 1e-9
 
 
-def known_courses(state: TrackerState, dt: float, unseen: BoolArray) -> tuple[tuple[KnownCourses, ...], FloatArray]:
+def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
+    """The paths of the `unseen` (n,) vehicles with a heading, of `STEPS` steps, in local positions."""
+    table, rows = state.table, np.flatnonzero(unseen & np.isfinite(state.table.box.yaw))
+    rate = np.zeros(len(table))
+    able = np.zeros(len(table), dtype=np.bool_)
+    for node_type, of_type in state.joint.rows_by_type(table.label[rows], moving=True):
+        if isinstance(node_type.motion, Curvilinear):
+            able[rows[of_type]] = True
+            if node_type.motion.turn_time > 0:
+                rate[rows[of_type]] = table.turn.known(rows[of_type], node_type.motion.turning_share)[0]
+    rows = np.flatnonzero(able)
+    now = state.kinematics().select(rows)
+    speed = np.hypot(*now.velocity.T)
+    curvature = np.where(speed > MOVING, rate[rows], 0.0) / np.maximum(speed, MOVING)
+    heading = _course(table.box.yaw[rows], table.box.yaw_variance[rows], now)
+    paths = state.trails.paths(table.id[rows], now.position + state.origin, heading, curvature, STEPS)
+    return replace(paths, row=rows, position=paths.position - state.origin)
+
+
+def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[KnownCourses, ...], FloatArray]:
     """The courses of vehicles with a heading over the next `dt` s, by motion; their turn rates are predicted after.
 
-    Returned as well: the headings after it (n,), rad, of the `unseen` (n,) that keep to their courses, NaN of others.
+    Returned as well: the headings after it (n,), rad, of those that keep to their `paths`, NaN of others.
     """
     table, velocity = state.table, state.kinematics().velocity
     turn_time, found, after = np.zeros(len(table)), [], np.full(len(table), np.nan)
+    path = np.full(len(table), -1)
+    path[paths.row] = np.arange(len(paths))
     for node_type, rows in state.joint.rows_by_type(table.label, moving=True):
         motion = node_type.motion
         if not isinstance(motion, Curvilinear):
@@ -41,38 +67,39 @@ def known_courses(state: TrackerState, dt: float, unseen: BoolArray) -> tuple[tu
         if len(rows) == 0:
             continue
         rate, variance = table.turn.known(rows, motion.turning_share)
-        turns = (motion.turn_time > 0) & (np.hypot(*velocity[rows].T) > MOVING)
+        speed = np.hypot(*velocity[rows].T)
+        turns = (motion.turn_time > 0) & (speed > MOVING)
         rate, variance = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0)
-        heading, settling, course_variance = table.box.yaw[rows], np.zeros(len(rows)), np.zeros(len(rows))
-        led = np.flatnonzero(unseen[rows]) if motion.course_time > 0 else np.empty(0, dtype=np.int64)
+        heading, (settling, across, pull) = table.box.yaw[rows], np.zeros((3, len(rows)))
+        led = np.flatnonzero((path[rows] >= 0) & (motion.course_time > 0))
         if len(led):
-            heading[led], turn, course_variance[led] = _along_paths(state, rows[led], rate[led], dt)
+            own, way = paths.select(path[rows[led]]), speed[led] * dt
+            turn = _at(own.heading, way) - own.heading[:, 0]
+            heading[led], across[led] = own.heading[:, 0], _across(own, speed[led])
+            typical, weight = _at(own.speed, way), _at(own.weight, way)
+            pull[led] = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
             after[rows[led]] = wrap_angle(heading[led] + turn)
             rate[led], settling[led] = turn / turning_time(motion, dt), 1 / motion.course_time
         mean = state.joint.estimator.mean(table.id[rows])
-        ids = table.id[rows]
-        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, settling, course_variance))
+        ids, course = table.id[rows], (settling, across, pull)
+        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, *course))
     if turn_time.any():
         table.turn.predict(dt, turn_time)
     return tuple(found), after
 
 
-def _along_paths(
-    state: TrackerState, rows: IntArray, rate: FloatArray, dt: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Course of the paths (k,), rad, turn along them within `dt` s (k,), rad, and variance of the course (k,), rad^2,
-    of tracks `rows` (k,)."""
-    table, now = state.table, state.kinematics().select(rows)
-    speed = np.hypot(*now.velocity.T)
-    way = speed * dt
-    steps = max(1, math.ceil(way.max() / STEP))
-    heading = _course(table.box.yaw[rows], table.box.yaw_variance[rows], now)
-    curvature = rate / np.maximum(speed, MOVING)
-    paths = state.trails.paths(table.id[rows], now.position + state.origin, heading, curvature, steps)
-    k = np.minimum((way / STEP).astype(np.int64), steps - 1)
-    start, share, each = paths.heading[:, 0], way / STEP - k, np.arange(len(rows))
-    end = paths.heading[each, k] + share * (paths.heading[each, k + 1] - paths.heading[each, k])
-    return start, end - start, COURSE_DEVIATION**2 + paths.disagreement
+def _across(paths: Paths, speed: FloatArray) -> FloatArray:
+    """Variances (k,) of the velocity across paths, (m/s)^2."""
+    own = np.minimum(ACROSS**2 + (1 - paths.certainty) * LEAVING**2, (WIDEST * speed) ** 2)
+    return np.asarray(own + paths.disagreement * speed**2)
+
+
+def _at(column: FloatArray, way: FloatArray) -> FloatArray:
+    """Values (k,) of a column (k, m + 1) of paths at some way (k,), m, interpolated."""
+    most, each = column.shape[1] - 1, np.arange(len(column))
+    share = np.minimum(way / STEP, most)
+    k = np.minimum(share.astype(np.int64), most - 1)
+    return np.asarray(column[each, k] + (share - k) * (column[each, k + 1] - column[each, k]))
 
 
 def _course(yaw: FloatArray, variance: FloatArray, now: Kinematics) -> FloatArray:

@@ -13,9 +13,10 @@ import numpy as np
 
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
+from saga_fg.model.paths import Paths
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.deletion import untrackable
-from saga_fg.tracking.known_courses import known_courses
+from saga_fg.tracking.known_courses import known_courses, predicted_paths
 from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
@@ -45,12 +46,13 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
     table = state.table
     unseen = ahead | (table.last_detected < state.time)
     noise = _predict_stationarity(state, dt)
-    explained, nodes, lights = state.settings.explained_noise, node_table(state), state.map_nodes
+    paths = predicted_paths(state, unseen)
+    explained, nodes, lights = state.settings.explained_noise, node_table(state, paths), state.map_nodes
     if watched and lights.infers:
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
     state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
     before = state.kinematics().velocity
-    courses, heading = known_courses(state, dt, unseen)
+    courses, heading = known_courses(state, dt, paths)
     state.graph = replace(state.graph, modes=courses)
     state.joint.predict(state.graph, dt)
     table.box.turn_with(before, state.kinematics().velocity, unseen)
@@ -68,8 +70,8 @@ def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
     return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
 
 
-def node_table(state: TrackerState) -> NodeTable:
-    """The present estimates as edge rules see them: the tracks, the vehicle, the nodes of the map.
+def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
+    """The present estimates as edge rules see them: the tracks with their `paths`, the vehicle, the nodes of the map.
 
     The direction of motion stands in for a heading that is not known. A confirmed track exists, hidden or not.
     """
@@ -89,4 +91,5 @@ def node_table(state: TrackerState) -> NodeTable:
         unseen=table.coasting(state.time),
         existence=np.where(table.confirmed, 1.0, table.existence),
     )
-    return state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)
+    nodes = state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)
+    return replace(nodes, paths=paths)

@@ -1,13 +1,15 @@
-r"""Trails of earlier traffic: the paths that vehicles took lately, along which others can be expected to go on.
+r"""Trails of earlier traffic: where vehicles went lately, and how fast; others can be expected to do as they did.
 
-A trail is a row of points of one track, `SPACING` m apart, each with the direction of travel. A path is predicted from
-a place and a course h in steps of ds: with the trails j near its next place, of each the nearest point, d_j m away,
+A trail is a row of points of one track, `SPACING` m apart, each with the direction of travel and the speed. A path is
+predicted from a place and a course h in steps of ds: with the trails j near its next place, of each the nearest point,
+d_j m away,
 
     k_j = exp( -d_j^2 / (2 reach^2) - (h_j - h)^2 / (2 TURN^2) ),   m, s^2: mean and variance of h_j - h under k_j
     h'  = h + c m + (1 - c) u ds,   c = K / (K + PRIOR) / (1 + s^2 / AGREEMENT^2),  K = sum of k_j
 
 with u the curvature that the vehicle has itself, which fades along the way. Where there are no trails, it goes on as it
-does; where they part, nothing is known of its course, until it is nearer to one of them.
+does; where they part, nothing is known of its course, until it is nearer to one of them. The mean of the speeds under
+k_j is the typical speed at each place.
 
 The trails need no map, outlive single tracks and are forgotten after `memory` s.
 """
@@ -20,6 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from saga_fg.model.interactions import unit
+from saga_fg.model.paths import Paths
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import wrap_angle
@@ -30,9 +34,10 @@ STEP = 3.0  # m between the points of a predicted path
 NEAREST = 12  # trail points that are compared with a place
 PRIOR = 0.2  # weight of going on as before, against that of one trail right here: few leave the path of others
 TURN = 0.3  # rad, sigma of the kernel on the difference of headings
-AGREEMENT = 0.1  # rad, deviation of the headings of trails from which they say little
+AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
 _LEAST = 1e-9
+_NEARER = np.tril(np.ones((NEAREST, NEAREST), dtype=np.bool_), -1)
 
 
 @dataclass(frozen=True)
@@ -49,25 +54,24 @@ class TrailSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class TrailPoints(Columns):
-    """n points: id of the track, position (n, 2), world, m, heading, rad, time, s."""
+    """n points: id of the track, position (n, 2), world, m, heading, rad, speed, m/s, time, s."""
 
     id: IntArray
     position: FloatArray
     heading: FloatArray
+    speed: FloatArray
     time: FloatArray
 
 
-class Paths(NamedTuple):
-    """Predicted paths of n vehicles at m + 1 places, `STEP` m apart, from where they are.
+class _Beside(NamedTuple):
+    """What trails tell of n places, each (n,): mean of h_j - h, rad, certainty c, variance s^2, typical speed, m/s, and
+    K."""
 
-    position (n, m + 1, 2) m; heading (n, m + 1) rad; certainty (n, m + 1) in [0, 1) with which trails give the heading;
-    disagreement (n,) variance s^2 of the trails' headings where they are, rad^2
-    """
-
-    position: FloatArray
-    heading: FloatArray
+    turn: FloatArray
     certainty: FloatArray
-    disagreement: FloatArray
+    variance: FloatArray
+    speed: FloatArray
+    weight: FloatArray
 
 
 @dataclass(eq=False)
@@ -105,48 +109,44 @@ class Trails:
         dx, dy = (passing.position - latest.position[at]).T
         return np.asarray((latest.id[at] != passing.id) | (dx * dx + dy * dy >= SPACING**2))
 
-    def headings(
-        self, ids: IntArray, position: FloatArray, heading: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean of h_j - h, rad, at places (n, 2), world, with headings h (n,), certainty c, variance s^2: (n,) each.
-
-        The trails of tracks `ids` (n,) tell them nothing.
-        """
-        points, settings = self.points, self.settings
+    def _beside(self, ids: IntArray, position: FloatArray, heading: FloatArray) -> _Beside:
+        """The trails beside places (n, 2), world, with headings (n,), rad, without those of the tracks `ids` (n,)."""
+        points, reach = self.points, self.settings.reach
         if points is None or len(points) == 0:
-            return np.zeros(len(heading)), np.zeros(len(heading)), np.zeros(len(heading))
+            return _Beside(*np.zeros((5, len(heading))))
         if self._tree is None:
             self._tree = cKDTree(points.position, balanced_tree=False, compact_nodes=False)
-        apart, at = self._tree.query(position, k=NEAREST, distance_upper_bound=2 * settings.reach)
+        apart, at = self._tree.query(position, k=NEAREST, distance_upper_bound=2 * reach)
         at = np.minimum(at, len(points) - 1)
         of = points.id[at]
-        found = np.isfinite(apart) & (of != ids[:, None]) & ~np.tril(of[:, :, None] == of[:, None], -1).any(axis=2)
+        found = np.isfinite(apart) & (of != ids[:, None]) & ~((of[:, :, None] == of[:, None]) & _NEARER).any(axis=2)
         turn = wrap_angle(points.heading[at] - heading[:, None])
         aside = np.where(found, apart, 0.0)
-        k = np.exp(-((aside / settings.reach) ** 2 + (turn / TURN) ** 2) / 2) * found
+        k = np.exp(-((aside / reach) ** 2 + (turn / TURN) ** 2) / 2) * found
         total = k.sum(axis=1)
-        mean = (k * turn).sum(axis=1) / np.maximum(total, _LEAST)
-        variance = (k * (turn - mean[:, None]) ** 2).sum(axis=1) / np.maximum(total, _LEAST)
-        return mean, total / (total + PRIOR) / (1 + variance / AGREEMENT**2), variance
+        share = k / np.maximum(total, _LEAST)[:, None]
+        mean = (share * turn).sum(axis=1)
+        variance = (share * (turn - mean[:, None]) ** 2).sum(axis=1)
+        certainty = total / (total + PRIOR) / (1 + variance / AGREEMENT**2)
+        return _Beside(mean, certainty, variance, (share * points.speed[at]).sum(axis=1), total)
 
     def paths(
         self, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
     ) -> Paths:
-        """Predict the paths of n tracks at `position` (n, 2), world, with a `curvature` (n,) of their own, 1/m."""
-        place, course = position, heading
-        turn, certainty, disagreement = self.headings(ids, place, course)
-        course = course + certainty * turn
-        places, courses, certain = [place], [course], [certainty]
+        """Predict the paths of n tracks at `position` (n, 2), world, with a `curvature` (n,) of their own, 1/m.
+
+        Their steps are `STEP` m long, their rows 0 to n - 1.
+        """
+        place, beside = position, self._beside(ids, position, heading)
+        course = heading + beside.certainty * beside.turn
+        certainty, disagreement = beside.certainty, beside.variance
+        columns = [(place, course, beside.speed, beside.weight)]
         for step in range(steps):
             own = curvature * STEP * np.exp(-(step + 0.5) * STEP / _BEND)
-            middle = course + own / 2
-            there = place + STEP * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-            turn, certainty, _ = self.headings(ids, there, course)
-            after = course + certainty * turn + (1 - certainty) * own
-            middle = (course + after) / 2
-            place = place + STEP * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+            beside = self._beside(ids, place + STEP * unit(course + own / 2), course)
+            after = course + beside.certainty * beside.turn + (1 - beside.certainty) * own
+            place = place + STEP * unit((course + after) / 2)
             course = after
-            places.append(place)
-            courses.append(course)
-            certain.append(certainty)
-        return Paths(np.stack(places, axis=1), np.stack(courses, axis=1), np.stack(certain, axis=1), disagreement)
+            columns.append((place, course, beside.speed, beside.weight))
+        places, courses, speeds, weights = (np.stack(column, axis=1) for column in zip(*columns, strict=True))
+        return Paths(np.arange(len(ids)), places, courses, speeds, weights, certainty, disagreement)

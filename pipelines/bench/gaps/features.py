@@ -160,7 +160,8 @@ def _lane(labelled: LabelledScene, gap: Gap, origin: FloatArray, yaw: float) -> 
     for lane in road.lanes if road is not None else ():
         centre = Route.through(np.array(lane.centre))
         way, aside, direction = (float(each[0]) for each in centre.project(origin[None]))
-        if abs(aside) <= LANE_REACH and np.cos(direction - yaw) > 0.8 and (best is None or abs(aside) < best[0]):
+        on_it = abs(aside) <= LANE_REACH and way <= centre.way[-1] and np.cos(direction - yaw) > 0.8
+        if on_it and (best is None or abs(aside) < best[0]):
             at = np.searchsorted(centre.way, way + np.array(AHEAD)) - 1
             bend = wrap_angle(centre.direction[np.clip(at, 0, len(centre.direction) - 1)] - yaw)
             best = abs(aside), [*np.where(way + np.array(AHEAD) < centre.way[-1], bend, UNKNOWN).tolist(), aside]

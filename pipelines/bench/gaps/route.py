@@ -9,6 +9,7 @@ import numpy as np
 
 from pipelines.bench.gaps.labelled import LabelledScene
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.polyline import feet
 
 STEP = 0.5  # m between points: shorter ones are noise
 ONWARD = 80.0  # m beyond the last label
@@ -50,24 +51,13 @@ class Route:
     def project(self, place: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Arc length (N,), m, lateral offset (N,), m, left is positive, and direction (N,), rad, of places (N, 2).
 
-        NaN for places of NaN. The way of places behind the start is negative.
+        NaN for places of NaN. The way of places behind the start is negative, the last segment runs on.
         """
-        a, step = self.ends[:-1], np.diff(self.ends, axis=0)
-        length = np.diff(self.way)
-        offset = place[:, None] - a  # (N, S, 2)
-        t = np.einsum("nsi,si->ns", offset, step) / length
-        inside = np.clip(t, 0.0, length)
-        inside[:, 0] = np.minimum(t[:, 0], length[0])
-        across = (step[:, 0] * offset[..., 1] - step[:, 1] * offset[..., 0]) / length
-        away = np.hypot(across, t - inside)
-        nearest = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
-        row = np.arange(len(place))
-        sign = np.where(across[row, nearest] < 0, -1.0, 1.0)
-        return (
-            self.way[nearest] + inside[row, nearest],
-            sign * away[row, nearest],
-            np.where(np.isfinite(place[:, 0]), self.direction[nearest], np.nan),
-        )
+        known = np.isfinite(place[:, 0])
+        at = feet(self.ends, place[known])
+        found = np.full((3, len(place)), np.nan)
+        found[:, known] = at.s, at.e, np.arctan2(at.direction[:, 1], at.direction[:, 0])
+        return found[0], found[1], found[2]
 
     def crossing(self, line: FloatArray) -> tuple[float, float]:
         """The way to a line (2, 2) that the route crosses, m, and its direction there; infinite where it does not."""

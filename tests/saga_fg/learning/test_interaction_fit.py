@@ -11,6 +11,7 @@ from saga_fg.learning import GapSettings, HiddenObjects, fit_interactions, hidde
 from saga_fg.learning.interaction_fit import RuleParameters
 from saga_fg.model.edge_features import EdgeFeatures
 from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.model.sensor import NoiseModel, Sensor
@@ -110,3 +111,19 @@ def test_learning_from_nothing_is_an_error():
     sample = gaps_of(1, pairs=1)
     with pytest.raises(InputError, match="at least one object that is followed"):
         fit_interactions(HiddenObjects.pooled([sample]).select(slice(0, 0)), SETTINGS, (FOLLOW,))
+
+
+def test_the_law_of_drivers_is_learned():
+    driver = IntelligentDriver(headway=1.1, free_speed=20.0)
+    parameters = RuleParameters.of((Following(driver, rate=1.0, gap_scale=math.inf),))
+    names = [name for _, name in parameters.names]
+    laws = {
+        f"interaction.{name}" for name in ("headway", "standstill_gap", "acceleration", "deceleration", "free_speed")
+    }
+    assert laws <= set(names)
+    assert "interaction.time_constant" not in names, "scales the rate alone"
+    x = parameters.start.copy()
+    x[names.index("interaction.headway")] = math.log(2.0)
+    (rule,) = parameters.valued(x)
+    assert rule.interaction.headway == pytest.approx(2.0)
+    assert rule.interaction.free_speed == pytest.approx(20.0)

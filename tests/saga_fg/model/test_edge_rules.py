@@ -11,7 +11,9 @@ from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs, traffic_rules
 from saga_fg.model.graph_building import build_graph
+from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.paths import Paths
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
@@ -68,6 +70,13 @@ def leaders(pairs):
 
 def random_traffic(rng, n=15):
     return table(rng.uniform(-25, 25, (n, 2)), rng.normal(0, 0.5, n), rng.uniform(0, 15, n))
+
+
+def with_path(nodes, row, places, headings):
+    """The nodes, one of which has a predicted path."""
+    none = np.zeros((1, len(places)))
+    path = Paths(np.array([row]), np.asarray(places)[None], np.asarray(headings)[None], none, none, np.zeros(1))
+    return replace(nodes, paths=path)
 
 
 # what neighbours have to tell
@@ -408,7 +417,7 @@ def test_rates_are_continuous_in_whether_a_vehicle_between_moves(leading, exists
 
     certain = 0.0 if leading == "moving" else 1.0
     assert led(certain) == pytest.approx(led(abs(certain - 1e-9)), abs=1e-8)
-    assert led(certain)[0] == led(1 - certain)[0], "who leads from beyond depends on its existence alone"
+    assert led(certain)[0] == pytest.approx(led(1 - certain)[0]), "who leads from beyond depends on its existence alone"
     assert (led(certain)[0] == 0) == (exists == 1)
 
 
@@ -420,3 +429,56 @@ def test_who_creeps_in_a_jam_is_not_coupled_as_parked_objects_are():
         return rule.pairs(replace(table(side_by_side, 0.0, speed=speed), **known)).rate
 
     assert rates(1.5).max() < 1e-3 < 0.5 < rates(0.1).min()
+
+
+# along a path
+
+
+def round_the_corner():
+    """A car before a left turn of 12 m radius, one round it, and one straight on."""
+    places, headings = bend(8, 12.0, gap=-4.0)
+    nodes = table([(0.0, 0.0), places[5], (20.0, 0.0)], [0.0, headings[5], 0.0])
+    return nodes, places, headings
+
+
+def test_the_leader_is_the_nearest_on_the_path_that_is_predicted():
+    nodes, places, headings = round_the_corner()
+    rule = Following(SharedVelocity(), gap_scale=np.inf)
+    assert leaders(rule.pairs(nodes)) == {0: 2}
+    assert leaders(rule.pairs(with_path(nodes, 0, places, headings))) == {0: 1}
+
+
+def test_a_straight_path_is_no_path():
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        nodes = random_traffic(rng)
+        nodes = replace(nodes, heading=np.zeros(len(nodes)))
+        on = nodes.position[4] + np.arange(0.0, 60.0, 3.0)[:, None] * np.array([1.0, 0.0])
+        rule = Following(SharedVelocity())
+        assert edges(rule.pairs(nodes)).get(4, {}) == pytest.approx(
+            edges(rule.pairs(with_path(nodes, 4, on, np.zeros(20)))).get(4, {})
+        )
+
+
+@pytest.mark.parametrize(
+    "law", [CarFollowing(time_constant=2.0, gap="standstill", headway=1.0), IntelligentDriver(headway=1.0)]
+)
+def test_laws_take_the_gap_along_the_path(law):
+    """At the estimate, the acceleration is that behind a leader straight ahead, as far away as this one on the path."""
+    nodes, places, headings = round_the_corner()
+    nodes = with_path(nodes, 0, places, headings)
+    ahead = nodes.along(np.array([0]), np.array([1])).ahead[0]
+    assert ahead == pytest.approx(20.0, abs=0.5)
+
+    def acceleration(nodes):
+        triples = law.triples(nodes, np.array([0]), np.array([1]))
+        x, other = (np.concatenate([nodes.position[k], nodes.velocity[k]]) for k in (0, 1))
+        return (triples.A_self[0] @ x + triples.A_other[0] @ other + triples.b[0])[2:]
+
+    straight_on = table([(0.0, 0.0), (ahead, 0.0), (60.0, 0.0)], 0.0)
+    assert acceleration(nodes) == pytest.approx(acceleration(straight_on), abs=1e-9)
+    step = 0.1 * np.array([[0.0, 0.0], [np.cos(headings[5]), np.sin(headings[5])], [0.0, 0.0]])
+    further = replace(nodes, position=nodes.position + step)
+    triples = law.triples(nodes, np.array([0]), np.array([1]))
+    change = triples.A_other[0][2:, :2] @ step[1]
+    assert change == pytest.approx(acceleration(further) - acceleration(nodes), rel=0.1, abs=1e-3)

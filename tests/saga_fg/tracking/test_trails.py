@@ -18,12 +18,11 @@ SPEED, RADIUS, DT = 8.0, 20.0, 0.1
 NOBODY = np.array([-1])
 
 
-def passing(position, heading, time=0.0, ids=None):
+def passing(position, heading, time=0.0, ids=None, speed=8.0):
     n = len(position)
     ids = np.zeros(n, dtype=np.int64) if ids is None else np.array(ids)
-    return TrailPoints(
-        ids, np.array(position, dtype=float), np.broadcast_to(heading, n).astype(float), np.full(n, time)
-    )
+    headings = np.broadcast_to(heading, n).astype(float)
+    return TrailPoints(ids, np.array(position, dtype=float), headings, np.full(n, speed), np.full(n, time))
 
 
 def along(place, heading, ids=0, settings=SETTINGS):
@@ -67,7 +66,7 @@ def test_a_path_goes_round_the_bend_of_earlier_traffic():
     expected, heading = arc(-10 + STEP * np.arange(11))
     assert found.position[0] == pytest.approx(expected, abs=0.6)
     assert found.heading[0] == pytest.approx(heading, abs=0.12)
-    assert found.certainty.min() > 0.4
+    assert found.weight.min() > 0.4
 
 
 def test_a_vehicle_beside_the_trail_stays_beside_it():
@@ -82,7 +81,7 @@ def test_a_vehicle_beside_the_trail_stays_beside_it():
 def test_other_traffic_leads_nobody(position, heading):
     found = path(along(*arc(np.arange(-20, 40, 1.0))), position, heading, steps=4)
     assert found.heading[0] == pytest.approx(np.full(5, heading), abs=1e-2)
-    assert found.certainty.max() < 0.05
+    assert found.weight.max() < 0.05
 
 
 def test_without_trails_a_path_keeps_its_own_bend_which_fades():
@@ -95,16 +94,16 @@ def test_without_trails_a_path_keeps_its_own_bend_which_fades():
 
 def test_ones_own_trail_leads_one_nowhere():
     trails = along(*arc(np.arange(-20, 40, 1.0)), ids=5)
-    assert path(trails, track=np.array([5])).certainty.max() == 0.0
+    assert path(trails, track=np.array([5])).weight.max() == 0.0
 
 
-def test_where_trails_part_the_course_is_uncertain():
-    trails = along(*arc(np.arange(-20, 40, 1.0)))
-    for p in np.arange(-20, 40, 1.0):
-        trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]))
+def test_a_path_knows_the_speed_of_earlier_traffic():
+    trails = Trails(SETTINGS)
+    for x in np.arange(-20.0, 40.0, 2.0):
+        trails.update(passing([(x, 0.0)], 0.0, 0.1 * (x + 20.0), [1], speed=10.0 - 0.1 * x))
     found = path(trails)
-    assert found.certainty[0, 1] > 0.5, "before the fork"
-    assert found.certainty[0, 5:8].min() < 0.5 * found.certainty[0, 1], "at the fork"
+    assert found.speed[0] == pytest.approx(10.0 - 0.1 * found.position[0, :, 0], abs=0.2)
+    assert path(Trails(SETTINGS)).weight.max() == 0.0
 
 
 @given(turn=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))
@@ -176,8 +175,30 @@ def test_trails_are_part_of_a_snapshot():
 def test_where_trails_part_the_place_is_less_certain():
     """A car that is hidden at a fork of two trails may be on either."""
     trails = along(*arc(np.arange(-20, 40, 1.0)))
-    before = path(trails).disagreement[0]
+    before = path(trails)
     for p in np.arange(-20, 40, 1.0):
         trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]))
-    assert before == pytest.approx(0.0, abs=1e-9)
-    assert path(trails, *(each[0] for each in arc(np.array([6.0])))).disagreement[0] > 0.01
+    at_the_fork = path(trails, *(each[0] for each in arc(np.array([6.0]))))
+    assert before.certainty[0] > 0.7 > 0.0 == path(Trails(SETTINGS)).certainty[0]
+    assert before.disagreement == pytest.approx(0.0, abs=1e-9)
+    assert at_the_fork.disagreement > 0.01
+    assert at_the_fork.certainty < 0.9 * before.certainty
+
+
+def test_a_hidden_car_takes_on_the_speed_of_earlier_traffic():
+    """One car slows down from 10 to 5 m/s between 0 and 30 m, the other is hidden at 0 m and does the same."""
+    x, speed, t = -30.0, 10.0, 0.0
+    slow, fast = Tracker(ON, SENSORS), Tracker(replace(ON, trails=TrailSettings()), SENSORS)
+    places = []
+    while t < 9.0:
+        places.append(x)
+        x, speed, t = x + DT * speed, float(np.interp(x, [0.0, 30.0], [10.0, 5.0])), t + DT
+    behind, gap = 30, 25  # frames
+    hidden = behind + int(np.searchsorted(places, 0.0))
+    for k in range(hidden + gap):
+        seen = [places[k], *([places[k - behind]] if behind <= k < hidden else [])]
+        for tracker in (slow, fast):
+            tracker.step(frame(k * DT, [(p, 0.0) for p in seen], yaw=0.0))
+    truth = places[hidden + gap - 1 - behind]
+    off = [abs(tracker.tracks((hidden + gap - 1) * DT).boxes.position[1, 0] - truth) for tracker in (slow, fast)]
+    assert off[0] < 0.92 * off[1], "from one vehicle alone"

@@ -1,0 +1,64 @@
+"""Predicted paths of nodes: where others are along the way of a vehicle, and beside it.
+
+A path is a polyline from the node on, and straight beyond both ends. A node without one goes straight along its
+heading.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.polyline import feet
+
+
+@dataclass(frozen=True, eq=False)
+class Paths(Columns):
+    """k paths of m steps: rows (k,) of the nodes, ascending; position (k, m + 1, 2), m; heading (k, m + 1), rad.
+
+    speed, weight    (k, m + 1) typical speed of earlier traffic there, m/s, and the weight of what it is known from,
+                     against 1 for no more than one's own speed
+    certainty        (k,) from 0 to 1 with which earlier traffic tells the course where the path begins
+    disagreement     (k,) variance of its headings there, rad^2
+    """
+
+    row: IntArray
+    position: FloatArray
+    heading: FloatArray
+    speed: FloatArray
+    weight: FloatArray
+    certainty: FloatArray
+    disagreement: FloatArray
+
+
+class Along(NamedTuple):
+    """Places of E nodes on the paths of others: ahead along the path, m, aside to its left, m, its direction there (E,)
+    rad, and whether it is a predicted one."""
+
+    ahead: FloatArray
+    aside: FloatArray
+    direction: FloatArray
+    predicted: BoolArray
+
+
+def along_paths(
+    position: FloatArray, heading: FloatArray, paths: Paths | None, target: IntArray, source: IntArray
+) -> Along:
+    """Places of nodes `source` (E,) on the paths of nodes `target` (E,); position (n, 2), heading (n,) of all nodes."""
+    dx, dy = (position[source] - position[target]).T
+    direction = heading[target]
+    c, s = np.cos(direction), np.sin(direction)
+    ahead, aside = dx * c + dy * s, dy * c - dx * s
+    predicted = np.zeros(len(target), dtype=np.bool_)
+    if paths is not None and len(paths):
+        line = np.minimum(np.searchsorted(paths.row, target), len(paths) - 1)
+        predicted = paths.row[line] == target
+        bent = np.flatnonzero(predicted)
+        at = feet(paths.position[line[bent]], position[source[bent]])
+        ahead[bent], aside[bent] = at.s, at.e
+        direction[bent] = np.arctan2(at.direction[:, 1], at.direction[:, 0])
+    return Along(ahead, aside, direction, predicted)
