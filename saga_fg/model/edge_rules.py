@@ -34,6 +34,7 @@ from saga_fg.settings import (
     settings_group,
 )
 
+_MOST_COMPARED = 250_000  # pairs that are compared one by one; a tree is faster beyond
 _LEAST = 1e-9  # probability that a certain object does not exist
 Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
@@ -279,8 +280,13 @@ def pairs_within(
     to, of = np.flatnonzero(targets), np.flatnonzero(sources)
     if len(to) == 0 or len(of) < 2:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    near = cKDTree(position[to]).sparse_distance_matrix(cKDTree(position[of]), radius, output_type="ndarray")
-    target, source = to[near["i"]], of[near["j"]]
+    if len(to) * len(of) <= _MOST_COMPARED:
+        (x, y), (x_of, y_of) = position[to].T, position[of].T
+        i, j = np.nonzero((x[:, None] - x_of) ** 2 + (y[:, None] - y_of) ** 2 <= radius**2)
+    else:
+        near = cKDTree(position[to]).sparse_distance_matrix(cKDTree(position[of]), radius, output_type="ndarray")
+        i, j = near["i"], near["j"]
+    target, source = to[i], of[j]
     different = target != source
     return target[different], source[different]
 

@@ -174,8 +174,8 @@ def test_two_half_steps_settle_as_one():
 
 
 def test_an_uncertain_course_keeps_its_variance_across():
-    """At last the velocity across has the variance |v|^2 var(h), besides that of the lateral acceleration."""
-    speed, k, variance, dt = 8.0, 1.5, 0.01, 0.01
+    """At last the velocity across has the variance s^2, besides that of the lateral acceleration."""
+    speed, k, variance, dt = 8.0, 1.5, 0.64, 0.01
     quiet = NodeType("car", Curvilinear(acceleration_noise=0.0, lateral_acceleration_noise=0.0, jerk_noise=0.0))
     none, mean = np.zeros(1), np.array([[0, 0, speed, 0, 0, 0]])
     record = KnownCourses.of(quiet, np.array([7]), none, none, none, mean, dt, np.array([k]), np.array([variance]))
@@ -183,4 +183,22 @@ def test_an_uncertain_course_keeps_its_variance_across():
     P_across = 0.0
     for _ in range(1000):
         P_across = F[3, 3] ** 2 * P_across + Q[3, 3]
-    assert P_across == pytest.approx(speed**2 * variance, rel=0.05)
+    assert P_across == pytest.approx(variance, rel=0.05)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_an_acceleration_to_the_speed_of_traffic_acts_along_the_course(rate):
+    """The mean gains pull dt of speed and pull dt^2 / 2 of way; the covariance is that without it."""
+    dt, pull = 0.1, np.array([-1.5])
+    quiet = NodeType("car", Curvilinear())
+    none, mean = np.zeros(1), np.array([[0, 0, 8.0, 0, 0, 0]])
+    with_it, without = (
+        own(KnownCourses.of(quiet, np.array([7]), none, none + rate, none, mean, dt, pull=p), dt, quiet)
+        for p in (pull, None)
+    )
+    for a, b in ((with_it[0], without[0]), (with_it[2], without[2])):
+        assert np.array_equal(a, b)
+    change = with_it[1] - without[1]
+    assert np.hypot(*change[2:4]) == pytest.approx(1.5 * dt)
+    assert np.hypot(*change[:2]) == pytest.approx(1.5 * dt**2 / 2, rel=0.01)
+    assert change[2:4] @ [np.cos(rate * dt), np.sin(rate * dt)] == pytest.approx(-1.5 * dt, rel=1e-3)
