@@ -166,7 +166,7 @@ def test_csv_and_ndjson_agree(tmp_path_factory: pytest.TempPathFactory, table: l
 HEAD = "timestamp,x,y,z,length,score,label\n0,1,1,1,1,1,car\n"
 OPEN_QUOTE = "expected comma-separated values: a quote is opened and not closed on this line"
 BROKEN_CSV = [
-    ("", "expected a column 'timestamp', the columns there are none"),
+    ("", "expected a column 'timestamp' and a column 'x' and a column 'y', the columns there are none"),
     ("timestamp,x,y\n", "expected at least one row"),
     ("timestamp,x\n0,1\n", "expected a column 'y', the columns there are timestamp, x"),
     ("timestamp,x,y,lenght\n0,1,1,4\n", "unknown column 'lenght'; did you mean 'length'"),
