@@ -45,6 +45,8 @@ NumPy archives (.npz, without pickled objects) have an array for each column, al
 
     np.savez("detections.npz", timestamp=[0.0, 0.1], x=[10.2, 0.0], y=[3.1, 0.0], empty=[False, True])
 
+Tables of true objects have the columns of tracks, and `visible`: 0 for objects that no sensor can see.
+
 Parquet, Feather and Arrow files have the same columns (extra [parquet]).
 
 Tracks are written with the same columns and, besides, id, cov_xx, cov_xy, cov_yy (covariance of the horizontal
@@ -55,12 +57,14 @@ from data_tools.datasets.detection_files.dataset import DetectionFile, read_dete
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.track_rows import TrackRows, read_tracks
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
+from data_tools.datasets.detection_files.truth import TruthFile
 
 __all__ = [
     "TRACK_COLUMNS",
     "DetectionFile",
     "TableImport",
     "TrackRows",
+    "TruthFile",
     "read_detections",
     "read_scenes_in_parts",
     "read_tracks",

@@ -29,7 +29,7 @@ _ALIASES = {
     "length": "l len size_x size_l dim_x dimension_x dimensions_x box_length",
     "width": "w size_y size_w dim_y dimension_y dimensions_y box_width",
     "height": "h size_z size_h dim_z dimension_z dimensions_z box_height",
-    "yaw": "heading theta yaw_angle heading_angle rotation_z rot_z orientation",
+    "yaw": "heading hdg theta yaw_angle heading_angle rot_z orientation",
     **{f"v{axis}": _SPEED.replace("#", axis) for axis in "xy"},
     "score": "confidence conf prob probability detection_score tracking_score existence",
     "label": "class category type class_name object_type object_class obj_type obj_class cls classification "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,9 +13,12 @@ import numpy as np
 from data_tools.datasets.detection_files.column_names import Columns
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.units import ISO, Clock, factor, is_date, seconds_of_dates
+from data_tools.plausibility import headings_in_degrees
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+
+log = logging.getLogger(__name__)
 
 REQUIRED = ("timestamp", "x", "y")
 BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score")
@@ -73,8 +77,8 @@ class RawTable:
         A yaw may come from the columns of a quaternion. Raises `InputError` for anything else.
         """
         if name not in self.columns:
-            if all(part in self.columns for part in ROTATIONS.get(name, ("",))):
-                return self._yaw_of_quaternions(ROTATIONS[name])
+            if any(part in self.columns for part in ROTATIONS.get(name, ())):
+                return self._yaw_of_quaternions(name)
             return np.full(self.length, default)
         if name not in self._read:
             self._read[name] = self._in_our_unit(name)
@@ -93,6 +97,12 @@ class RawTable:
                 faults.append(str(error).removeprefix(f"{self.path}: "))
         if faults:
             raise InputError(f"{self.path}: {'; '.join(faults)}")
+
+    def warn_of_headings(self) -> None:
+        """Warn where headings look like degrees; they are wrapped later on, and cannot be told then."""
+        doubt = headings_in_degrees(self.numbers("yaw"))
+        if doubt is not None:
+            log.warning("%s: %s", self.path, doubt.text(options=True))
 
     def texts(self, name: str, default: str) -> StrArray:
         """A column (N,) of names; `default` where left out. A whole number is a name too, but in NumPy archives.
@@ -187,17 +197,24 @@ class RawTable:
         row = next(row for row, value in enumerate(values) if value is not None and not _is_number(value, kinds))
         raise self.fault(row, f"{self.title(name)}: expected a number, got {str(values[row])[:40]!r}")
 
-    def _yaw_of_quaternions(self, names: Sequence[str]) -> FloatArray:
-        """Heading (N,) of rotations w, x, y, z; NaN where one is left out."""
-        parts = np.stack([self.numbers(name) for name in names], axis=-1)
+    def _yaw_of_quaternions(self, name: str) -> FloatArray:
+        """Heading (N,) of rotations w, x, y, z, of which x and y may be missing; NaN where one is left out."""
+        names = ROTATIONS[name]
+        w, _, _, z = (part in self.columns for part in names)
+        if not (w and z):
+            there = next(part for part in names if part in self.columns)
+            theirs = self.found.names.get(there, there)
+            mend = f"if it is the heading: --columns {name}={theirs}"
+            raise InputError(f"{self.path}: {self.title(there)}: expected {' '.join(names)} with it; {mend}")
+        parts = np.stack([self.numbers(part, np.nan if part in self.columns else 0.0) for part in names], axis=-1)
         known = np.flatnonzero(np.isfinite(parts).all(axis=1))
         yaw = np.full(self.length, np.nan)
         norm = np.linalg.norm(parts[known], axis=1)
         odd = np.abs(norm - 1) > 0.01
         if odd.any():
             at = int(np.argmax(odd))
-            names_here = " ".join(self.title(name) for name in names)
-            raise self.fault(int(known[at]), f"{names_here}: expected a quaternion of length 1, got {norm[at]:g}")
+            text = f"{' '.join(names)}: expected a quaternion of length 1, got {norm[at]:g}"
+            raise self.fault(int(known[at]), text)
         unit = checked_quaternions(" ".join(names), parts[known] / norm[:, None])
         yaw[known] = yaw_of(quaternion_rotation(unit))
         return yaw

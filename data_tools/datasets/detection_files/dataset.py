@@ -119,7 +119,10 @@ def read_detections(path: str | Path, how: TableImport | None = None) -> Detecti
 
     Raises `InputError` naming file, row and column.
     """
-    return DetectionFile(read_raw_table(Path(path), how=how))
+    raw = read_raw_table(Path(path), how=how)
+    table = DetectionFile(raw)
+    raw.warn_of_headings()
+    return table
 
 
 def read_scenes_in_parts(
@@ -136,6 +139,8 @@ def read_scenes_in_parts(
     name, latest, with_poses = "", -np.inf, None
     for table in read_raw_parts(Path(path), how=how, rows=rows):
         part = DetectionFile(table)
+        if with_poses is None:
+            table.warn_of_headings()
         if with_poses not in (None, part.with_poses):
             raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
         with_poses = part.with_poses

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from data_tools.datasets.detection_files.dataset import box_columns
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
-from saga_fg.numerics.arrays import FloatArray, StrArray, from_upper_triangle
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, from_upper_triangle
 from saga_fg.types.boxes import Boxes
 
 REQUIRED = ("timestamp", "id", "x", "y")
@@ -38,6 +38,14 @@ class TrackRows:
     coasting: FloatArray
     named: bool = True
 
+    def select(self, rows: IntArray) -> TrackRows:
+        """Some of the rows."""
+        return replace(
+            self,
+            **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("boxes", "named")},
+            boxes=self.boxes.select(rows),
+        )
+
 
 def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool = False) -> TrackRows:
     """Read a table of tracks in any of the formats of detections. Raises `InputError` naming file, row and column.
@@ -55,6 +63,7 @@ def track_rows_of(raw: RawTable) -> TrackRows:
     _, left_out = raw.labels()
     kept = np.flatnonzero(~left_out)
     found = box_columns(raw, left_out)
+    raw.warn_of_headings()
     timestamp = raw.numbers("timestamp")
     if np.isnan(timestamp).any():
         row = int(np.argmax(np.isnan(timestamp)))
