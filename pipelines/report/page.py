@@ -53,7 +53,7 @@ def report_page(report: Report) -> str:
         ("CONFIGURATION", configuration),
         ("STYLE", _part("page.css")),
         ("DATA", _packed(data)),
-        ("SCRIPT", _part("charts.js") + _part("road.js") + _part("player.js")),
+        ("SCRIPT", _part("charts.js") + _part("road.js") + _part("fans.js") + _part("player.js")),
     ):
         page = page.replace(f"<!--{mark}-->", text)
     return page

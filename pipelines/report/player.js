@@ -1,7 +1,12 @@
 const $ = id => document.getElementById(id);
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, SCORE = 9, XX = 10, XY = 11, YY = 12, COASTING = 13;
 const ELLIPSE_95 = 5.991, TRAIL = 3, COASTS = 150;  // chi-square with 2 degrees of freedom; s; ms
-const LAYERS = {road: "road", truth: "true objects", detections: "detections", tracks: "tracks", ids: "ids", trails: "trails", ellipses: "ellipses", edges: "edges"};
+const LAYERS = {road: "road", truth: "true objects", detections: "detections", tracks: "tracks", ids: "ids", trails: "trails", ellipses: "ellipses", edges: "edges", fans: "predictions"};
+
+function ellipse(xx, xy, yy) {  // half axes and angle of the 95 % ellipse of a covariance
+  const middle = (xx + yy) / 2, spread = Math.hypot((xx - yy) / 2, xy);
+  return [Math.sqrt(ELLIPSE_95 * (middle + spread)), Math.sqrt(ELLIPSE_95 * Math.max(0, middle - spread)), Math.atan2(2 * xy, xx - yy) / 2];
+}
 
 async function unpack(text) {
   const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -11,6 +16,7 @@ async function unpack(text) {
 
 function player(scenes, start) {
   const canvas = $("view"), g = canvas.getContext("2d");
+  const horizons = new Set(scenes.flatMap(s => Object.values(s.methods)).flatMap(m => m.horizons));  // chosen ones, ms
   const shown = Object.fromEntries(Object.keys(LAYERS).map(name => [name, name !== "ids"]));
   let scene = scenes[0], k = 0, picked = null, timer = null, zoom = 9, offset = [0, 0], hatching = null;
 
@@ -25,8 +31,15 @@ function player(scenes, start) {
     $("method").hidden = names.length < 2;
     $("time").max = last();
     $("show-road").parentElement.hidden = !scene.road;
-    picked = null;
+    chooseMethod();
     show(0);
+  }
+
+  function chooseMethod() {
+    picked = null;
+    $("show-fans").parentElement.hidden = !method().horizons.length;
+    fanHorizons($("horizons"), method().horizons, horizons, draw);
+    draw();
   }
 
   function show(moment) {
@@ -92,6 +105,7 @@ function player(scenes, start) {
     }
     if (shown.trails) drawTrails(tracks, thin);
     if (shown.edges) drawEdges(tracks, thin);
+    if (shown.fans) drawFans(g, method().predictions[k] ?? [], tracks, horizons, picked, thin, colourOf);
     if (shown.ellipses) for (const row of tracks) drawEllipse(row, thin);
     if (shown.tracks) for (const row of tracks) drawTrack(row, thin);
     if (shown.ids) drawIds(tracks);
@@ -136,10 +150,8 @@ function player(scenes, start) {
 
   function drawEllipse(row, thin) {
     if (row[XX] === null) return;
-    const [a, b, d] = [row[XX] / 1e4, row[XY] / 1e4, row[YY] / 1e4];
-    const middle = (a + d) / 2, spread = Math.hypot((a - d) / 2, b), angle = Math.atan2(2 * b, a - d) / 2;
     g.strokeStyle = colourOf(row[ID]); g.globalAlpha = .4; g.lineWidth = thin; g.beginPath();
-    g.ellipse(row[X] / 100, row[Y] / 100, Math.sqrt(ELLIPSE_95 * (middle + spread)), Math.sqrt(ELLIPSE_95 * Math.max(0, middle - spread)), angle, 0, 7);
+    g.ellipse(row[X] / 100, row[Y] / 100, ...ellipse(row[XX] / 1e4, row[XY] / 1e4, row[YY] / 1e4), 0, 7);
     g.stroke(); g.globalAlpha = 1;
   }
 
@@ -245,7 +257,7 @@ function player(scenes, start) {
   window.onresize = draw;
   $("play").onclick = play;
   $("time").oninput = () => show(+$("time").value);
-  $("method").onchange = () => { picked = null; draw(); };
+  $("method").onchange = chooseMethod;
   $("scene").onchange = () => chooseScene($("scene").selectedIndex);
   $("scene").append(...scenes.map(s => new Option(s.name)));
   for (const [name, text] of Object.entries(LAYERS)) {
