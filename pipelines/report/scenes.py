@@ -9,8 +9,8 @@
     object     [class, x, y, length, width, yaw, visible]
     detection  [class, x, y, length, width, yaw, score]
 
-Lengths in cm, yaw in mrad, velocities in cm/s, scores and rates in thousandths, covariances in cm^2, coasting and horizons in ms;
-null is unknown. `ids`, `labels` are counted from 0.
+Lengths in cm, yaw in mrad, velocities in cm/s, scores and rates in thousandths, covariances in cm^2, coasting and
+horizons in ms; null is unknown. `ids`, `labels` are counted from 0.
 """
 
 from __future__ import annotations

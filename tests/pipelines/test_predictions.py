@@ -151,6 +151,7 @@ TRY = """
   time.value = 15; time.oninput();
   const pictures = [view.toDataURL()];
   const press = id => { document.getElementById(id).click(); pictures.push(view.toDataURL()); };
+  press("show-confirmed"); pictures.shift();
   press("horizon-2000"); press("horizon-500"); press("show-fans");
   found.pictures = pictures.map(one => pictures.indexOf(one));
   found.switches = document.getElementById("horizons").textContent;
@@ -161,5 +162,5 @@ def test_fans_are_drawn_in_a_browser(run, tmp_path: Path):
     page = report_page(Report("fans", [], [scene_of_run({"saga": run}, (), CONFIG.sensors)]))
     found = tried_in_browser(page, TRY, tmp_path)
     assert found["faults"] == []
-    assert found["switches"] == " 0.5 s 2 s"
+    assert found["switches"] == " 0.5 s ahead 2 s ahead"
     assert found["pictures"] == [0, 1, 2, 2]  # without horizons there is nothing more to switch off

@@ -36,7 +36,10 @@ SUFFIX = ".predictions.csv"
 
 @dataclass(frozen=True, eq=False)
 class PredictionRows(Columns):
-    """R predicted positions: moment (R,), s, horizon (R,), s, id (R,), position (R, 2), m, covariance (R, 2, 2), m^2."""
+    """R predicted positions.
+
+    timestamp (R,) of the moment, s; horizon (R,), s; id (R,); position (R, 2), m; covariance (R, 2, 2), m^2
+    """
 
     timestamp: FloatArray
     horizon: FloatArray
