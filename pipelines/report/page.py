@@ -19,7 +19,7 @@ from pipelines.report.charts import Chart
 from pipelines.report.scenes import ReportScene, scene_data
 from pipelines.report.thresholds import start_thresholds
 
-SCRIPTS = ("charts.js", "road.js", "layers.js", "filters.js", "panel.js", "player.js")
+SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "player.js")
 
 
 @dataclass(frozen=True, eq=False)

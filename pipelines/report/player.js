@@ -40,6 +40,7 @@ function player({scenes, start, thresholds, ghosts}) {
   function chooseMethods() {
     if (picked && !names().includes(picked.method)) picked = null;
     filters.showScores(names());
+    showHorizons(names().map(name => scene.methods[name]), draw);
     draw();
   }
 
