@@ -17,7 +17,7 @@ def test_a_clone_has_its_pages() -> None:
     run = CliRunner().invoke(app, ["docs", "guides/stream"])
     assert run.exit_code == 0
     assert Path(run.stdout.strip()).read_text(encoding="utf-8").startswith("# ")
-    with pytest.raises(InputError, match="unknown page 'formatz'.*formats"):
+    with pytest.raises(InputError, match=r"unknown page 'formatz'.*formats"):
         location("formatz", PAGES)
 
 
