@@ -32,10 +32,10 @@ def location(page: str, folder: Path) -> str:
     """Return the path of a page in `folder`, or its address. Raises `InputError` for a page that a clone lacks."""
     known = {path.relative_to(folder).with_suffix("").as_posix(): path for path in sorted(folder.rglob("*.md"))}
     if known and page not in known:
-        raise InputError(unknown_name("page", page, list(known)))
+        raise InputError(unknown_name("page", page, tuple(known)))
     return str(known[page]) if known else f"{_address()}/{page}.md"
 
 
 def _address() -> str:
-    urls = dict(entry.split(", ", 1) for entry in metadata("saga-fg").get_all("Project-URL", []))
+    urls: dict[str, str] = dict(entry.split(", ", 1) for entry in metadata("saga-fg").get_all("Project-URL", []))
     return urls["Documentation"]
