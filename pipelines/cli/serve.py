@@ -70,7 +70,7 @@ def serve(
     """Track live: detections in, tracks out, as newline-delimited JSON.
 
     One line is one frame of one sensor; every frame is answered with the tracks at its time. A line that cannot be
-    used is answered with what is wrong, counted and skipped. docs/guides/stream.md describes the messages.
+    used is answered with what is wrong, counted and skipped. `saga-fg docs guides/stream` has the messages.
 
     SIGTERM and Ctrl-C finish what has come in, with a bound on the time; the exit code is then 143 or 0.
 
