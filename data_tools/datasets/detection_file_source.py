@@ -22,7 +22,7 @@ class DetectionFileSource(DatasetSource):
     """Your own detections: a table with a row for each.
 
     The columns timestamp (s), x and y (m) are needed; label, score, sensor, size, heading and more are used where they
-    are there (see docs/formats.md).
+    are there (see `saga-fg docs formats`).
     """
 
     name = "file"

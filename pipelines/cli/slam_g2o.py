@@ -64,7 +64,7 @@ def g2o(
     from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
     from pipelines.slam.results import write_pose_graph
     from saga_fg.errors import InputError
-    from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
+    from saga_fg.slam.pose_graph import graph_error, optimise_poses
 
     if robust is not None and certify:
         raise InputError("--certify: expected without --robust, the proof is for squared errors")
@@ -75,11 +75,13 @@ def g2o(
     check_writable_folder(output)
     loss = None if robust is None else Robust(robust, robust_scale)
     graph = read_g2o(file)
+    if compare and not graph.poses_alone:
+        raise InputError(f"--compare: expected a graph of poses alone, {file} has landmarks or priors")
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         rows = _rows(covariances, graph.ids)
         optimised = optimise_poses(graph, loss, certify)
         blocks = optimised.covariances(rows)
-    guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
+    guess = graph_error(graph, loss)
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):
@@ -87,6 +89,9 @@ def g2o(
             errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
     write_pose_graph(output, graph, optimised, rows, blocks, errors)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
+    if graph.landmarks is not None:
+        poses += f", {counted(len(graph.landmarks.ids), 'landmark')}"
+        edges = counted(len(graph.first) + sum(len(seen.pose) for seen in graph.landmarks.observations), "measurement")
     typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (at the start {guess:.6g})")
     if (minimum := optimised.chordal) is not None:
         proven = "the global minimum" if minimum.certified else "not proven to be the global minimum"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.datasets.detection_files import read_predictions
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable
@@ -41,10 +42,11 @@ def result_report(source: DatasetSource, result: Path) -> Report:
 def result_scenes(source: DatasetSource, result: Path, found: Mapping[str, SceneResult]) -> list[ReportScene]:
     """Return the scenes of a result, with edges by the rules of the dataset's default configuration.
 
-    Raises `InputError` for a broken record of the run.
+    Raises `InputError` for a broken record of the run, or broken predictions.
     """
     record, config = read_run_record(result), load_config(source.family)
     method = record.method if record is not None else "tracks"
+    predicted = read_predictions(result)
     return [
         ReportScene(
             each.scene,
@@ -52,6 +54,7 @@ def result_scenes(source: DatasetSource, result: Path, found: Mapping[str, Scene
             {} if each.coasting is None else {method: each.coasting},
             config.tracker.edges,
             config.sensors,
+            {method: predicted[name]} if name in predicted else {},
         )
-        for each in found.values()
+        for name, each in found.items()
     ]

@@ -146,9 +146,13 @@ def write_pose_graph(
         names = ("cost", "bound", "gap", "certified", "eigenvalue", "dimensions")
         figures["chordal"] = {name: getattr(minimum, name) for name in names}
     paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
+    best, points = graph.at(optimised.world_T_pose), {}
+    if graph.landmarks is not None and optimised.landmarks is not None:
+        best = best.with_landmarks(graph.landmarks.at(optimised.landmarks))
+        points = {"landmarks": optimised.landmarks}
     with atomic_directory(output) as folder:
-        write_g2o(folder / "poses.g2o", graph.at(optimised.world_T_pose))
+        write_g2o(folder / "poses.g2o", best)
         if len(rows):
             write_covariances(folder / "covariances.csv", "id", graph.ids[rows].tolist(), covariances)
         write_figures(folder / "errors.json", figures)
-        write_bytes(folder / "above.png", png(paths_from_above(paths)))
+        write_bytes(folder / "above.png", png(paths_from_above(paths, points)))
