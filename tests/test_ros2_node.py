@@ -52,7 +52,8 @@ class StandinBuffer:
 def node(monkeypatch):
     def module(name, **content):
         made = ModuleType(name)
-        made.__dict__.update(content)
+        for key, value in content.items():
+            setattr(made, key, value)
         monkeypatch.setitem(sys.modules, name, made)
 
     messages = {"DetectedObjects": SimpleNamespace, "TrackedObjects": SimpleNamespace}
