@@ -62,7 +62,7 @@ def node(monkeypatch):
     module("rclpy.time", Time=SimpleNamespace(from_msg=lambda stamp: stamp))
     module("autoware_perception_msgs")
     module("autoware_perception_msgs.msg", **messages)
-    module("rosidl_runtime_py", set_message_fields=lambda message, content: vars(message).update(content))
+    module("rosidl_runtime_py", set_message_fields=lambda message, content: message.__init__(**content))
     listener = {"TransformListener": lambda buffer, node: None, "TransformException": LookupFailedError}
     module("tf2_ros", Buffer=StandinBuffer, **listener)
     spec = importlib.util.spec_from_file_location("ros2_node", SOURCE)
