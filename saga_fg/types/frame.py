@@ -15,6 +15,8 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements
+from saga_fg.types.html_table import html_table
+from saga_fg.types.pandas_tables import Table, boxes_of_table
 from saga_fg.types.road_map import RoadMap
 
 Coordinates = Literal["world", "ego", "sensor"]
@@ -95,6 +97,15 @@ class Detections(Columns):
         return cls(boxes, score, rate, covariance)
 
     @classmethod
+    def from_pandas(cls, table: Table) -> Self:
+        """Return the rows of a `pandas.DataFrame` as detections of one moment.
+
+        Columns: x, y, and where known z, length, width, height (m), yaw (rad), vx, vy (m/s), range_rate (m/s), score or
+        confidence, label or class. Missing values are unknown. Raises `InputError` naming the column.
+        """
+        return cls(*boxes_of_table(table))
+
+    @classmethod
     def empty(cls) -> Self:
         return cls(Boxes.empty(), np.empty(0))
 
@@ -118,6 +129,18 @@ class Detections(Columns):
 
     def __iter__(self) -> Iterator[Detection]:
         return (self[row] for row in range(len(self)))
+
+    def _repr_html_(self) -> str:
+        columns = (
+            self.boxes.label,
+            *self.boxes.position[:, :2].T,
+            *self.boxes.size[:, :2].T,
+            self.boxes.yaw,
+            self.score,
+        )
+        rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        names = ("class", "x, m", "y, m", "length, m", "width, m", "yaw, rad", "score")
+        return html_table(f"{len(self)} detections", names, rows)
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""
