@@ -134,6 +134,11 @@ class DatasetSource(ABC):
     merged: ClassVar[tuple[str, str]] = ("", "")
 
     @property
+    def title(self) -> str:
+        """What the recordings are called above a report."""
+        return self.name
+
+    @property
     def tracks_suffix(self) -> str:
         """Suffix of the result of one part, in parallel runs."""
         return ".csv"

@@ -19,24 +19,32 @@ def _report(
     source: DatasetSource,
     result: options.Result,
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")],
+    beside: Annotated[
+        Path | None,
+        typer.Option("--beside", help="Another result of the same recordings, to show side by side.", metavar="RESULT"),
+    ] = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Make a page of a tracking result: a player, charts, and figures where there is ground truth."""
+    """Make a page of a tracking result: a player, charts, and figures, of errors where there is ground truth."""
     from data_tools.files.atomic_files import check_writable, write_text
     from pipelines.report import report_page, result_report
     from saga_fg.errors import InputError
 
-    options.apart(output, result, *source.input_files())
+    options.apart(output, result, *([] if beside is None else [beside]), *source.input_files())
     if output.suffix not in (".html", ".htm"):
         raise InputError(f"{output}: expected a file name that ends in .html")
     check_writable(output)
     with working("making the page"):
-        page = report_page(result_report(source, result))
+        page = report_page(result_report(source, result, beside))
         write_text(output, page)
     typer.echo(f"{output}: {len(page) / 1e6:.1f} MB")
 
 
-_commands = dataset_commands("report", _report, ("report {result} --output report.html",))
+_commands = dataset_commands(
+    "report",
+    _report,
+    ("report {result} --output report.html", "report {result} --beside other/{tracks} --output report.html"),
+)
 report_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 
 
