@@ -46,12 +46,12 @@ class Polylines(NamedTuple):
     @classmethod
     def of(cls, lines: Sequence[FloatArray]) -> Self:
         """Polylines (k, 2) of one piece at least, of points apart."""
-        none = np.empty((0, 2)), np.empty((0, 2)), *[np.empty(0)] * 5
-        parts = [none, *map(_pieces, lines)]
+        parts = [_pieces(np.zeros((1, 2))), *map(_pieces, lines)]  # none, and those of each line
+        start, t, low, high, before, middle, angle = (np.concatenate(column) for column in zip(*parts, strict=True))
         pieces = np.array([len(line) - 1 for line in lines], dtype=np.int64)
         length = np.array([np.hypot(*np.diff(line, axis=0).T).sum() for line in lines])
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        return cls(*columns, np.cumsum(pieces) - pieces, pieces, length, np.cumsum(length + 1) - length)
+        first, base = np.cumsum(pieces) - pieces, np.cumsum(length + 1) - length
+        return cls(start, t, low, high, before, middle, angle, first, pieces, length, base)
 
     def __len__(self) -> int:
         return len(self.length)
@@ -107,6 +107,6 @@ def _pieces(line: FloatArray) -> tuple[FloatArray, ...]:
     length = np.hypot(*step.T)
     end = np.cumsum(length)
     low, high = np.zeros(len(step)), length.copy()
-    low[0], high[-1] = -np.inf, np.inf
+    low[:1], high[-1:] = -np.inf, np.inf
     angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     return line[:-1], step / length[:, None], low, high, end - length, end - length / 2, angle
