@@ -32,7 +32,7 @@ class DetectionFileSource(DatasetSource):
     """Your own detections: a table with a row for each.
 
     Time, x and y (m) are needed; label, score, sensor, size, heading and more are used where they are there. Columns,
-    classes and units may be those of your own: `saga-fg inspect TABLE` shows how it is understood (docs/formats.md).
+    classes and units may be your own: `saga-fg inspect TABLE` shows how it is understood (see `saga-fg docs formats`).
     """
 
     name = "file"
@@ -97,6 +97,10 @@ class DetectionFileSource(DatasetSource):
             self.sort,
         )
         return own.over(self.table_import or TableImport())
+
+    @property
+    def title(self) -> str:
+        return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
 
     @property
     def tracks_suffix(self) -> str:
