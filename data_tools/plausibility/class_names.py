@@ -25,8 +25,10 @@ _LARGE = re.compile(r"large|heavy")
 
 def usual_class(name: str) -> str | None:
     """Our class that a name means, such as "car" for REGULAR_VEHICLE; None for a name that means none of them."""
-    words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
-    found = {_WORD_OF[word] for word in words if word in _WORD_OF}
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    found: set[str] = set()
+    for text in (name, parted):
+        found = found or {_WORD_OF[word] for word in re.findall(r"[a-z]+", text.lower()) if word in _WORD_OF}
     if "car" in found and _LARGE.search(name.lower()):
         found.add("truck")
     return next((ours for ours in _ORDER if ours in found), None)

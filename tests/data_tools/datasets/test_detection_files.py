@@ -368,7 +368,7 @@ def test_a_table_of_tracks_names_what_is_wrong_in_it(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tracks\.csv: expected a column 'id'"):
         read_tracks(path)
     path.write_text("timestamp,id,x,y,cov_xx\n0,1,2,3,4\n0,,2,3,4\n")
-    with pytest.raises(InputError, match=r"tracks\.csv: line 3: id: expected a number, got none"):
+    with pytest.raises(InputError, match=r"tracks\.csv: line 3: id: expected a name or a whole number, it is left out"):
         read_tracks(path)
     path.write_text("timestamp,id,x,y,cov_zx\n0,1,2,3,4\n")
     with pytest.raises(InputError, match="unknown column 'cov_zx'; did you mean"):
