@@ -20,6 +20,7 @@ from saga_fg.types.track import known_velocities
 log = logging.getLogger(__name__)
 
 _SAME_TIME = 1e-4  # s
+_FEW = 0.1  # of the moments, which a tracker may need to begin
 _NEAR_TIME = 0.02  # s between a moment of the truth and the tracks of another clock
 
 
@@ -111,7 +112,7 @@ def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
     moved = np.array([moment_of.get(time, np.nan) for time in rows.timestamp[mine].tolist()])
     kept = np.isfinite(moved)
     missing = int((~near).sum())
-    if missing:
+    if missing > _FEW * len(scene):
         log.warning("%s: scene %s: no tracks at %d of %d moments of the truth", path, scene.name, missing, len(scene))
     return replace(rows.select(mine[kept]), timestamp=moved[kept])
 
