@@ -24,6 +24,7 @@ BUILT_IN = {
     "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
     "ngsim": "data_tools.simulator.recorded_source:NgsimSource",
     "openacc": "data_tools.simulator.recorded_source:OpenAccSource",
+    "mcap": "data_tools.datasets.mcap.source:McapSource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
     "simulated": "data_tools.simulator.source:SimulatedSource",
 }

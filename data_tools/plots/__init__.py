@@ -4,6 +4,7 @@ from data_tools.plots.birds_eye import Panel, birds_eye_view, png
 from data_tools.plots.maps import occupancy_picture, paths_from_above, scan_map_from_above
 from data_tools.plots.metrics import calibration_plot, error_histograms, recall_sweep
 from data_tools.plots.running_graph import running_graph_picture
+from data_tools.plots.tracks import plot
 
 __all__ = [
     "Panel",
@@ -12,6 +13,7 @@ __all__ = [
     "error_histograms",
     "occupancy_picture",
     "paths_from_above",
+    "plot",
     "png",
     "recall_sweep",
     "running_graph_picture",

@@ -3,7 +3,8 @@
     scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]],
              "horizons": [ms], "predictions": [[prediction, ...]], [] without}},
-             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see `pipelines.report.road`}
+             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see `pipelines.report.road`,
+             "map": {"areas": [[kind, ring, ...]], "lines": [[x, y, ...]]} or null, "cameras": {name: [JPEG]}}
     track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
     prediction [id, horizon, x, y, cov_xx, cov_xy, cov_yy]
     object     [class, x, y, length, width, yaw, visible]
@@ -22,9 +23,11 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.area_map import AreaMap
 from data_tools.datasets.detection_files import PredictionRows
 from data_tools.metrics import SceneBoxes
-from pipelines.report.road import road_data
+from pipelines.report.images import Thumbnails
+from pipelines.report.road import map_data, road_data
 from pipelines.tracking import TrackedScene
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
@@ -53,6 +56,7 @@ class ReportScene:
     rules     find the edges between the tracks of a moment
     sensors   models by name, which place detections in the world
     predictions  by the tracker's name, of its tracks; may be left out
+    map       of the place; cameras: thumbnails of images for each moment, by camera
     """
 
     scene: Scene
@@ -61,6 +65,8 @@ class ReportScene:
     rules: Sequence[EdgeRule] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     predictions: Mapping[str, PredictionRows] = field(default_factory=dict)
+    map: AreaMap | None = None
+    cameras: Thumbnails = field(default_factory=dict)
 
 
 def scene_of_run(
@@ -107,6 +113,8 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
             for boxes, score in zip(*shown, strict=True)
         ],
         "road": road_data(scene.frames, shown[0], origin),
+        "map": None if report.map is None else map_data(report.map, origin),
+        "cameras": dict(report.cameras),
     }
 
 

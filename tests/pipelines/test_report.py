@@ -169,7 +169,7 @@ def test_a_table_of_tracks_becomes_a_page(tmp_path: Path):
     data = data_of(page)
     assert len(data["scenes"][0]["times"]) == 30
     assert list(data["scenes"][0]["methods"]) == ["saga"]
-    assert data["charts"][0]["title"].startswith("Time in the tracker")
+    assert data["charts"][-1]["title"].startswith("Time in the tracker")
     assert "acceleration_noise" in page  # the configuration
     alone = run(app, ["report", "file", str(tracks), "--output", str(tmp_path / "alone.html")])
     assert alone.exit_code == 0, alone.output
