@@ -40,6 +40,10 @@ class DetectionFileSource(DatasetSource):
     table: Literal["csv", "ndjson"] = option("Format of the tables, in parallel.", "csv", verbs=("track",))
 
     @property
+    def title(self) -> str:
+        return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
+
+    @property
     def tracks_suffix(self) -> str:
         return f".{self.table}"
 

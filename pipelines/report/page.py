@@ -28,6 +28,7 @@ class Report:
 
     start   moment of the first scene that the player shows first
     ghosts  whether it shows tracks that nobody sees now from the start
+    beside  the method that it shows beside the last one from the start, "" for none
     """
 
     title: str
@@ -39,6 +40,7 @@ class Report:
     notes: Sequence[str] = ()
     start: int = 0
     ghosts: bool = False
+    beside: str = ""
 
 
 def report_page(report: Report) -> str:
@@ -48,6 +50,7 @@ def report_page(report: Report) -> str:
         "charts": [asdict(chart) for chart in report.charts],
         "start": report.start,
         "ghosts": report.ghosts,
+        "beside": report.beside,
         "thresholds": start_thresholds(report.scenes),
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""
