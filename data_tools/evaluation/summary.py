@@ -12,9 +12,9 @@ from data_tools.figures import FigureTable, cell
 from data_tools.metrics import LabelErrors, NuScenesTrackingMetrics, calibration, error_summary, errors_by_class
 
 LEGEND = (
-    "AMOTA: mean over all scores. score: that of the best MOTA; from it on HOTA, MOTA,\n"
-    "recall, identity switches (IDS), false boxes (FP). m, m/s: RMSE of position and\n"
-    "velocity. in 90 %: share of errors in the 90 % ellipses (right: 0.90). -: none"
+    "AMOTA: mean over all scores. score: that of the best MOTA; from it on HOTA,\n"
+    "MOTA, recall, identity switches (IDS), false boxes (FP). m, m/s: RMSE of places\n"
+    "and velocities. in 90 %: share of errors in 90 % ellipses (right: 0.90)."
 )
 _COLUMNS = ("class", "AMOTA", "HOTA", "score", "MOTA", "recall", "IDS", "FP", "m", "m/s", "in 90 %")
 _LONGEST = 14  # characters of a class

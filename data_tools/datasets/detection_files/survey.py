@@ -121,5 +121,7 @@ def _times(raw: RawTable) -> tuple[SensorTimes, ...]:
             usual = float(np.median(steps)) if len(steps) else np.nan
             pauses = int((steps > GAP * usual).sum()) if len(steps) else 0
             longest = float(steps.max()) if len(steps) else np.nan
-            found.append(SensorTimes(name, each, len(moments), *moments[[0, -1]].tolist(), usual, longest, pauses))
+            found.append(
+                SensorTimes(name, each, len(moments), float(moments[0]), float(moments[-1]), usual, longest, pauses)
+            )
     return tuple(found)
