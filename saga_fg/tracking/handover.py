@@ -28,10 +28,12 @@ import numpy as np
 
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching, least_total
+from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.initiation import unmeasured_velocity
 from saga_fg.tracking.relinking import area, least_log_odds, log_survival
 from saga_fg.tracking.tracker_state import TrackerState
+
+_FARTHEST = 200.0  # squared distance of two positions from which not even the narrowest densities join tracks
 
 
 def hand_over(state: TrackerState, matching: Matching) -> Matching:
@@ -69,16 +71,25 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     i, j = np.nonzero(
         same(table.label[new], table.label[old]) & (table.last_detected[old] < table.initiated[new][:, None])
     )
-    return new[i], old[j], others[i]
+    near = _near(state, new[i], old[j])
+    return new[i[near]], old[j[near]], others[i[near]]
+
+
+def _near(state: TrackerState, new: IntArray, old: IntArray) -> IntArray:
+    """Which pairs (k,) are near enough, moving or stationary, for their densities to count at all."""
+    now, still = state.kinematics(), state.table.stationarity
+    moving, _ = mahalanobis_of_pairs(now.position[new] - now.position[old], now.P[new] + now.P[old])
+    stationary, _ = mahalanobis_of_pairs(still.position[new] - still.position[old], still.P[new] + still.P[old])
+    return np.flatnonzero(np.minimum(moving, stationary) < _FARTHEST)
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
     """(k,) logs of `moving` and `stationary`, see the module."""
     table, stationarity = state.table, state.table.stationarity
-    now = state.kinematics()
-    boxes, prior = state.boxes(now.position, now.velocity).select(new), state.settings.stationarity.prior
-    _, V_0, p = unmeasured_velocity(state, boxes, prior)
-    p = np.clip(p, 1e-9, 1 - 1e-9)
+    now, prior = state.kinematics(), state.settings.stationarity.prior
+    each, of_pair = np.unique(new, return_inverse=True)  # a new track is in many pairs
+    _, V_0, p = unmeasured_velocity(state, state.boxes(now.position, now.velocity).select(each), prior)
+    V_0, p = V_0[of_pair], np.clip(p, 1e-9, 1 - 1e-9)[of_pair]
     s, s_new = (np.clip(stationarity.probability[rows], 0.0, 1 - 1e-9) for rows in (old, new))
     moving = np.log1p(-s) + np.log1p(-s_new) - np.log1p(-p)
     for node_type, rows in state.joint.rows_by_type(table.label[new]):

@@ -27,6 +27,8 @@ from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.settings import TrafficFlowSettings
 from saga_fg.tracking.track_table import TrackTable
 
+_FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
+
 
 @dataclass(frozen=True, eq=False)
 class Passages(Columns):
@@ -97,23 +99,27 @@ class TrafficFlowPrior:
             + (lateral / settings.lateral_scale) ** 2
             + (turn / settings.heading_scale) ** 2
         )
-        k = settings.weight * np.exp(-exponent / 2)
-        k = np.where((passages.label == label[:, None]) & np.isfinite(heading)[:, None], k, 0.0)
-        k = _nearest_of_each(k, passages.id)
-        still = (stationary + k @ passages.stationary) / (1 + k.sum(axis=1))
-        k = k * (1 - passages.stationary)
-        norm = 1 - stationary + k.sum(axis=1)
-        mean = k @ passages.speed / norm
-        square = passages.speed**2 + passages.variance + settings.spread**2
-        return SpeedPrior(still, mean, ((1 - stationary) * variance + k @ square) / norm - mean**2)
+        new, passage = np.nonzero(exponent < _FARTHEST)  # false where the heading is unknown
+        alike = passages.label[passage] == label[new]
+        new, passage = new[alike], passage[alike]
+        k = settings.weight * np.exp(-exponent[new, passage] / 2)
+        nearest = _nearest_of_each(new, passages.id[passage], k)
+        new, k, near = new[nearest], k[nearest], passages.select(passage[nearest])
+
+        def total(values: FloatArray) -> FloatArray:
+            return np.bincount(new, weights=values, minlength=len(label))
+
+        still = (stationary + total(k * near.stationary)) / (1 + total(k))
+        k = k * (1 - near.stationary)
+        norm = 1 - stationary + total(k)
+        mean = total(k * near.speed) / norm
+        square = near.speed**2 + near.variance + settings.spread**2
+        return SpeedPrior(still, mean, ((1 - stationary) * variance + total(k * square)) / norm - mean**2)
 
 
-def _nearest_of_each(k: FloatArray, ids: IntArray) -> FloatArray:
-    """k (m, n) with all but the largest entry of each track id (n,) in each row set to 0."""
-    order = np.lexsort((k, np.broadcast_to(ids, k.shape)), axis=1)
-    sorted_ids = ids[order]
-    last = np.ones(k.shape, dtype=bool)
-    last[:, :-1] = sorted_ids[:, 1:] != sorted_ids[:, :-1]
-    kept = np.zeros(k.shape, dtype=bool)
-    np.put_along_axis(kept, order, last, axis=1)
-    return np.where(kept, k, 0.0)
+def _nearest_of_each(new: IntArray, ids: IntArray, k: FloatArray) -> IntArray:
+    """Of pairs (e,) of new tracks and passages of tracks `ids`, those of the largest weight `k` of each two tracks."""
+    order = np.lexsort((k, ids, new))
+    last = np.ones(len(order), dtype=bool)
+    last[:-1] = (np.diff(new[order]) != 0) | (np.diff(ids[order]) != 0)
+    return order[last]
