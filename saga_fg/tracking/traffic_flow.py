@@ -45,13 +45,15 @@ class Passages(Columns):
     time: FloatArray
 
     @classmethod
-    def of(cls, table: TrackTable, position: FloatArray, now: Kinematics, time: float) -> Passages:
-        """Return the passages of tracks at positions (n, 2), world, at a time, s."""
-        ahead = np.nan_to_num(np.stack([np.cos(table.box.yaw), np.sin(table.box.yaw)], axis=-1))
+    def of(cls, table: TrackTable, rows: IntArray, now: Kinematics, origin: FloatArray, time: float) -> Passages:
+        """Return the passages of tracks `rows` (n,) with kinematics `now`, local from `origin`, at a time, s."""
+        yaw = table.box.yaw[rows]
+        ahead = np.nan_to_num(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1))
         speed = np.einsum("ni,ni->n", ahead, now.velocity)
         variance = np.einsum("ni,nij,nj->n", ahead, now.P_velocity, ahead)
-        stationary, times = table.stationarity.probability, np.full(len(table), time)
-        return cls(table.id, table.label, position, table.box.yaw, speed, variance, stationary, times)
+        stationary, position = table.stationarity.probability[rows], now.position + origin
+        times = np.full(len(rows), time)
+        return cls(table.id[rows], table.label[rows], position, yaw, speed, variance, stationary, times)
 
 
 class SpeedPrior(NamedTuple):
@@ -107,7 +109,7 @@ class TrafficFlowPrior:
         new, k, near = new[nearest], k[nearest], passages.select(passage[nearest])
 
         def total(values: FloatArray) -> FloatArray:
-            return np.bincount(new, weights=values, minlength=len(label))
+            return np.bincount(new, weights=values, minlength=len(label)).astype(np.float64, copy=False)
 
         still = (stationary + total(k * near.stationary)) / (1 + total(k))
         k = k * (1 - near.stationary)

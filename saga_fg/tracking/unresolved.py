@@ -50,9 +50,9 @@ def unresolved_frames(
     rank = np.empty(len(boxes))
     rank[np.argsort(-probability, kind="stable")] = np.arange(len(boxes))
     covered = _overlaps(state, boxes, boxes, rank[None] < rank[:, None]).max(axis=1, initial=0.0) > OVERLAP
-    detected, now = state.table.select(matching.track), state.kinematics().select(matching.track)
-    surer = (detected.unresolved == 0) & (detected.existence >= probability[:, None])
-    live = _overlaps(state, boxes, detected.boxes(now.position + state.origin, now.velocity), surer)
+    detected, now = matching.track, state.kinematics()
+    surer = (state.table.unresolved[detected] == 0) & (state.table.existence[detected] >= probability[:, None])
+    live = _overlaps(state, boxes, state.boxes(now.position, now.velocity).select(detected), surer)
     covered |= live.max(axis=1, initial=0.0) > OVERLAP
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
     return np.where(covered & precise, FRAMES, 0.0)
