@@ -13,6 +13,7 @@ const LAYERS = [
   {name: "detections", on: false, there: scene => scene.detections.some(rows => rows.length), draw: drawDetections, focused: true},
   {name: "trails", on: true, draw: drawTrails},
   {name: "edges", on: false, there: scene => Object.values(scene.methods).some(m => m.edges.some(rows => rows.length)), draw: drawEdges, focused: true},
+  {name: "fans", text: "predictions", on: true, there: scene => Object.values(scene.methods).some(m => m.horizons.length), draw: drawFans, focused: true},
   {name: "ellipses", on: false, draw: drawEllipses, focused: true},
   {name: "tracks", on: true, draw: drawTracks},
   {name: "ids", on: true, draw: drawIds},

@@ -19,7 +19,7 @@ from pipelines.report.charts import Chart
 from pipelines.report.scenes import ReportScene, scene_data
 from pipelines.report.thresholds import start_thresholds
 
-SCRIPTS = ("charts.js", "road.js", "layers.js", "filters.js", "panel.js", "player.js")
+SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "player.js")
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +28,7 @@ class Report:
 
     start   moment of the first scene that the player shows first
     ghosts  whether it shows tracks that nobody sees now from the start
+    beside  the method that it shows beside the last one from the start, "" for none
     """
 
     title: str
@@ -39,6 +40,7 @@ class Report:
     notes: Sequence[str] = ()
     start: int = 0
     ghosts: bool = False
+    beside: str = ""
 
 
 def report_page(report: Report) -> str:
@@ -48,6 +50,7 @@ def report_page(report: Report) -> str:
         "charts": [asdict(chart) for chart in report.charts],
         "start": report.start,
         "ghosts": report.ghosts,
+        "beside": report.beside,
         "thresholds": start_thresholds(report.scenes),
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""

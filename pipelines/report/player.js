@@ -7,7 +7,7 @@ async function unpack(text) {
   return JSON.parse(await new Response(stream).text());
 }
 
-function player({scenes, start, thresholds, ghosts}) {
+function player({scenes, start, thresholds, ghosts, beside}) {
   const canvas = $("view"), g = canvas.getContext("2d");
   const shown = Object.fromEntries(LAYERS.map(layer => [layer.name, layer.on]));
   const filters = makeFilters(scenes, thresholds, ghosts, () => draw());
@@ -20,8 +20,8 @@ function player({scenes, start, thresholds, ghosts}) {
 
   function chooseScene(index) {
     scene = scenes[index];
-    const before = [$("method").value, $("beside").value], there = Object.keys(scene.methods);
-    $("scene").selectedIndex = index;
+    const before = [$("method").value, $("scene").dataset.chosen ? $("beside").value : beside], there = Object.keys(scene.methods);
+    $("scene").selectedIndex = index; $("scene").dataset.chosen = "yes";
     $("method").replaceChildren(...there.map(name => new Option(name, name)));
     $("method").value = there.includes(before[0]) ? before[0] : there[there.length - 1];
     $("beside").replaceChildren(new Option("alone", ""), ...there.map(name => new Option(`beside ${name}`, name)));
@@ -40,6 +40,7 @@ function player({scenes, start, thresholds, ghosts}) {
   function chooseMethods() {
     if (picked && !names().includes(picked.method)) picked = null;
     filters.showScores(names());
+    showHorizons(names().map(name => scene.methods[name]), draw);
     draw();
   }
 

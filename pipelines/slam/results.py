@@ -134,14 +134,15 @@ def write_pose_graph(
     rows: IntArray,
     covariances: FloatArray,
     errors: Mapping[str, float],
+    rejected: Sequence[str] = (),
 ) -> None:
-    """Write poses.g2o, the graph with its optimised poses, and errors.json.
+    """Write poses.g2o, the graph with its optimised poses, and errors.json; rejected: measurements left out as false.
 
     covariances (n, k, k) of poses `rows` (n,), relative to the first one: covariances.csv, unless there are none
     errors: by name: of each start, of the guess itself, of the baselines where they were run
     """
     d, minimum = graph.dim, optimised.chordal
-    figures: dict[str, object] = {"best": optimised.start, **errors}
+    figures: dict[str, object] = {"best": optimised.start, **errors, "rejected": list(rejected)}
     if minimum is not None:
         names = ("cost", "bound", "gap", "certified", "eigenvalue", "dimensions")
         figures["chordal"] = {name: getattr(minimum, name) for name in names}
