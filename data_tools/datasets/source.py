@@ -29,6 +29,7 @@ from data_tools.files.error_messages import unknown_name
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
+    from data_tools.datasets.area_map import AreaMap
     from data_tools.datasets.parts import Parts
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
@@ -45,6 +46,9 @@ TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "learn noise
 
 TrackedScenes = Iterable[tuple["Scene", Sequence["Tracks"]]]
 """Scenes with one `Tracks` for each of their timestamps."""
+
+Images = Mapping[str, Sequence[Path | None]]
+"""Image files by camera, for each moment of a scene."""
 
 Innovations = Mapping[str, "FloatArray"]
 """Squared distances of tracks and the detections they took, in sigmas, by class."""
@@ -123,6 +127,7 @@ class DatasetSource(ABC):
     example         options of the examples in the help
     tracks          what `track` writes, for the help; tracks_example: such a name
     merged          result of all parts in parallel, "" for none: of tracks, of labels
+    summarised      whether figures have a narrow summary
     """
 
     name: ClassVar[str]
@@ -132,6 +137,12 @@ class DatasetSource(ABC):
     tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson or .jsonl."
     tracks_example: ClassVar[str] = "tracks.csv"
     merged: ClassVar[tuple[str, str]] = ("", "")
+    summarised: ClassVar[bool] = False
+
+    @property
+    def title(self) -> str:
+        """What the recordings are called above a report."""
+        return self.name
 
     @property
     def tracks_suffix(self) -> str:
@@ -154,6 +165,14 @@ class DatasetSource(ABC):
         """Files that the options name, which no result may overwrite."""
         return ()
 
+    def kept(self) -> Mapping[str, Any]:
+        """What a result has to say on how its recordings were read: values of JSON."""
+        return {}
+
+    def with_kept(self, kept: Mapping[str, Any]) -> Self:
+        """The recordings, read as a result says (`kept`) where no option says otherwise."""
+        return self
+
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         """The recordings one by one, for workers; by default scenes that are read here and sent."""
@@ -168,6 +187,14 @@ class DatasetSource(ABC):
 
     def scans(self, scenes: Collection[str]) -> Mapping[str, ScanSequence]:
         """LiDAR scans by scene, of those that have some."""
+        return {}
+
+    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
+        """Maps to draw, by scene, of those that have one."""
+        return {}
+
+    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
+        """Camera images by scene, of those that have some."""
         return {}
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:

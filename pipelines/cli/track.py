@@ -26,6 +26,7 @@ def _track(
     lag: how.LagOption = None,
     association: how.AssociationOption = None,
     interactions: how.InteractionsOption = None,
+    predict: how.PredictOption = None,
     explain: how.ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -33,31 +34,35 @@ def _track(
     verbose: options.Verbose = False,
 ) -> None:
     """Track the detections of recordings."""
+    from pipelines.config import load_config
+    from pipelines.doubts import Doubted, Doubts
     from pipelines.explaining import trackers
-    from pipelines.idle_edges import IdleEdges
     from pipelines.scale_out import TrackTask
-    from pipelines.tracking import track_dataset
+    from pipelines.tracking import keep_predictions, track_dataset
 
     settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
-    kept = how.journal(explain, output, at_scale(workers, ray))
-    idle = IdleEdges(settings.of_method(method).tracker.edges)
+    kept, horizons = how.journal(explain, output, at_scale(workers, ray)), how.horizons(predict, method)
+    doubts = Doubts(settings.of_method(method), load_config(source.family), source.summarised)
     if at_scale(workers, ray):
-        task = TrackTask(settings, method, source)
+        doubts.see_first(source)
+        task = TrackTask(settings, method, source, horizons)
         report = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
-        idle.add(task.classes(report.counts))
-        idle.warn()
+        doubts.add(task.classes(report.counts))
+        doubts.finish()
         exit_on_failures(report)
         return
     summary = Summary(output)
     with source.open() as dataset:
         scenes = dataset.scenes
         with progress_bar(len(scenes)) as progress, trackers(settings, method, scenes, kept) as new_tracker:
-            runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
-            source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in runs))
-    summary.write_record(method, settings)
-    idle.add(summary.classes)
-    idle.warn()
+            looked_at = Doubted(dataset, doubts)
+            runs = summary.of(track_dataset(looked_at, new_tracker, progress=progress, horizons=horizons))
+            with keep_predictions(runs, output, horizons is not None) as kept_runs:
+                source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
+    summary.write_record(method, settings, source.kept())
+    doubts.add(summary.classes)
+    doubts.finish()
     summary.show()
 
 
@@ -65,6 +70,7 @@ _EXAMPLES = (
     "track {recordings} --output {tracks}",
     "track {recordings} --output {tracks} --method kf --config mine.yaml",
     "track {recordings} --output {tracks} --estimator fixed-lag --lag 3",
+    "track {recordings} --output {tracks} --predict 1,2,3",
     "track {recordings} --output run --workers 0   # all cores; writes run/tracks/",
 )
 

@@ -109,7 +109,7 @@ class Neighbours(Settings):
         else:  # the velocity of a new track is not known well enough
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= nodes.has_moved == 0 if nodes.has_moved is not None else False
-        target, source = pairs_within(nodes.position, able & nodes.acted, able, self.max_distance)
+        target, source = pairs_within(nodes.position, _acted(nodes, able), able, self.max_distance)
         rate = weighted_by_gain(
             self.strength(features_of(nodes, target, source)), self.information_gain, nodes, target, source
         )
@@ -197,7 +197,7 @@ class Following(Settings):
     def _ahead(self, nodes: NodeTable) -> tuple[IntArray, IntArray]:
         """All pairs that may be in a lane: target rows, source rows."""
         able = of_classes(nodes.label, self.classes)
-        follows = able & ~of_classes(nodes.label, self.towed) & nodes.acted
+        follows = _acted(nodes, able) & ~of_classes(nodes.label, self.towed)
         if not self.parked and nodes.has_moved is not None:
             follows = follows & (nodes.has_moved > 0)
         target, source = pairs_within(nodes.position, follows, able, self.max_gap)
@@ -271,6 +271,11 @@ def traffic_rules() -> tuple[Following, Neighbours]:
         information_gain=HIDDEN,
     )
     return leader, group
+
+
+def _acted(nodes: NodeTable, able: BoolArray) -> BoolArray:
+    """Those of the `able` (n,) nodes that others may act on."""
+    return able if nodes.acted is None else able & nodes.acted
 
 
 def pairs_within(

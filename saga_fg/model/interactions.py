@@ -18,7 +18,7 @@ Car-following is Helly's linear law (Helly 1959); with the gap taken from the pr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -32,7 +32,7 @@ from saga_fg.settings import (
     Settings,
     setting,
 )
-from saga_fg.types.road_map import LaneAcross
+from saga_fg.types.lanes_across import LanesAcross
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
@@ -51,9 +51,8 @@ class NodeTable:
     where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
     or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
     unknown; existence (n,) probability that a node is a real object, None: all are; open (n,) the weight with which a
-    stop line lets waiting vehicles go; lanes: by row of a stop line, the lanes that cross it; paths: predicted ones,
-    of nodes that may not go straight; acted (n,) mask of the nodes that others may act on, True: all; derived: values
-    that rules share, kept with the table
+    stop line lets waiting vehicles go; lanes: those that cross stop lines, these by row; paths: predicted ones;
+    acted (n,) mask of nodes that others may act on, None: all; derived: values that rules share, kept with the table
     """
 
     id: IntArray
@@ -71,9 +70,9 @@ class NodeTable:
     unseen: FloatArray | None = None
     existence: FloatArray | None = None
     open: FloatArray | None = None
-    lanes: Mapping[int, tuple[LaneAcross, ...]] = field(default_factory=dict)
+    lanes: LanesAcross | None = None
     paths: Paths | None = None
-    acted: BoolArray | Literal[True] = True
+    acted: BoolArray | None = None
     derived: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
@@ -82,6 +81,20 @@ class NodeTable:
     def along(self, target: IntArray, source: IntArray) -> Along:
         """Where nodes `source` (E,) are on the paths of nodes `target` (E,)."""
         return along_paths(self.position, self.heading, self.paths, target, source)
+
+    def select(self, rows: IntArray) -> NodeTable:
+        """The nodes `rows` (k,), ascending."""
+        place = dict(zip(rows.tolist(), range(len(rows)), strict=True))
+        columns: dict[str, Any] = {"types": tuple(map(self.types.__getitem__, place))}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, np.ndarray):
+                columns[each.name] = value[rows]
+            elif isinstance(value, Paths):
+                columns[each.name] = value.of_nodes(rows)
+            elif isinstance(value, Mapping) and each.init:
+                columns[each.name] = {place[row]: entry for row, entry in value.items() if row in place}
+        return replace(self, **columns)
 
 
 class Triples(NamedTuple):

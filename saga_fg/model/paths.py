@@ -6,14 +6,15 @@ heading.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
-from saga_fg.numerics.polyline import feet
+from saga_fg.numerics.polyline import Polylines
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,17 @@ class Paths(Columns):
     weight: FloatArray
     certainty: FloatArray
     disagreement: FloatArray
+
+    @cached_property
+    def lines(self) -> Polylines:
+        """The paths as polylines."""
+        return Polylines.of(list(self.position))
+
+    def of_nodes(self, rows: IntArray) -> Paths:
+        """The paths of the nodes `rows` (k,), ascending, which are counted from 0 then."""
+        place = np.searchsorted(rows, self.row).clip(max=max(len(rows) - 1, 0))
+        kept = np.flatnonzero(rows[place] == self.row) if len(rows) else np.empty(0, dtype=np.int64)
+        return replace(self.select(kept), row=place[kept])
 
 
 class Along(NamedTuple):
@@ -54,11 +66,11 @@ def along_paths(
     c, s = np.cos(direction), np.sin(direction)
     ahead, aside = dx * c + dy * s, dy * c - dx * s
     predicted = np.zeros(len(target), dtype=np.bool_)
-    if paths is not None and len(paths):
+    if paths is not None and len(paths) and len(target):
         line = np.minimum(np.searchsorted(paths.row, target), len(paths) - 1)
         predicted = paths.row[line] == target
         bent = np.flatnonzero(predicted)
-        at = feet(paths.position[line[bent]], position[source[bent]])
+        at = paths.lines.feet(line[bent], position[source[bent]])
         ahead[bent], aside[bent] = at.s, at.e
         direction[bent] = np.arctan2(at.direction[:, 1], at.direction[:, 0])
     return Along(ahead, aside, direction, predicted)

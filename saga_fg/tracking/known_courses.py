@@ -31,12 +31,12 @@ _LEAST = 1e-9
 
 
 def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
-    """The paths of the `unseen` (n,) vehicles with a heading, of `STEPS` steps, in local positions."""
+    """The paths of the `unseen` (n,) vehicles that keep to their courses, of `STEPS` steps, in local positions."""
     table, rows = state.table, np.flatnonzero(unseen & np.isfinite(state.table.box.yaw))
     rate = np.zeros(len(table))
     able = np.zeros(len(table), dtype=np.bool_)
     for node_type, of_type in state.joint.rows_by_type(table.label[rows], moving=True):
-        if isinstance(node_type.motion, Curvilinear):
+        if isinstance(node_type.motion, Curvilinear) and node_type.motion.course_time > 0:
             able[rows[of_type]] = True
             if node_type.motion.turn_time > 0:
                 rate[rows[of_type]] = table.turn.known(rows[of_type], node_type.motion.turning_share)[0]
@@ -71,7 +71,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
         turns = (motion.turn_time > 0) & (speed > MOVING)
         rate, variance = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0)
         heading, (settling, across, pull) = table.box.yaw[rows], np.zeros((3, len(rows)))
-        led = np.flatnonzero((path[rows] >= 0) & (motion.course_time > 0))
+        led = np.flatnonzero(path[rows] >= 0)
         if len(led):
             own, way = paths.select(path[rows[led]]), speed[led] * dt
             turn = _at(own.heading, way) - own.heading[:, 0]
