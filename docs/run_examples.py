@@ -7,6 +7,8 @@ Every fenced block of bash or Python is preceded by a comment that says what bec
     <!-- ci -->                     .ci/run runs it, with `--mark ci`, in the root of the repository
     <!-- not run: REASON -->        it is not run
 
+The cells of a notebook (.ipynb) are one such block, which is run.
+
 The blocks of a page run in order in one temporary folder, bash with `set -euo pipefail`, Python in a fresh interpreter.
 With `--jobs N`, so many pages run at a time, and a block's output is printed when it has ended.
 """
@@ -14,6 +16,7 @@ With `--jobs N`, so many pages run at a time, and a block's output is printed wh
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import subprocess
@@ -48,6 +51,9 @@ class UnmarkedExampleError(Exception):
 def examples(page: Path) -> list[Example]:
     """The blocks of a page. Raises `UnmarkedExampleError` for one without a mark."""
     text = page.read_text(encoding="utf-8")
+    if page.suffix == ".ipynb":
+        cells = [cell["source"] for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+        return [Example(page, 1, "run", "python", "\n\n".join("".join(source) for source in cells))]
     found = []
     for match in FENCE.finditer(text):
         line = text.count("\n", 0, match.start("code"))

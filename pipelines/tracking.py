@@ -2,19 +2,28 @@
 
 At a moment t of the scene, every frame up to and including t has been taken in; the tracks reported are the tracker's
 state at t, predicted there where the last frame is older. Nothing later than t has any influence.
+
+With horizons, the tracks reported at t are predicted to t plus each of them as well.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import Protocol
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
+import numpy as np
+
+from data_tools.datasets.detection_files import prediction_writer, predictions_path
 from pipelines.process import one_thread
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
+from saga_fg.types.predicted_tracks import LONGEST, PredictedTracks
 from saga_fg.types.track import Tracks
 
 Progress = Callable[[str, int, int], None]
@@ -33,16 +42,27 @@ class OnlineTracker(Protocol):
         ...
 
 
+@runtime_checkable
+class PredictingTracker(Protocol):
+    """A tracker that predicts its tracks, `saga_fg.tracking.Tracker`."""
+
+    def predict(self, horizons: FloatArray, joint: bool = False) -> PredictedTracks:
+        """The tracks at horizons (H,), s, after the newest frame."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class TrackedScene:
     """A scene and its tracks, one table for each of its timestamps.
 
     milliseconds  that the tracker took for each frame
+    predictions   made at its timestamps, where horizons were given
     """
 
     scene: Scene
     tracks: tuple[Tracks, ...]
     milliseconds: tuple[float, ...]
+    predictions: tuple[PredictedTracks, ...] = ()
 
     @property
     def frames(self) -> int:
@@ -55,9 +75,15 @@ class TrackedScene:
         return sum(self.milliseconds) / 1e3
 
 
-def track_scene(scene: Scene, tracker: OnlineTracker, progress: Progress | None = None) -> TrackedScene:
-    """Track one scene with a fresh tracker. Frames after the last timestamp of the scene are left out."""
+def track_scene(
+    scene: Scene, tracker: OnlineTracker, progress: Progress | None = None, horizons: FloatArray | None = None
+) -> TrackedScene:
+    """Track one scene with a fresh tracker. Frames after the last timestamp of the scene are left out.
+
+    horizons: (H,) s, to which the tracks of each timestamp are predicted; raises `InputError` where the tracker can't.
+    """
     wanted: list[Tracks] = []
+    predicted: list[PredictedTracks] = []
     milliseconds: list[float] = []
     done, latest, total = 0, None, len(scene.frames)
     with one_thread():
@@ -70,7 +96,21 @@ def track_scene(scene: Scene, tracker: OnlineTracker, progress: Progress | None 
                 if progress is not None:
                     progress(scene.name, done, total)
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
-    return TrackedScene(scene, tuple(wanted), tuple(milliseconds))
+            if horizons is not None and latest is not None:
+                predicted += _predicted(tracker, moment, horizons, latest.timestamp)
+    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted))
+
+
+def _predicted(
+    tracker: OnlineTracker, moment: float, horizons: FloatArray, newest: float
+) -> tuple[PredictedTracks, ...]:
+    """The tracks at times after a moment; none where the newest frame is too far from it."""
+    if not isinstance(tracker, PredictingTracker):
+        raise InputError("--predict: expected a method that predicts, saga or kf")
+    since = np.asarray(horizons + (moment - newest))
+    if since[0] < 0 or since[-1] > LONGEST:
+        return ()
+    return (replace(tracker.predict(since), timestamp=moment, horizons=horizons),)
 
 
 def track_dataset(
@@ -78,10 +118,32 @@ def track_dataset(
     new_tracker: Callable[[], OnlineTracker],
     scenes: Iterable[str] | None = None,
     progress: Progress | None = None,
+    horizons: FloatArray | None = None,
 ) -> Iterator[TrackedScene]:
     """Track some scenes (default: all), each with a tracker of its own, one at a time as they are asked for."""
     for name in dataset.scenes if scenes is None else scenes:
-        yield track_scene(scene_with_frames(dataset, name), new_tracker(), progress)
+        yield track_scene(scene_with_frames(dataset, name), new_tracker(), progress, horizons)
+
+
+@contextmanager
+def keep_predictions(runs: Iterable[TrackedScene], result: Path, wanted: bool) -> Iterator[Iterator[TrackedScene]]:
+    """Yield runs that are passed on; their predictions are kept beside the result, if that is wanted.
+
+    A table of predictions that an earlier run has left there goes. Raises `InputError` where it is not writable.
+    """
+    path = predictions_path(result)
+    if not wanted:
+        yield iter(runs)
+        path.unlink(missing_ok=True)
+        return
+    with prediction_writer(path) as write:
+
+        def passed_on() -> Iterator[TrackedScene]:
+            for run in runs:
+                write(run.scene.name, run.predictions)
+                yield run
+
+        yield passed_on()
 
 
 def scene_with_frames(dataset: Dataset, name: str) -> Scene:

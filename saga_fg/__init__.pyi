@@ -2,7 +2,7 @@ from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
 from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
-from .tracking import GreedyTracker, Tracker, TrackerSettings
+from .tracking import GreedyTracker, Tracker, TrackerSettings, track
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
@@ -37,4 +37,5 @@ __all__ = [
     "TrackerSettings",
     "Tracks",
     "UnknownNodeError",
+    "track",
 ]

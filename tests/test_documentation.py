@@ -6,6 +6,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,11 @@ from saga_fg import Tracker
 from saga_fg.smoothing import SmoothingSettings
 
 ROOT = Path(__file__).parents[1]
+URLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]
+ADDRESSES = (
+    URLS["Repository"] + "/blob/main",
+    URLS["Repository"].replace("github.com", "raw.githubusercontent.com") + "/main",
+)
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
 
 
@@ -88,6 +94,10 @@ def test_the_configuration_page_is_what_the_code_says() -> None:
 def test_links_within_the_documentation_lead_somewhere(page: Path) -> None:
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     for target in re.findall(r"\]\(([^)]+)\)", text):
+        if page.name == "README.md":  # its links are absolute, as it is shown by package indexes too
+            ours = re.match(rf"(?:{'|'.join(ADDRESSES)})/(.*)", target)
+            assert target.startswith("https://"), f"{page_name(page)} links to {target}"
+            target = ours[1] if ours else target
         if target.startswith(("http://", "https://")):
             continue
         name, _, anchor = target.partition("#")

@@ -57,7 +57,7 @@ def test_the_wheel_names_licence_command_and_pythons(wheel: zipfile.ZipFile) -> 
     assert "License-Expression: Apache-2.0" in metadata
     assert "Requires-Python: <3.14,>=3.11" in metadata
     assert f"{info}/licenses/LICENSE" in wheel.namelist()
-    assert "saga-fg = pipelines.cli.main:main" in wheel.read(f"{info}/entry_points.txt").decode()
+    assert "saga-fg = saga_fg.__main__:main" in wheel.read(f"{info}/entry_points.txt").decode()
 
 
 def test_what_the_wheel_holds_works_on_its_own(wheel: zipfile.ZipFile, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ class DetectionFileSource(DatasetSource):
     """Your own detections: a table with a row for each.
 
     The columns timestamp (s), x and y (m) are needed; label, score, sensor, size, heading and more are used where they
-    are there (see docs/formats.md).
+    are there (see `saga-fg docs formats`).
     """
 
     name = "file"
@@ -38,6 +38,10 @@ class DetectionFileSource(DatasetSource):
     )
     scenes: str | None = option("Scene names with commas between them; all if left out.", None)
     table: Literal["csv", "ndjson"] = option("Format of the tables, in parallel.", "csv", verbs=("track",))
+
+    @property
+    def title(self) -> str:
+        return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
 
     @property
     def tracks_suffix(self) -> str:

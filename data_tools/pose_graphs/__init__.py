@@ -1,6 +1,7 @@
 """Pose graphs in files, and generated ones."""
 
+from data_tools.pose_graphs.false_loops import with_false_loops
 from data_tools.pose_graphs.g2o import read_g2o, write_g2o
 from data_tools.pose_graphs.generated import city, torus
 
-__all__ = ["city", "read_g2o", "torus", "write_g2o"]
+__all__ = ["city", "read_g2o", "torus", "with_false_loops", "write_g2o"]

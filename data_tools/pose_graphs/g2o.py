@@ -1,57 +1,45 @@
 """The g2o format of pose graphs, in the plane and in space (https://github.com/RainerKuemmerle/g2o/wiki/File-Format).
 
-    VERTEX_SE2 id x y heading
-    EDGE_SE2 first second dx dy dheading I11 I12 I13 I22 I23 I33
-    VERTEX_SE3:QUAT id x y z qx qy qz qw
-    EDGE_SE3:QUAT first second dx dy dz qx qy qz qw I11 I12 ... I16 I22 ... I66
-    FIX id
-
-m and rad; a measurement is first_T_second; I is the upper triangle of the information matrix, row by row, ordered as
-the pose is: (x, y, heading) or (translation, rotation). g2o means the vector part of a quaternion by a rotation in
-space; like GTSAM, which everybody compares with, we read the matrix as that of a rotation vector. FIX names a pose to
-hold; as the first pose is always held, it has no effect. Empty lines and those that begin with # are left out.
+The records are those of `data_tools.pose_graphs.g2o_records`. A measurement is first_T_second; landmarks are measured
+in the frame of the pose, and ids of poses and landmarks are of one numbering. g2o means the vector part of a quaternion
+by a rotation in space; like GTSAM, which everybody compares with, we read the matrix as that of a rotation vector.
+Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements. FIX names a pose to hold; as the first pose is
+always held unless there are priors, it has no effect. Empty lines and those that begin with # are left out.
 """
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
-from data_tools.files.text_tables import LARGEST, TextTable, read_lines
+from data_tools.files.text_tables import TextTable
+from data_tools.pose_graphs.g2o_records import RECORDS, information, read_records, record_values, transforms
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation, rotation_quaternion
-from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.types.boxes import MAX_POSITION
+from saga_fg.numerics.geometry import rotation_quaternion
+from saga_fg.slam.pose_graph import LandmarkObservations, ObservationKind, PointLandmarks, PoseGraph, PosePriors
 
-_UNIT = 1e-3  # what the norm of a quaternion may be off 1
-_SLIGHT = 1e-4  # share of the largest eigenvalue by which the smallest may be negative: four digits are rounded so
-_LEAST = 1e-9  # share of the largest eigenvalue that it is then raised to
-_ENDS = ((0, "first"), (1, "second"))
-log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """The records of one dimension: their tags, the columns of a pose, where each entry of our tangent is found."""
-
-    vertex: str
-    edge: str
-    pose: tuple[str, ...]
-    tangent: tuple[int, ...]
-
-
-_PLANAR = _Layout("VERTEX_SE2", "EDGE_SE2", ("x", "y", "heading"), (0, 1, 2))
-_SPATIAL = _Layout("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", ("x", "y", "z", "qx", "qy", "qz", "qw"), (3, 4, 5, 0, 1, 2))
-_TAGS = {tag: layout for layout in (_PLANAR, _SPATIAL) for tag in (layout.vertex, layout.edge)}
+Tables = Mapping[str, TextTable]
+_POSE = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
+_EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
+_PRIOR = {2: "EDGE_PRIOR_SE2", 3: "EDGE_SE3_PRIOR"}
+_LANDMARK = {2: "VERTEX_XY", 3: "VERTEX_TRACKXYZ"}
+_OBSERVED: dict[str, ObservationKind] = {
+    "EDGE_SE2_XY": "point",
+    "EDGE_BEARING_SE2_XY": "bearing",
+    "BR": "range bearing",
+    "EDGE_SE3_TRACKXYZ": "point",
+}
+_TANGENT = {2: [0, 1, 2], 3: [3, 4, 5, 0, 1, 2]}  # where each entry of our tangent is found in the file's
+_OFFSET, _LARGEST_ID = "PARAMS_SE3OFFSET", 2**62
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
-    """Read a pose graph; poses come in the order of their ids.
+    """Read a pose graph; poses and landmarks come in the order of their ids.
 
     A file of measurements alone starts at dead reckoning along them. An information matrix with an eigenvalue that is
     0 or slightly negative, as rounded ones have, is projected to a positive definite one, with a warning.
@@ -60,141 +48,175 @@ def read_g2o(path: str | Path) -> PoseGraph:
     that is clearly negative.
     """
     file = Path(path)
-    tables = _records(file)
-    planar = {tag for tag in tables if _TAGS[tag] is _PLANAR}
-    if not tables or len(planar) not in (0, len(tables)):
+    tables = read_records(file)
+    dims = {RECORDS[tag].dim for tag in tables}
+    if len(dims) != 1:
         raise InputError(f"{file}: expected poses and edges, all in the plane (SE2) or all in space (SE3:QUAT)")
-    layout = _PLANAR if planar else _SPATIAL
-    if layout.edge not in tables:
-        raise InputError(f"{file}: expected {layout.edge} records, there are none")
-    edges, n = tables[layout.edge], len(layout.pose)
-    between, information = _transforms(edges, 2, layout), _information(edges, 2 + n, layout)
-    if layout.vertex not in tables:
-        named = np.stack([edges.integers(column, name, 0, 2**62) for column, name in _ENDS])
-        ids, rows = np.unique(named, return_inverse=True)
-        first, second = rows.reshape(named.shape)
-        _check_ends(edges, first, second)
-        return PoseGraph.of_measurements(ids, first, second, between, information)
-    vertices = tables[layout.vertex]
-    ids = vertices.integers(0, "id", 0, 2**62)
-    order = np.argsort(ids, kind="stable")
-    twice = np.flatnonzero(ids[order][1:] == ids[order][:-1])
-    if len(twice):
-        row = int(order[twice[0] + 1])
-        raise vertices.fault(row, f"id: pose {ids[row]} is given twice")
-    first, second = (_rows(edges, column, name, ids[order]) for column, name in _ENDS)
-    _check_ends(edges, first, second)
-    return PoseGraph(ids[order], _transforms(vertices, 1, layout)[order], first, second, between, information)
+    (d,) = dims
+    if _EDGE[d] not in tables:
+        raise InputError(f"{file}: expected {_EDGE[d]} records, there are none")
+    edges = tables[_EDGE[d]]
+    ends = np.stack([edges.integers(column, name, 0, _LARGEST_ID) for column, name in ((0, "first"), (1, "second"))])
+    between, weights = transforms(edges, RECORDS[_EDGE[d]]), _information(edges, _EDGE[d])
+    whole = _POSE[d] in tables
+    ids, order = _unique_ids(tables[_POSE[d]]) if whole else (np.unique(ends), np.arange(0))
+    first, second = (_rows(edges, named, name, ids) for named, name in zip(ends, ("first", "second"), strict=True))
+    if (first == second).any():
+        raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
+    priors = _priors(tables, d, ids)
+    if whole:
+        poses = transforms(tables[_POSE[d]], RECORDS[_POSE[d]])[order]
+        graph = PoseGraph(ids, poses, first, second, between, weights, priors=priors)
+    else:
+        graph = PoseGraph.of_measurements(ids, first, second, between, weights, priors)
+    return graph.with_landmarks(_landmarks(tables, graph, whole))
+
+
+def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
+    if (tag := _PRIOR[d]) not in tables:
+        return None
+    table = tables[tag]
+    rows = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", ids)
+    poses, weights = transforms(table, RECORDS[tag]), _information(table, tag)
+    if d == 3:  # measured is pose T offset, with errors in the sensor's frame
+        sensor_T_pose = np.linalg.inv(_offsets(tables, table, 1))
+        adjoint = np.stack([gtsam.Pose3(T).AdjointMap() for T in sensor_T_pose])
+        poses, weights = poses @ sensor_T_pose, adjoint.swapaxes(1, 2) @ weights @ adjoint
+    return PosePriors(rows, poses, weights)
+
+
+def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmarks | None:
+    """The landmarks; their places are those of the file if all of them and the poses are in it."""
+    d, tag = graph.dim, _LANDMARK[graph.dim]
+    observed = {tag: tables[tag] for tag in _OBSERVED if tag in tables}
+    named = {tag: table.integers(1, "landmark", 0, _LARGEST_ID) for tag, table in observed.items()}
+    if not named:
+        return None
+    ids = np.unique(np.concatenate(list(named.values())))
+    places = None
+    if tag in tables:
+        vertices = tables[tag]
+        given, order = _unique_ids(vertices)
+        for kind, table in observed.items():
+            _rows(table, named[kind], "landmark", given)
+        if guessed:
+            kept = np.searchsorted(given, ids)
+            places = record_values(vertices, RECORDS[tag])[order][kept]
+    for kind, table in observed.items():
+        both = np.isin(named[kind], graph.ids)
+        if both.any():
+            row = int(np.argmax(both))
+            raise table.fault(row, f"landmark: {named[kind][row]} is a pose")
+    observations = tuple(_observations(tables, kind, table, graph.ids, ids) for kind, table in observed.items())
+    return PointLandmarks(ids, observations, np.full((len(ids), d), np.nan) if places is None else places)
+
+
+def _observations(
+    tables: Tables, tag: str, table: TextTable, poses: IntArray, landmarks: IntArray
+) -> LandmarkObservations:
+    pose = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", poses)
+    landmark = np.searchsorted(landmarks, table.integers(1, "landmark", 0, _LARGEST_ID))
+    z, weights = record_values(table, RECORDS[tag]), information(table, RECORDS[tag])
+    if tag == "BR":
+        if (z[:, 1] <= 0).any():
+            raise table.fault(int(np.argmax(z[:, 1] <= 0)), "range: expected a number > 0")
+        z, weights = z[:, ::-1], weights[:, ::-1, ::-1]
+    if tag == "EDGE_SE3_TRACKXYZ":
+        T = _offsets(tables, table, 2)
+        R = T[:, :3, :3]
+        z, weights = (R @ z[:, :, None])[:, :, 0] + T[:, :3, 3], R @ weights @ R.swapaxes(1, 2)
+    return LandmarkObservations(_OBSERVED[tag], pose, landmark.astype(np.int64), z, weights)
+
+
+def _offsets(tables: Tables, table: TextTable, column: int) -> FloatArray:
+    """Poses (n, 4, 4) of the sensors that a column names."""
+    named = table.integers(column, "offset", 0, _LARGEST_ID)
+    if _OFFSET not in tables:
+        if (named != 0).any():
+            raise table.fault(int(np.argmax(named != 0)), f"offset: there is no {_OFFSET} record")
+        return np.tile(np.eye(4), (len(named), 1, 1))
+    ids, order = _unique_ids(tables[_OFFSET])
+    rows = _rows(table, named, "offset", ids)
+    return transforms(tables[_OFFSET], RECORDS[_OFFSET])[order][rows]
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     """Write a pose graph, whole or not at all. Raises `InputError` where that is not possible."""
-    layout = _PLANAR if graph.dim == 2 else _SPATIAL
-    k = len(layout.tangent)
-    upper = np.triu_indices(k)
-    back = np.argsort(layout.tangent)
-    information = graph.information[:, back[:, None], back][:, upper[0], upper[1]]
+    d, names = graph.dim, graph.ids
     lines = [
-        f"{layout.vertex} {id_} {_numbers(row)}"
-        for id_, row in zip(graph.ids.tolist(), _columns(graph.world_T_pose), strict=True)
+        f"{_POSE[d]} {id_} {_numbers(row)}"
+        for id_, row in zip(names.tolist(), _columns(graph.world_T_pose), strict=True)
     ]
-    lines += [
-        f"{layout.edge} {first} {second} {_numbers(row)} {_numbers(entries)}"
-        for first, second, row, entries in zip(
-            graph.ids[graph.first].tolist(),
-            graph.ids[graph.second].tolist(),
-            _columns(graph.first_T_second),
-            information,
-            strict=True,
-        )
-    ]
+    marks, priors = graph.landmarks, graph.priors
+    if marks is not None:
+        lines += [
+            f"{_LANDMARK[d]} {id_} {_numbers(row)}" for id_, row in zip(marks.ids.tolist(), marks.position, strict=True)
+        ]
+    if d == 3 and (marks is not None or priors is not None):
+        lines.append(f"{_OFFSET} 0 0 0 0 0 0 0 1")
+    ends = np.stack([names[graph.first], names[graph.second]], axis=1)
+    lines += _lines(_EDGE[d], ends, _columns(graph.first_T_second), _upper(graph.information, d))
+    if priors is not None:
+        pose = names[priors.pose][:, None]
+        pose = pose if d == 2 else np.column_stack([pose, np.zeros_like(pose)])
+        lines += _lines(_PRIOR[d], pose, _columns(priors.world_T_pose), _upper(priors.information, d))
+    if marks is not None:
+        lines += [line for seen in marks.observations for line in _observation_lines(seen, names, marks.ids, d)]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _records(file: Path) -> dict[str, TextTable]:
-    """The lines of a file by their tag."""
-    found: dict[str, tuple[list[list[str]], list[int]]] = {}
-    for number, line in enumerate(read_lines(file), start=1):
-        tag, *row = line.split() or [""]
-        if not tag or tag.startswith("#") or tag == "FIX":
-            continue
-        layout = _TAGS.get(tag)
-        if layout is None:
-            raise InputError(f"{file}: line {number}: expected one of {', '.join(_TAGS)}, FIX, got {tag[:40]!r}")
-        k = len(layout.tangent)
-        columns = 1 + len(layout.pose) if tag == layout.vertex else 2 + len(layout.pose) + k * (k + 1) // 2
-        if len(row) != columns:
-            raise InputError(f"{file}: line {number}: expected {columns} values after {tag}, got {len(row)}")
-        rows, lines = found.setdefault(tag, ([], []))
-        rows.append(row)
-        lines.append(number)
-    return {tag: TextTable.of(file, rows, lines) for tag, (rows, lines) in found.items()}
+def _observation_lines(seen: LandmarkObservations, poses: IntArray, landmarks: IntArray, d: int) -> list[str]:
+    ends = np.stack([poses[seen.pose], landmarks[seen.landmark]], axis=1)
+    if seen.kind == "range bearing":
+        sigma = 1 / np.sqrt(np.diagonal(seen.information, axis1=1, axis2=2))
+        return _lines("BR", ends, seen.z[:, ::-1], sigma[:, ::-1])
+    tag = "EDGE_BEARING_SE2_XY" if seen.kind == "bearing" else "EDGE_SE2_XY" if d == 2 else "EDGE_SE3_TRACKXYZ"
+    if d == 3:
+        ends = np.column_stack([ends, np.zeros(len(ends), dtype=np.int64)])
+    i, j = np.triu_indices(seen.z.shape[1])
+    return _lines(tag, ends, seen.z, seen.information[:, i, j])
 
 
-def _check_ends(edges: TextTable, first: IntArray, second: IntArray) -> None:
-    if (first == second).any():
-        raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
+def _lines(tag: str, ids: IntArray, values: FloatArray, weights: FloatArray) -> list[str]:
+    return [
+        f"{tag} {' '.join(map(str, named))} {_numbers(row)} {_numbers(entries)}"
+        for named, row, entries in zip(ids.tolist(), values, weights, strict=True)
+    ]
 
 
-def _rows(edges: TextTable, column: int, name: str, ids: IntArray) -> IntArray:
-    """Rows of the poses that a column of the edges names."""
-    named = edges.integers(column, name, 0, 2**62)
+def _information(table: TextTable, tag: str) -> FloatArray:
+    """Information of poses, in the order of our tangent."""
+    record = RECORDS[tag]
+    tangent = np.array(_TANGENT[record.dim])
+    return information(table, record)[:, tangent[:, None], tangent]
+
+
+def _upper(matrices: FloatArray, d: int) -> FloatArray:
+    """Upper triangles of information matrices of poses, in the order of the file."""
+    back = np.argsort(_TANGENT[d])
+    i, j = np.triu_indices(len(back))
+    return np.asarray(matrices[:, back[:, None], back][:, i, j])
+
+
+def _unique_ids(table: TextTable) -> tuple[IntArray, IntArray]:
+    """Ids in increasing order, and their rows."""
+    ids = table.integers(0, "id", 0, _LARGEST_ID)
+    order = np.argsort(ids, kind="stable")
+    twice = np.flatnonzero(ids[order][1:] == ids[order][:-1])
+    if len(twice):
+        row = int(order[twice[0] + 1])
+        raise table.fault(row, f"id: {ids[row]} is given twice")
+    return ids[order], order.astype(np.int64)
+
+
+def _rows(table: TextTable, named: IntArray, name: str, ids: IntArray) -> IntArray:
+    """Rows of what a column of a table names."""
     rows = np.minimum(np.searchsorted(ids, named), len(ids) - 1)
     if (ids[rows] != named).any():
         row = int(np.argmax(ids[rows] != named))
-        raise edges.fault(row, f"{name}: there is no pose {named[row]}")
+        what = name if name in ("landmark", "offset") else "pose"
+        raise table.fault(row, f"{name}: there is no {what} {named[row]}")
     return rows.astype(np.int64)
-
-
-def _transforms(table: TextTable, column: int, layout: _Layout) -> FloatArray:
-    largest = tuple(MAX_POSITION if name in ("x", "y", "z") else LARGEST for name in layout.pose)
-    values = table.numbers(slice(column, column + len(layout.pose)), layout.pose, largest)
-    if layout is _PLANAR:
-        c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
-        T = np.tile(np.eye(3), (len(values), 1, 1))
-        T[:, :2, :2] = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
-        T[:, :2, 2] = values[:, :2]
-        return T
-    quaternion = values[:, [6, 3, 4, 5]]
-    norm = quaternion_norms(quaternion)
-    bad = np.abs(norm - 1) > _UNIT
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise table.fault(row, f"qx qy qz qw: expected a unit quaternion, got norm {norm[row]:.6g}")
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3, :3] = quaternion_rotation(quaternion / norm[:, None])
-    T[:, :3, 3] = values[:, :3]
-    return T
-
-
-def _information(edges: TextTable, column: int, layout: _Layout) -> FloatArray:
-    k = len(layout.tangent)
-    upper = np.triu_indices(k)
-    names = tuple(f"I{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))
-    entries = edges.numbers(slice(column, column + len(names)), names)
-    matrix = np.zeros((len(entries), k, k))
-    matrix[:, upper[0], upper[1]] = matrix[:, upper[1], upper[0]] = entries
-    tangent = np.array(layout.tangent)
-    return _definite(edges, matrix)[:, tangent[:, None], tangent]
-
-
-def _definite(edges: TextTable, matrix: FloatArray) -> FloatArray:
-    """Project matrices (M, k, k) that are nearly positive definite."""
-    values, vectors = np.linalg.eigh(matrix)
-    smallest, largest, k = values[:, 0], values[:, -1], matrix.shape[1]
-    bad = (smallest < -_SLIGHT * largest) | (largest <= 0)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise edges.fault(
-            row, f"I11 ... I{k}{k}: expected a positive definite matrix, smallest eigenvalue {smallest[row]:.3g}"
-        )
-    near = np.flatnonzero(smallest <= 0)
-    if len(near):
-        example = edges.fault(int(near[0]), f"smallest eigenvalue {smallest[near[0]]:.3g}")
-        log.warning("%s; so of %d information matrices, which are made positive definite", example, len(near))
-        raised = np.maximum(values[near], _LEAST * largest[near, None])
-        matrix[near] = (vectors[near] * raised[:, None]) @ vectors[near].swapaxes(1, 2)
-    return matrix
 
 
 def _columns(T: FloatArray) -> FloatArray:

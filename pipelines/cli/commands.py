@@ -10,6 +10,7 @@ from pipelines.cli.bench import bench_app
 from pipelines.cli.config import config
 from pipelines.cli.console import new_command
 from pipelines.cli.demo import demo
+from pipelines.cli.docs import docs
 from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.explain import explain
 from pipelines.cli.learn import learn_app
@@ -37,6 +38,7 @@ app.command()(demo)
 app.command()(serve)
 app.command()(status)
 app.command()(config)
+app.command()(docs)
 
 
 def _print_version(wanted: bool) -> None:

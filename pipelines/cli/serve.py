@@ -60,13 +60,17 @@ def serve(
     lag: how.LagOption = None,
     association: how.AssociationOption = None,
     interactions: how.InteractionsOption = None,
+    predict: Annotated[
+        str | None,
+        typer.Option("--predict", help="Answer every frame with its tracks these s later, as well.", metavar="S,S,..."),
+    ] = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
     """Track live: detections in, tracks out, as newline-delimited JSON.
 
     One line is one frame of one sensor; every frame is answered with the tracks at its time. A line that cannot be
-    used is answered with what is wrong, counted and skipped. docs/guides/stream.md describes the messages.
+    used is answered with what is wrong, counted and skipped. `saga-fg docs guides/stream` has the messages.
 
     SIGTERM and Ctrl-C finish what has come in, with a bound on the time; the exit code is then 143 or 0.
 
@@ -74,6 +78,7 @@ def serve(
     Examples:
       saga-fg serve < frames.ndjson > tracks.ndjson
       saga-fg serve --listen 127.0.0.1:7447 --reorder 0.1
+      saga-fg serve --predict 1,2,3 < frames.ndjson > tracks.ndjson
       saga-fg serve --listen ./saga.sock --snapshot state.saga --every 2
       saga-fg status
     """
@@ -90,7 +95,8 @@ def serve(
     if reorder is not None:
         bounds = replace(bounds, reorder=reorder)
     rules = settings.of_method(method).tracker.edges
-    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, rules)
+    horizons = how.horizons(predict, method)
+    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, rules, horizons)
     return_large_blocks()
     keeper = None if snapshot is None else _restored(stream, snapshot, every, settings, method)
     last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)

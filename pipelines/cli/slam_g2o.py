@@ -15,7 +15,7 @@ from pipelines.cli.summary import counted
 if TYPE_CHECKING:
     from saga_fg.numerics.arrays import IntArray
 
-Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
+Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]
 
 
 def g2o(
@@ -39,7 +39,11 @@ def g2o(
     ] = "all",
     robust: Annotated[
         Loss | None,
-        typer.Option("--robust", help="Loss over the measurements that do not join successive poses: false loops."),
+        typer.Option(
+            "--robust",
+            help="Against false loops, measurements that do not join successive poses: leave out those that contradict "
+            "the rest (consensus), or a loss over all of them.",
+        ),
     ] = None,
     robust_scale: Annotated[
         float, typer.Option("--robust-scale", help="Scale of that loss, standard deviations.")
@@ -55,7 +59,7 @@ def g2o(
       saga-fg slam g2o sphere2500.g2o --output sphere
       saga-fg slam g2o MIT.g2o --output MIT --compare
       saga-fg slam g2o CSAIL.g2o --output CSAIL --certify --covariances last
-      saga-fg slam g2o with_false_loops.g2o --robust geman-mcclure --output clean
+      saga-fg slam g2o with_false_loops.g2o --robust consensus --output clean
     """
     from data_tools.files.atomic_files import check_writable_folder
     from data_tools.files.error_messages import error_context
@@ -64,30 +68,44 @@ def g2o(
     from pipelines.slam.pose_graph_baselines import isam2, levenberg_marquardt
     from pipelines.slam.results import write_pose_graph
     from saga_fg.errors import InputError
-    from saga_fg.slam.pose_graph import factor_graph, optimise_poses, pose_values
+    from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
 
-    if robust is not None and certify:
-        raise InputError("--certify: expected without --robust, the proof is for squared errors")
-    if robust is not None and compare:
-        raise InputError("--compare: expected without --robust, GTSAM's optimisers are run without a loss")
+    if robust not in (None, "consensus") and certify:
+        raise InputError("--certify: expected without a robust loss, the proof is for squared errors")
+    if robust not in (None, "consensus") and compare:
+        raise InputError("--compare: expected without a robust loss, GTSAM's optimisers are run without one")
     if not 0 < robust_scale < math.inf:
         raise InputError(f"--robust-scale {robust_scale:g}: expected a number > 0")
     check_writable_folder(output)
-    loss = None if robust is None else Robust(robust, robust_scale)
+    rejected: list[str] = []
+    loss = None if robust is None or robust == "consensus" else Robust(robust, robust_scale)
     graph = read_g2o(file)
+    if compare and not graph.poses_alone:
+        raise InputError(f"--compare: expected a graph of poses alone, {file} has landmarks or priors")
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         rows = _rows(covariances, graph.ids)
+        if robust == "consensus":
+            agreed = consensus(graph)
+            rejected = [
+                f"{graph.ids[graph.first[k]]} {graph.ids[graph.second[k]]}" for k in (~agreed.kept).nonzero()[0]
+            ]
+            graph = agreed.graph
         optimised = optimise_poses(graph, loss, certify)
         blocks = optimised.covariances(rows)
-    guess = factor_graph(graph, loss).error(pose_values(graph.world_T_pose))
+    guess = graph_error(graph, loss)
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):
             errors["GTSAM Levenberg-Marquardt"] = levenberg_marquardt(graph)
             errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
-    write_pose_graph(output, graph, optimised, rows, blocks, errors)
+    write_pose_graph(output, graph, optimised, rows, blocks, errors, rejected)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
+    if graph.landmarks is not None:
+        poses += f", {counted(len(graph.landmarks.ids), 'landmark')}"
+        edges = counted(len(graph.first) + sum(len(seen.pose) for seen in graph.landmarks.observations), "measurement")
     typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (at the start {guess:.6g})")
+    if robust == "consensus":
+        typer.echo(f"left out as false: {counted(len(rejected), 'loop')}")
     if (minimum := optimised.chordal) is not None:
         proven = "the global minimum" if minimum.certified else "not proven to be the global minimum"
         typer.echo(f"chordal cost {minimum.cost:.8g}, {proven}: no poses below {minimum.bound:.8g}")

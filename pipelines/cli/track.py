@@ -26,6 +26,7 @@ def _track(
     lag: how.LagOption = None,
     association: how.AssociationOption = None,
     interactions: how.InteractionsOption = None,
+    predict: how.PredictOption = None,
     explain: how.ExplainOption = False,
     workers: Workers = None,
     ray: RayAddress = None,
@@ -36,14 +37,14 @@ def _track(
     from pipelines.explaining import trackers
     from pipelines.idle_edges import IdleEdges
     from pipelines.scale_out import TrackTask
-    from pipelines.tracking import track_dataset
+    from pipelines.tracking import keep_predictions, track_dataset
 
     settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
-    kept = how.journal(explain, output, at_scale(workers, ray))
+    kept, horizons = how.journal(explain, output, at_scale(workers, ray)), how.horizons(predict, method)
     idle = IdleEdges(settings.of_method(method).tracker.edges)
     if at_scale(workers, ray):
-        task = TrackTask(settings, method, source)
+        task = TrackTask(settings, method, source, horizons)
         report = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
         idle.add(task.classes(report.counts))
         idle.warn()
@@ -53,8 +54,9 @@ def _track(
     with source.open() as dataset:
         scenes = dataset.scenes
         with progress_bar(len(scenes)) as progress, trackers(settings, method, scenes, kept) as new_tracker:
-            runs = summary.of(track_dataset(dataset, new_tracker, progress=progress))
-            source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in runs))
+            runs = summary.of(track_dataset(dataset, new_tracker, progress=progress, horizons=horizons))
+            with keep_predictions(runs, output, horizons is not None) as kept_runs:
+                source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
     summary.write_record(method, settings)
     idle.add(summary.classes)
     idle.warn()
@@ -65,6 +67,7 @@ _EXAMPLES = (
     "track {recordings} --output {tracks}",
     "track {recordings} --output {tracks} --method kf --config mine.yaml",
     "track {recordings} --output {tracks} --estimator fixed-lag --lag 3",
+    "track {recordings} --output {tracks} --predict 1,2,3",
     "track {recordings} --output run --workers 0   # all cores; writes run/tracks/",
 )
 

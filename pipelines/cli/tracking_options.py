@@ -12,6 +12,7 @@ from saga_fg.tracking import AssociationName, EstimatorName
 
 if TYPE_CHECKING:
     from pipelines.config import Method, TrackConfig
+    from saga_fg.numerics.arrays import FloatArray
 
 _METHOD = typer.Option(
     "--method",
@@ -49,6 +50,15 @@ ExplainOption = Annotated[
     bool,
     typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
 ]
+PredictOption = Annotated[
+    str | None,
+    typer.Option(
+        "--predict",
+        help="Predict the tracks of every moment to these s after it, and keep that beside the output: "
+        "OUTPUT.predictions.csv, for `saga-fg report`.",
+        metavar="S,S,...",
+    ),
+]
 
 
 def configured(
@@ -84,6 +94,22 @@ def with_interactions(config: TrackConfig, method: str, interactions: Path | Non
     if method != "saga":
         raise InputError(f"--interactions {interactions}: goes with --method saga, {method} has no interactions")
     return config.with_interactions(load_interactions(interactions))
+
+
+def horizons(predict: str | None, method: Method) -> FloatArray | None:
+    """The horizons (H,) of --predict, s; None if it is left out. Raises `InputError` for anything else."""
+    from saga_fg.types.predicted_tracks import checked_horizons
+
+    if predict is None:
+        return None
+    if method == "centerpoint":
+        raise InputError("--predict: expected --method saga or kf, centerpoint predicts nothing")
+    try:
+        return checked_horizons([float(text) for text in predict.split(",")])
+    except InputError as error:
+        raise InputError(f"--predict: {error}") from error
+    except ValueError as error:
+        raise InputError(f"--predict: expected seconds with commas between them, got {predict[:40]!r}") from error
 
 
 def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:

@@ -81,6 +81,8 @@ def _report(comparison: Comparison, config: TrackConfig, first: int, start: int)
         configuration=write_settings(config, comments=False),
         notes=[NOTE],
         start=start,
+        ghosts=True,  # of these it tells
+        beside="kf",
     )
 
 

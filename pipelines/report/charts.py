@@ -40,8 +40,11 @@ def accuracy_charts(errors: LabelErrors) -> list[Chart]:
     """Return distributions of the errors at labels by class, and the shares that the tracks' ellipses hold."""
     classes = {name: of_class for name, of_class in errors_by_class(errors).items() if name != "overall"}
     charts = [
-        _distribution(
-            f"{title} at labels", unit, [(name, e.sample(field).values * scale) for name, e in classes.items()]
+        distribution(
+            f"{title} at labels",
+            unit,
+            "share of labels below",
+            [(name, e.sample(field).values * scale) for name, e in classes.items()],
         )
         for title, unit, field, scale in (
             ("Position error", "m", "position", 1.0),
@@ -67,12 +70,12 @@ def latency_chart(milliseconds: FloatArray) -> Chart:
     return Chart(title, "ms", "frames", [Series("frames", edges.tolist(), counts.tolist())], bars=True)
 
 
-def _distribution(title: str, unit: str, samples: Sequence[tuple[str, FloatArray]]) -> Chart:
-    """Return cumulative distributions up to the 99 % quantile."""
+def distribution(title: str, unit: str, share_of: str, samples: Sequence[tuple[str, FloatArray]]) -> Chart:
+    """Return cumulative distributions up to the 99 % quantile, of the samples with enough values."""
     share = np.linspace(0.0, 0.99, CURVE_POINTS)
     series = [
         Series(name, np.quantile(values, share).tolist(), share.tolist())
         for name, values in samples
         if len(values) >= FEWEST
     ]
-    return Chart(title, unit, "share of labels below", series)
+    return Chart(title, unit, share_of, series)

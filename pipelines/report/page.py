@@ -17,13 +17,18 @@ from typing import Any
 from data_tools.figures import FigureTable, as_json
 from pipelines.report.charts import Chart
 from pipelines.report.scenes import ReportScene, scene_data
+from pipelines.report.thresholds import start_thresholds
+
+SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "player.js")
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
     """Content of a page; `facts` are lines under the title, `notes` paragraphs above the player.
 
-    start  moment of the first scene that the player shows first
+    start   moment of the first scene that the player shows first
+    ghosts  whether it shows tracks that nobody sees now from the start
+    beside  the method that it shows beside the last one from the start, "" for none
     """
 
     title: str
@@ -34,6 +39,8 @@ class Report:
     configuration: str = ""
     notes: Sequence[str] = ()
     start: int = 0
+    ghosts: bool = False
+    beside: str = ""
 
 
 def report_page(report: Report) -> str:
@@ -42,6 +49,9 @@ def report_page(report: Report) -> str:
         "scenes": [scene_data(scene) for scene in report.scenes],
         "charts": [asdict(chart) for chart in report.charts],
         "start": report.start,
+        "ghosts": report.ghosts,
+        "beside": report.beside,
+        "thresholds": start_thresholds(report.scenes),
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""
     page = _part("page.html")
@@ -53,7 +63,7 @@ def report_page(report: Report) -> str:
         ("CONFIGURATION", configuration),
         ("STYLE", _part("page.css")),
         ("DATA", _packed(data)),
-        ("SCRIPT", _part("charts.js") + _part("road.js") + _part("player.js")),
+        ("SCRIPT", "".join(map(_part, SCRIPTS))),
     ):
         page = page.replace(f"<!--{mark}-->", text)
     return page

@@ -1,7 +1,5 @@
 const $ = id => document.getElementById(id);
-const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, SCORE = 9, XX = 10, XY = 11, YY = 12, COASTING = 13;
-const ELLIPSE_95 = 5.991, TRAIL = 3, COASTS = 150;  // chi-square with 2 degrees of freedom; s; ms
-const LAYERS = {road: "road", truth: "true objects", detections: "detections", tracks: "tracks", ids: "ids", trails: "trails", ellipses: "ellipses", edges: "edges"};
+const NEAREST = 1, FARTHEST = 80, START = 9;  // zoom, pixels per m
 
 async function unpack(text) {
   const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -9,214 +7,149 @@ async function unpack(text) {
   return JSON.parse(await new Response(stream).text());
 }
 
-function player(scenes, start) {
+function player({scenes, start, thresholds, ghosts, beside}) {
   const canvas = $("view"), g = canvas.getContext("2d");
-  const shown = Object.fromEntries(Object.keys(LAYERS).map(name => [name, name !== "ids"]));
-  let scene = scenes[0], k = 0, picked = null, timer = null, zoom = 9, offset = [0, 0], hatching = null;
+  const shown = Object.fromEntries(LAYERS.map(layer => [layer.name, layer.on]));
+  const filters = makeFilters(scenes, thresholds, ghosts, () => draw());
+  let scene = scenes[0], k = 0, picked = null, timer = null, zoom = START, offset = [0, 0], home = null, views = [];
+  // picked: {method, id} of the track that is followed; views: of the last drawing, from left to right
 
-  const method = () => scene.methods[$("method").value];
   const last = () => scene.times.length - 1;
+  const names = () => $("beside").value ? [$("beside").value, $("method").value] : [$("method").value];
+  const rowOf = track => track && scene.methods[track.method].moments[k].find(row => row[ID] === track.id);
 
   function chooseScene(index) {
     scene = scenes[index];
-    const before = $("method").value, names = Object.keys(scene.methods);
-    $("method").replaceChildren(...names.map(name => new Option(name, name)));
-    $("method").value = names.includes(before) ? before : names[names.length - 1];
-    $("method").hidden = names.length < 2;
+    const before = [$("method").value, $("scene").dataset.chosen ? $("beside").value : beside], there = Object.keys(scene.methods);
+    $("scene").selectedIndex = index; $("scene").dataset.chosen = "yes";
+    $("method").replaceChildren(...there.map(name => new Option(name, name)));
+    $("method").value = there.includes(before[0]) ? before[0] : there[there.length - 1];
+    $("beside").replaceChildren(new Option("alone", ""), ...there.map(name => new Option(`beside ${name}`, name)));
+    $("beside").value = there.includes(before[1]) ? before[1] : "";
+    $("method").hidden = $("beside").hidden = there.length < 2;
     $("time").max = last();
-    $("show-road").parentElement.hidden = !scene.road;
+    for (const layer of LAYERS) $(`show-${layer.name}`).parentElement.hidden = !(layer.there ? layer.there(scene) : true);
+    filters.showClasses(scene);
+    home = moves(scene) ? null : extent(scene);
     picked = null;
+    goHome();
+    chooseMethods();
     show(0);
+  }
+
+  function chooseMethods() {
+    if (picked && !names().includes(picked.method)) picked = null;
+    filters.showScores(names());
+    showHorizons(names().map(name => scene.methods[name]), draw);
+    draw();
+  }
+
+  function extent(scene) {  // of all tracks of a scene without a vehicle that moves; null without tracks
+    const rows = Object.values(scene.methods).flatMap(result => result.moments.flat());
+    if (!rows.length) return null;
+    const [x0, x1, y0, y1] = rows.reduce(([a, b, c, d], row) =>
+      [Math.min(a, row[X]), Math.max(b, row[X]), Math.min(c, row[Y]), Math.max(d, row[Y])], [Infinity, -Infinity, Infinity, -Infinity]);
+    return {x: (x0 + x1) / 200, y: (y0 + y1) / 200, width: (x1 - x0) / 100 + 12, height: (y1 - y0) / 100 + 12};
+  }
+
+  function goHome() {
+    offset = [0, 0];
+    const fit = home && Math.min(canvas.clientWidth / names().length / home.width, canvas.clientHeight / home.height);
+    zoom = fit ? Math.max(NEAREST, Math.min(25, fit)) : START;
   }
 
   function show(moment) {
     k = Math.max(0, Math.min(last(), moment));
     $("time").value = k;
     $("clock").value = `${scene.times.length ? scene.times[k].toFixed(1) : "-"} s`;
+    showImages(scene, k);
     draw();
   }
 
-  function outline(x, y, length, width, yaw) {
-    const c = Math.cos(yaw), s = Math.sin(yaw);
-    g.beginPath();
-    for (const [a, b] of [[.5, .5], [-.5, .5], [-.5, -.5], [.5, -.5]])
-      g.lineTo(x + c * a * length - s * b * width, y + s * a * length + c * b * width);
-    g.closePath();
-  }
-
-  const box = (row, at) => outline(row[at] / 100, row[at + 1] / 100, row[at + 2] / 100, row[at + 3] / 100, row[at + 4] / 1000);
-  const colourOf = id => COLOURS[id % COLOURS.length];
-  const trackNow = id => method().moments[k].find(row => row[ID] === id);
-
-  function hidden() {
-    if (hatching) return hatching;
-    const tile = document.createElement("canvas");
-    tile.width = tile.height = 8;
-    const t = tile.getContext("2d");
-    t.fillStyle = "#f3dcc4"; t.fillRect(0, 0, 8, 8);
-    t.strokeStyle = "#b5651d"; t.beginPath(); t.moveTo(0, 8); t.lineTo(8, 0); t.stroke();
-    return hatching = g.createPattern(tile, "repeat");
-  }
-
   function centre() {
-    const [ex, ey, yaw] = scene.ego[k];
-    const row = picked === null ? null : trackNow(picked);
-    return row ? [row[X] / 100, row[Y] / 100, yaw / 1000] : [ex / 100, ey / 100, yaw / 1000];
+    const [ex, ey, yaw] = scene.ego[k], row = rowOf(picked);
+    if (row) return [...middle(row), yaw / 1000];
+    return home ? [home.x, home.y, 0] : [ex / 100, ey / 100, yaw / 1000];
   }
 
-  function place() {  // world to pixels: driving direction to the right, left of the vehicle up
-    const ratio = window.devicePixelRatio || 1, [x, y, yaw] = centre();
-    canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+  function place(pane, panes) {  // world to pixels: driving direction to the right, left of the vehicle up
+    const ratio = window.devicePixelRatio || 1, [x, y, yaw] = centre(), width = canvas.clientWidth / panes;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
-    g.translate(canvas.clientWidth * .42 + offset[0], canvas.clientHeight / 2 + offset[1]);
+    g.beginPath(); g.rect(pane * width, 0, width, canvas.clientHeight); g.clip();
+    const across = home || picked ? .5 : .42;
+    g.translate((pane + across) * width + offset[0], canvas.clientHeight / 2 + offset[1]);
     g.scale(zoom, -zoom);
     g.rotate(-yaw); g.translate(-x, -y);
-    hidden().setTransform(g.getTransform().inverse());  // hatched in pixels, not in metres
   }
 
   function draw() {
     if (!scene.times.length) return;
-    place();
-    const tracks = method().moments[k], thin = 1 / zoom;
-    if (shown.road && scene.road) drawRoad(g, scene.road, k, thin);
-    if (shown.truth && scene.truth) for (const row of scene.truth[k]) { box(row, 1); g.fillStyle = row[6] ? "#cfd6dc" : hidden(); g.fill(); }
-    drawEgo();
-    if (shown.detections) {
-      g.strokeStyle = "#27313b"; g.lineWidth = thin;
-      for (const row of scene.detections[k]) {
-        g.globalAlpha = .25 + .6 * Math.max(0, Math.min(1, row[6] / 1000));
-        const x = row[1] / 100, y = row[2] / 100, r = 4 * thin;
-        g.beginPath(); g.moveTo(x - r, y - r); g.lineTo(x + r, y + r); g.moveTo(x - r, y + r); g.lineTo(x + r, y - r); g.stroke();
+    const ratio = window.devicePixelRatio || 1, methods = names();
+    canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+    views = methods.map((name, pane) => {
+      const followed = picked?.method === name ? picked.id : null;
+      const tracks = filters.rows(scene, name, k, followed);
+      const view = {g, thin: 1 / zoom, scene, k, name, result: scene.methods[name], tracks,
+        focus: tracks.find(row => row[ID] === followed) ?? null,
+        colour: row => filters.colour(scene, row), shownClass: label => filters.shownClass(scene, label)};
+      g.save();
+      place(pane, methods.length);
+      for (const layer of LAYERS) {
+        if (layer.there && !layer.there(scene)) continue;
+        view.on = shown[layer.name];
+        if (!view.on && !(layer.focused && view.focus)) continue;
+        g.save(); layer.draw(view); g.restore();
       }
-      g.globalAlpha = 1;
-    }
-    if (shown.trails) drawTrails(tracks, thin);
-    if (shown.edges) drawEdges(tracks, thin);
-    if (shown.ellipses) for (const row of tracks) drawEllipse(row, thin);
-    if (shown.tracks) for (const row of tracks) drawTrack(row, thin);
-    if (shown.ids) drawIds(tracks);
+      view.inverse = g.getTransform().inverse();
+      g.restore();
+      return view;
+    });
+    if (methods.length > 1) drawNames(methods, ratio);
+    canvas.dataset.tracks = views.map(view => view.tracks.length).join(" ");
     describe();
   }
 
-  function drawEgo() {
-    const [x, y, yaw] = scene.ego[k];
-    g.save(); g.translate(x / 100, y / 100); g.rotate(yaw / 1000); g.beginPath();
-    for (const p of [[2.3, 0], [-1.5, 1.1], [-.7, 0], [-1.5, -1.1]]) g.lineTo(...p);
-    g.closePath(); g.fillStyle = "#1d2733"; g.fill(); g.restore();
-  }
-
-  function drawTrails(tracks, thin) {
-    const alive = new Set(tracks.map(row => row[ID])), trails = new Map();
-    for (let i = k; i >= 0 && scene.times[k] - scene.times[i] <= TRAIL; i--)
-      for (const row of method().moments[i]) if (alive.has(row[ID])) {
-        if (!trails.has(row[ID])) trails.set(row[ID], []);
-        trails.get(row[ID]).push([row[X] / 100, row[Y] / 100]);
-      }
-    g.lineWidth = 1.5 * thin; g.globalAlpha = .45;
-    for (const [id, points] of trails) { g.strokeStyle = colourOf(id); g.beginPath(); for (const p of points) g.lineTo(...p); g.stroke(); }
-    g.globalAlpha = 1;
-  }
-
-  function drawEdges(tracks, thin) {
-    const at = new Map(tracks.map(row => [row[ID], [row[X] / 100, row[Y] / 100]]));
-    g.lineWidth = 1.2 * thin;
-    for (const [target, source, rate] of method().edges[k]) {
-      const a = at.get(source), b = at.get(target);
-      if (!a || !b) continue;
-      g.globalAlpha = .25 + .75 * Math.min(1, rate / 500);
-      g.strokeStyle = g.fillStyle = "#5c6b7a";
-      const angle = Math.atan2(b[1] - a[1], b[0] - a[0]), head = 8 * thin;
-      g.beginPath(); g.moveTo(...a); g.lineTo(...b); g.stroke();
-      g.beginPath(); g.moveTo(...b);
-      for (const turn of [2.7, -2.7]) g.lineTo(b[0] + head * Math.cos(angle + turn), b[1] + head * Math.sin(angle + turn));
-      g.fill();
-    }
-    g.globalAlpha = 1;
-  }
-
-  function drawEllipse(row, thin) {
-    if (row[XX] === null) return;
-    const [a, b, d] = [row[XX] / 1e4, row[XY] / 1e4, row[YY] / 1e4];
-    const middle = (a + d) / 2, spread = Math.hypot((a - d) / 2, b), angle = Math.atan2(2 * b, a - d) / 2;
-    g.strokeStyle = colourOf(row[ID]); g.globalAlpha = .4; g.lineWidth = thin; g.beginPath();
-    g.ellipse(row[X] / 100, row[Y] / 100, Math.sqrt(ELLIPSE_95 * (middle + spread)), Math.sqrt(ELLIPSE_95 * Math.max(0, middle - spread)), angle, 0, 7);
-    g.stroke(); g.globalAlpha = 1;
-  }
-
-  function drawTrack(row, thin) {
-    const mine = row[ID] === picked;
-    g.strokeStyle = g.fillStyle = colourOf(row[ID]);
-    g.globalAlpha = mine ? 1 : .3 + .7 * Math.max(0, Math.min(1, row[SCORE] / 1000));
-    g.lineWidth = (mine ? 4 : 2) * thin;
-    g.setLineDash(row[COASTING] > COASTS ? [5 * thin, 4 * thin] : []);
-    box(row, X); g.stroke(); g.setLineDash([]);
-    g.globalAlpha *= .12; g.fill(); g.globalAlpha = 1;
-    const c = Math.cos(row[YAW] / 1000) * row[LENGTH] / 200, s = Math.sin(row[YAW] / 1000) * row[LENGTH] / 200;
-    g.lineWidth = thin; g.beginPath(); g.moveTo(row[X] / 100, row[Y] / 100); g.lineTo(row[X] / 100 + c, row[Y] / 100 + s); g.stroke();
-  }
-
-  function drawIds(tracks) {
-    const world = g.getTransform(), ratio = window.devicePixelRatio || 1;
+  function drawNames(methods, ratio) {
+    const width = canvas.clientWidth / methods.length;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
-    g.font = "11px system-ui, sans-serif";
-    for (const row of tracks) {
-      const p = world.transformPoint(new DOMPoint(row[X] / 100, row[Y] / 100));
-      g.fillStyle = colourOf(row[ID]);
-      g.fillText(shortName(row[ID]), p.x / ratio + 6, p.y / ratio - 6);
-    }
-    g.setTransform(world);
+    g.font = "bold 13px system-ui, sans-serif"; g.fillStyle = SOFT; g.strokeStyle = "#c3ccd4";
+    methods.forEach((name, pane) => {
+      g.fillText(name, pane * width + 12, 20);
+      if (pane) { g.beginPath(); g.moveTo(pane * width, 0); g.lineTo(pane * width, canvas.clientHeight); g.stroke(); }
+    });
   }
-
-  const shortName = id => method().ids[id].split("-").pop();
 
   function describe() {
-    const panel = $("panel");
-    if (picked === null) { panel.replaceChildren(); return; }
-    const row = trackNow(picked), life = method().moments.map(rows => rows.find(r => r[ID] === picked));
-    const seen = life.map((r, i) => r ? i : -1).filter(i => i >= 0);
-    const speed = r => Math.hypot(r[VX], r[VY]) / 100, facts = [];
-    if (row) {
-      facts.push(["class", scene.labels[row[LABEL]]], ["score", (row[SCORE] / 1000).toFixed(2)]);
-      if (row[VX] !== null) facts.push(["speed", `${speed(row).toFixed(1)} m/s`]);
-      if (row[XX] !== null) facts.push(["position ±", `${(Math.sqrt((row[XX] + row[YY]) / 2) / 100).toFixed(2)} m`]);
-      if (row[COASTING] !== null) facts.push(["unseen for", `${(row[COASTING] / 1000).toFixed(1)} s`]);
-      const led = method().edges[k].filter(e => e[0] === picked).map(e => shortName(e[1]));
-      if (led.length) facts.push(["influenced by", led.join(", ")]);
-    } else facts.push(["now", "not there"]);
-    facts.push(["from, to", `${scene.times[seen[0]].toFixed(1)} to ${scene.times[seen[seen.length - 1]].toFixed(1)} s`]);
-    const title = document.createElement("h2"), list = document.createElement("dl");
-    title.textContent = `track ${method().ids[picked]}`; title.style.color = colourOf(picked);
-    for (const [name, value] of facts) {
-      const dt = document.createElement("dt"), dd = document.createElement("dd");
-      dt.textContent = name; dd.textContent = value; list.append(dt, dd);
-    }
-    panel.replaceChildren(title, list, sparkline(life, r => r[VX] === null ? null : speed(r), "speed, m/s"), sparkline(life, r => r[SCORE] / 1000, "score"));
+    if (!picked) { $("panel").replaceChildren(); return; }
+    const result = scene.methods[picked.method], row = result.moments.flat().find(each => each[ID] === picked.id);
+    describeTrack($("panel"), scene, result, k, picked.id, filters.colour(scene, row));
   }
 
-  function sparkline(life, value, name) {
-    const W = 188, H = 44, values = life.map(r => r ? value(r) : null), top = Math.max(...values.map(v => v ?? 0), .01);
-    const plot = svg("svg", {viewBox: `0 0 ${W} ${H}`, width: W, height: H, role: "img", "aria-label": name});
-    const px = i => i / Math.max(1, life.length - 1) * W, py = v => H - 4 - v / top * (H - 16);
-    let path = "";
-    values.forEach((v, i) => { if (v !== null) path += `${i && values[i - 1] !== null ? "L" : "M"}${px(i).toFixed(1)} ${py(v).toFixed(1)}`; });
-    plot.append(svg("path", {d: path, fill: "none", stroke: colourOf(picked), "stroke-width": 1.5}),
-      svg("line", {x1: px(k), x2: px(k), y1: 12, y2: H, stroke: "#aab4be"}),
-      svg("text", {x: 0, y: 9, style: "font-size:10px;fill:#5c6b7a"}, `${name}, up to ${top.toFixed(1)}`));
-    return plot;
+  function follow(track) {
+    picked = track;
+    offset = [0, 0];
+    draw();
+    remember();
   }
 
   function pick(event) {
-    const ratio = window.devicePixelRatio || 1;
-    const p = g.getTransform().inverse().transformPoint(new DOMPoint(event.offsetX * ratio, event.offsetY * ratio));
-    const reach = r => Math.max(r[LENGTH] / 200, 12 / zoom);
-    const near = method().moments[k].map(r => [Math.hypot(r[X] / 100 - p.x, r[Y] / 100 - p.y) - reach(r), r[ID]]).filter(d => d[0] < 0);
-    picked = near.length ? near.sort((a, b) => a[0] - b[0])[0][1] : null;
-    offset = [0, 0];
-    draw();
+    const ratio = window.devicePixelRatio || 1, pane = Math.min(views.length - 1, Math.floor(event.offsetX / canvas.clientWidth * views.length));
+    const view = views[Math.max(0, pane)], p = view.inverse.transformPoint(new DOMPoint(event.offsetX * ratio, event.offsetY * ratio));
+    const reach = row => Math.max(row[LENGTH] / 200, 12 / zoom);
+    const near = view.tracks.map(row => [Math.hypot(row[X] / 100 - p.x, row[Y] / 100 - p.y) - reach(row), row[ID]]).filter(d => d[0] < 0);
+    follow(near.length ? {method: view.name, id: near.sort((a, b) => a[0] - b[0])[0][1]} : null);
+  }
+
+  function next(step) {  // the tracks in view one after the other, the nearest to the vehicle first
+    const [ex, ey] = scene.ego[k], view = views.find(each => each.name === picked?.method) ?? views[views.length - 1];
+    const order = [...view.tracks].sort((a, b) => Math.hypot(a[X] - ex, a[Y] - ey) - Math.hypot(b[X] - ex, b[Y] - ey)).map(row => row[ID]);
+    if (!order.length) return;
+    const at = picked ? order.indexOf(picked.id) : step > 0 ? -1 : 0;
+    follow({method: view.name, id: order[(at + step + order.length) % order.length]});
   }
 
   function play() {
-    if (timer) { clearTimeout(timer); timer = null; $("play").textContent = "Play"; return; }
+    if (timer) { clearTimeout(timer); timer = null; $("play").textContent = "Play"; remember(); return; }
     $("play").textContent = "Pause";
     const step = () => {
       show(k >= last() ? 0 : k + 1);
@@ -225,6 +158,57 @@ function player(scenes, start) {
     };
     timer = setTimeout(step, 0);
   }
+
+  function moment() {  // the address of what is shown
+    const parts = {scene: scene.name, t: scene.times[k]?.toFixed(3), method: $("method").value, beside: $("beside").value};
+    if (picked) parts.id = scene.methods[picked.method].ids[picked.id];
+    return "#" + new URLSearchParams(Object.entries(parts).filter(part => part[1]));
+  }
+
+  function remember() {
+    try { history.replaceState(null, "", moment()); } catch { return; }  // a frame of another page may not
+  }
+
+  function visit(hash) {  // #scene=...&t=seconds&id=track&method=...&beside=..., each may be left out
+    const asked = new URLSearchParams(hash.slice(1)), at = scenes.findIndex(each => each.name === asked.get("scene"));
+    if (at >= 0 && scenes[at] !== scene) chooseScene(at);
+    for (const select of ["method", "beside"])
+      if (asked.has(select) && scene.methods[asked.get(select)]) $(select).value = asked.get(select);
+    chooseMethods();
+    const t = parseFloat(asked.get("t"));
+    if (Number.isFinite(t)) show(scene.times.reduce((best, time, i) => Math.abs(time - t) < Math.abs(scene.times[best] - t) ? i : best, 0));
+    const named = id => id === asked.get("id") || shortName(id) === asked.get("id");
+    const owner = [...names()].reverse().find(name => scene.methods[name].ids.some(named));
+    if (!owner) return;
+    picked = {method: owner, id: scene.methods[owner].ids.findIndex(named)};
+    if (!Number.isFinite(t) && !rowOf(picked)) show(scene.methods[owner].moments.findIndex(rows => rows.some(row => row[ID] === picked.id)));
+    offset = [0, 0];
+    draw();
+  }
+
+  function resize(factor) { zoom = Math.max(NEAREST, Math.min(FARTHEST, zoom * factor)); draw(); }
+
+  function toggle(name) { const box = $(`show-${name}`); box.checked = !box.checked; box.onchange(); }
+
+  const step = by => { show(k + by); remember(); };
+  const KEYS = {
+    " ": ["space", "play and pause", play],
+    ArrowRight: ["→", "next moment", e => step(e.shiftKey ? 10 : 1)],
+    ArrowLeft: ["←", "moment before; with shift: ten", e => step(e.shiftKey ? -10 : -1)],
+    n: ["n", "follow the next track, the nearest to the vehicle first", () => next(1)],
+    p: ["p", "follow the one before", () => next(-1)],
+    Escape: ["Esc", "follow none", () => follow(null)],
+    "+": ["+", "closer; the wheel, too", () => resize(1.25)],
+    "-": ["-", "farther", () => resize(.8)],
+    0: ["0", "back to the vehicle", () => { goHome(); follow(null); }],
+    "]": ["]", "fewer tracks: a higher least score", () => filters.shift(.05)],
+    "[": ["[", "more tracks", () => filters.shift(-.05)],
+    g: ["g", "ghosts: tracks that nobody sees now", () => toggle("ghosts")],
+    d: ["d", "detections", () => toggle("detections")],
+    e: ["e", "edges of the graph", () => toggle("edges")],
+    i: ["i", "ids", () => toggle("ids")],
+    "?": ["?", "this help", () => $("help").showModal()],
+  };
 
   let held = null, moved = 0;
   canvas.onpointerdown = e => { held = [e.clientX, e.clientY]; moved = 0; canvas.setPointerCapture(e.pointerId); };
@@ -236,31 +220,55 @@ function player(scenes, start) {
     draw();
   };
   canvas.onpointerup = e => { held = null; if (moved < 5) pick(e); };
-  canvas.onwheel = e => { e.preventDefault(); zoom = Math.max(1, Math.min(80, zoom * Math.exp(-e.deltaY / 500))); draw(); };
+  canvas.onwheel = e => { e.preventDefault(); resize(Math.exp(-e.deltaY / 500)); };
   document.onkeydown = e => {
-    if (["SELECT", "INPUT", "BUTTON", "SUMMARY"].includes(e.target.tagName)) return;
-    const keys = {" ": play, ArrowRight: () => show(k + 1), ArrowLeft: () => show(k - 1), 0: () => { offset = [0, 0]; zoom = 9; picked = null; draw(); }};
-    if (keys[e.key]) { e.preventDefault(); keys[e.key](); }
+    if (["SELECT", "INPUT", "BUTTON", "SUMMARY"].includes(e.target.tagName) || $("help").open || e.ctrlKey || e.metaKey || e.altKey) return;
+    if (KEYS[e.key]) { e.preventDefault(); KEYS[e.key][2](e); }
   };
   window.onresize = draw;
+  window.onhashchange = () => visit(location.hash);
   $("play").onclick = play;
   $("time").oninput = () => show(+$("time").value);
-  $("method").onchange = () => { picked = null; draw(); };
-  $("scene").onchange = () => chooseScene($("scene").selectedIndex);
+  $("time").onchange = remember;
+  $("method").onchange = $("beside").onchange = () => { chooseMethods(); remember(); };
+  $("scene").onchange = () => { chooseScene($("scene").selectedIndex); remember(); };
   $("scene").append(...scenes.map(s => new Option(s.name)));
-  for (const [name, text] of Object.entries(LAYERS)) {
-    const label = document.createElement("label"), input = document.createElement("input");
-    input.type = "checkbox"; input.checked = shown[name]; input.id = `show-${name}`;
-    input.onchange = () => { shown[name] = input.checked; draw(); };
-    label.append(input, ` ${text}`); $("toggles").append(label);
+  $("ask").onclick = () => $("help").showModal();
+  $("link").onclick = async () => {
+    remember();
+    await navigator.clipboard?.writeText(location.href.replace(/#.*|$/, "") + moment()).catch(() => {});
+    $("link").textContent = "Copied"; setTimeout(() => { $("link").textContent = "Link"; }, 1500);
+  };
+  for (const [sign, text] of Object.values(KEYS)) {
+    const dt = document.createElement("dt"), dd = document.createElement("dd");
+    dt.textContent = sign; dd.textContent = text; $("keys").append(dt, dd);
   }
+  const check = (name, text, on, set) => {
+    const label = document.createElement("label"), input = document.createElement("input");
+    input.type = "checkbox"; input.checked = on; input.id = `show-${name}`;
+    input.onchange = () => { set(input.checked); draw(); };
+    label.append(input, ` ${text}`); $("toggles").append(label);
+  };
+  for (const [name, text] of filters.toggles) check(name, text, filters.state[name], on => { filters.state[name] = on; });
+  for (const layer of LAYERS) check(layer.name, layer.text ?? layer.name, layer.on, on => { shown[layer.name] = on; });
   chooseScene(0);
   show(start);
+  visit(location.hash);
+}
+
+function showImages(scene, k) {  // those of the cameras at a moment, as a strip
+  $("cameras").replaceChildren(...Object.entries(scene.cameras ?? {}).filter(([, images]) => images[k]).map(([name, images]) => {
+    const figure = document.createElement("figure"), caption = document.createElement("figcaption"), image = new Image();
+    caption.textContent = image.alt = name; image.setAttribute("src", `data:image/jpeg;base64,${images[k]}`);
+    figure.append(image, caption);
+    return figure;
+  }));
 }
 
 unpack($("data").textContent).then(data => {
   $("charts").append(...data.charts.map(drawChart));
   $("configuration").hidden = !$("configuration").querySelector("pre");
-  if (data.scenes.length) player(data.scenes, data.start);
+  $("player").hidden = !data.scenes.length;
+  if (data.scenes.length) player(data);
   document.body.dataset.ready = "yes";
 });

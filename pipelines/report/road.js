@@ -21,3 +21,23 @@ function drawRoad(g, road, k, thin) {  // lanes as bands, stop lines and lights 
   });
   g.restore();
 }
+
+const AREAS = {drivable: "#eceff2", crossing: "#dfe6d8", walkway: "#f1ede4"};
+
+function drawMap({g, scene, thin}) {  // areas, and lines of lanes, from the map of the recordings
+  for (const [kind, ...rings] of scene.map.areas) {
+    g.fillStyle = AREAS[kind];
+    g.beginPath();
+    for (const ring of rings) {
+      for (let i = 0; i < ring.length; i += 2) g[i ? "lineTo" : "moveTo"](ring[i] / 100, ring[i + 1] / 100);
+      g.closePath();
+    }
+    g.fill("evenodd");
+  }
+  g.strokeStyle = "#cdd5dc"; g.lineWidth = thin;
+  for (const line of scene.map.lines) {
+    g.beginPath();
+    for (let i = 0; i < line.length; i += 2) g.lineTo(line[i] / 100, line[i + 1] / 100);
+    g.stroke();
+  }
+}

@@ -12,7 +12,8 @@ from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
 from pipelines.scale_out.manifest import file_name
 from pipelines.smoothing import SmoothConfig, smooth_dataset
-from pipelines.tracking import TrackedScene, track_dataset
+from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.smoothing import LabelCounts
 from saga_fg.types.dataset import Dataset
 
@@ -21,24 +22,31 @@ _OF_CLASS = "tracks of "
 
 @dataclass(frozen=True)
 class TrackTask:
-    """Track the scenes of a part; results in tracks/, as the dataset writes them."""
+    """Track the scenes of a part; results in tracks/, as the dataset writes them.
+
+    horizons  (H,) s, to which the tracks of every moment are predicted; None for no predictions
+    """
 
     settings: TrackConfig
     method: Method
     source: DatasetSource
+    horizons: FloatArray | None = None
 
     @property
     def configuration(self) -> str:
         """The method, the form of the results, and the settings."""
-        head = f"# track, method {self.method}, results of {self.source.name} as {self.source.tracks_suffix}\n"
+        ahead = "" if self.horizons is None else f", predicted by {self.horizons.tolist()} s"
+        head = f"# track, method {self.method}, results of {self.source.name} as {self.source.tracks_suffix}{ahead}\n"
         return head + write_settings(self.settings, comments=False)
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the tracks; counts frames, boxes and tracks, these also by class."""
         counts = dict.fromkeys(("frames", "tracks", "boxes"), 0)
-        runs = _counted(track_dataset(dataset, lambda: self.settings.new_tracker(self.method)), counts)
-        (folder / "tracks").mkdir()
-        self.source.write_track_part(folder, file_name(name), dataset, ((run.scene, run.tracks) for run in runs))
+        tracked = track_dataset(dataset, lambda: self.settings.new_tracker(self.method), horizons=self.horizons)
+        runs, part = _counted(tracked, counts), folder / "tracks" / f"{file_name(name)}{self.source.tracks_suffix}"
+        part.parent.mkdir()
+        with keep_predictions(runs, part, self.horizons is not None) as kept:
+            self.source.write_track_part(folder, file_name(name), dataset, ((run.scene, run.tracks) for run in kept))
         return counts
 
     @staticmethod

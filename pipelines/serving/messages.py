@@ -3,13 +3,15 @@
 in   frame      what a sensor detected at one time; `type` may be left out
      status     asks for counts and latencies
      subscribe  asks for the tracks of all frames, not just of those this client sends
+     predict    asks for the tracks at times after the newest frame
      reset      forgets all tracks and the time: a new scene begins; with `sensor`, the number of that sensor alone
 out  tracks     the answer to a frame
      held       a frame that waits for its turn; its answer follows
      late       a frame that came too late and was left out
      unconfirmed  a frame whose time jumps, left out unless the next frame agrees
      repeat     a frame that was judged before
-     status, reset, subscribe   the answers to the requests
+     predictions  the answer to `predict`
+     status, reset, subscribe   the answers to the other requests
      error      a message that could not be used, and why; nothing else happened
 """
 
@@ -19,7 +21,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, NoReturn, cast
 
@@ -31,9 +33,10 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Coordinates, Detections, Frame
+from saga_fg.types.predicted_tracks import PredictedTracks, checked_horizons
 from saga_fg.types.track import Tracks
 
-REQUESTS = ("status", "subscribe", "reset")
+REQUESTS = ("status", "subscribe", "predict", "reset")
 
 POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
 NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
@@ -51,12 +54,17 @@ class FrameMessage:
     seq: int | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Request:
-    """One of `REQUESTS`; sensor: of a reset of the number of one sensor alone, whose next frame may have any."""
+    """One of `REQUESTS`.
+
+    sensor    of a reset of the number of one sensor alone, whose next frame may have any
+    horizons  (H,) of a request for predictions, s after the newest frame
+    """
 
     kind: str
     sensor: str | None = None
+    horizons: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Request:
@@ -79,8 +87,21 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Reque
     if kind == "reset" and "sensor" in message:
         _known("", message, ("type", "sensor"))
         return Request(kind, _name("", message, "sensor", ""))
+    if kind == "predict":
+        _known("", message, ("type", "horizons"))
+        return Request(kind, horizons=stream_horizons(message.get("horizons"), settings))
     _known("", message, ("type",))
     return Request(kind)
+
+
+def stream_horizons(given: Any, settings: StreamSettings) -> FloatArray:
+    """Return horizons (H,), s. Raises `InputError` unless they are increasing numbers within the stream's limits."""
+    if not isinstance(given, list) or len(given) > settings.max_horizons:
+        raise InputError(f"horizons: expected a list of at most {settings.max_horizons} s, got {_short(given)}")
+    horizons = checked_horizons([_number("horizons", {"": each}, "") for each in given])
+    if horizons[-1] > settings.max_horizon:
+        raise InputError(f"horizons: expected at most {settings.max_horizon:g} s, got {horizons[-1]:g}")
+    return horizons
 
 
 def tracks_message(tracks: Tracks) -> dict[str, Any]:
@@ -98,6 +119,27 @@ def tracks_message(tracks: Tracks) -> dict[str, Any]:
         for id_, label, row in zip(tracks.id.tolist(), boxes.label.tolist(), numbers.tolist(), strict=True)
     ]
     return {"type": "tracks", "timestamp": tracks.timestamp, "tracks": rows}
+
+
+def predictions_message(predicted: PredictedTracks) -> dict[str, Any]:
+    """Return the answer to a request for predictions: lists over the horizons, in world coordinates."""
+    P = predicted.position_covariance
+    numbers = np.stack(
+        [
+            *np.moveaxis(predicted.position, -1, 0),
+            *np.moveaxis(predicted.velocity, -1, 0),
+            predicted.yaw,
+            *(P[..., 0, 0], P[..., 0, 1], P[..., 1, 1]),
+        ]
+    )
+    names = ("x", "y", "vx", "vy", "yaw", "cov_xx", "cov_xy", "cov_yy")
+    rows = [
+        {"id": id_, "label": label}
+        | {name: x for name, x in zip(names, numbers[:, :, n].tolist(), strict=True) if np.isfinite(x).all()}
+        for n, (id_, label) in enumerate(zip(predicted.id.tolist(), predicted.label.tolist(), strict=True))
+    ]
+    horizons = predicted.horizons.tolist()
+    return {"type": "predictions", "timestamp": predicted.timestamp, "horizons": horizons, "tracks": rows}
 
 
 def late_message(newest: float) -> dict[str, Any]:

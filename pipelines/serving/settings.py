@@ -37,6 +37,10 @@ class StreamSettings(Settings):
         500, "largest number of detections of a frame; 500 take up to 0.2 s, for which all clients wait"
     )
     max_message: PositiveInt = setting(4 * MB, "largest size of a message, bytes")
+    max_horizon: Positive = setting(
+        10.0, "furthest time of a prediction, s; higher: such a request takes longer, and all clients wait for it"
+    )
+    max_horizons: PositiveInt = setting(20, "largest number of times of a prediction")
     max_failures: PositiveInt = setting(3, "internal errors in a row after which a fresh tracker starts")
     max_clients: PositiveInt = setting(
         256, "largest number of connections; fewer where the process may open fewer files"

@@ -21,15 +21,17 @@ from pipelines.serving.messages import (
     about,
     late_message,
     parse_message,
+    predictions_message,
     tracks_message,
     unconfirmed_message,
 )
 from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
 from pipelines.serving.settings import StreamSettings
-from pipelines.tracking import OnlineTracker
+from pipelines.tracking import OnlineTracker, PredictingTracker
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import TimeVerdict
 
 log = logging.getLogger(__name__)
@@ -91,6 +93,7 @@ class StreamTracker(Generic[Client]):
     new_tracker  makes a tracker; called at the start, on a reset, and after repeated internal errors
     settings     limits of the stream
     rules        edge rules of the tracker, to warn where none acts on a class of the tracks
+    horizons     (H,) s, to which every answer to a frame has predictions; None for none
     keeper       keeps the state in a file, None: nothing is kept
 
     A line that cannot be used is answered, counted and otherwise without effect; so is one that makes the tracker fail.
@@ -103,6 +106,7 @@ class StreamTracker(Generic[Client]):
         new_tracker: Callable[[], StreamedTracker],
         settings: StreamSettings | None = None,
         rules: Sequence[EdgeRule] = (),
+        horizons: FloatArray | None = None,
     ) -> None:
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
@@ -119,6 +123,7 @@ class StreamTracker(Generic[Client]):
         self._failed_in_a_row = 0
         self._log_limit = LogLimit()
         self._idle_edges = IdleEdges(rules)
+        self._horizons = horizons
         self._started = time.monotonic()
         self._lock = threading.Lock()
 
@@ -197,6 +202,8 @@ class StreamTracker(Generic[Client]):
             return [(client, self.status())]
         if message.kind == "subscribe":
             return [(client, {"type": "subscribe"})]
+        if message.kind == "predict":
+            return [(client, self._predictions(message.horizons))]
         answers = self._flush()  # held frames would bring numbers back
         if message.sensor is None:
             self._begin_anew()
@@ -274,7 +281,14 @@ class StreamTracker(Generic[Client]):
             self.counts["jumps"] += 1
             self._held.set_clock(frame.timestamp)
             clock = {"clock": verdict}
-        return tracks_message(tracks) | clock | self._about(message)
+        predicted = {} if self._horizons is None else {"predictions": self._predictions(self._horizons)}
+        return tracks_message(tracks) | predicted | clock | self._about(message)
+
+    def _predictions(self, horizons: FloatArray) -> Answer:
+        """Return the tracks at times after the newest frame, s. Raises `InputError` where there are none."""
+        if not isinstance(self._tracker, PredictingTracker):
+            raise InputError("predict: expected --method saga or kf, centerpoint predicts nothing")
+        return predictions_message(self._tracker.predict(horizons))
 
     def _about(self, message: FrameMessage) -> Answer:
         """Return the fields that identify a frame for its client, and the last number of its sensor on the disk."""

@@ -4,7 +4,8 @@
 * iSAM2 with QR factorisation (with Cholesky it throws on badly conditioned graphs), a few poses at a time, each
   starting where a measurement from an earlier pose puts it, then updated until the error changes no more. Poses that
   come one by one cost an update each; where loops are large, as on a sphere, every one of these factorises most of the
-  graph.
+  graph;
+* graduated non-convexity over Levenberg-Marquardt, with truncated least squares and odometry as known inliers.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 
 from factors import pose
 from saga_fg.errors import InputError
-from saga_fg.slam.pose_graph import PoseGraph, factor_graph, pose_values
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.slam.pose_graph import PoseGraph, factor_graph, pose_array, pose_values, trusted
 
 _UNCHANGED = 1e-9  # relative change of the error below which iSAM2 counts as converged
 _ROUNDS = 20  # of relinearisation at most, after the last measurement
@@ -65,6 +67,16 @@ def isam2(graph: PoseGraph, batch: int = 10) -> float:
         if abs(before - error) <= _UNCHANGED * before:
             break
     return float(error)
+
+
+def graduated(graph: PoseGraph) -> tuple[FloatArray, BoolArray]:
+    """Poses of `gtsam.GncLMOptimizer` from the guess in the graph, and which measurements (M,) it kept."""
+    params = gtsam.GncLMParams()
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers([0, *(1 + np.flatnonzero(trusted(graph))).tolist()])
+    optimizer = gtsam.GncLMOptimizer(factor_graph(graph), pose_values(graph.world_T_pose), params)
+    poses = pose_array(optimizer.optimize(), graph.dim)
+    return poses, np.asarray(optimizer.getWeights())[1:] > 0.5
 
 
 def _arrivals(graph: PoseGraph) -> Iterator[tuple[int, list[int]]]:

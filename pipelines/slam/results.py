@@ -134,21 +134,26 @@ def write_pose_graph(
     rows: IntArray,
     covariances: FloatArray,
     errors: Mapping[str, float],
+    rejected: Sequence[str] = (),
 ) -> None:
-    """Write poses.g2o, the graph with its optimised poses, and errors.json.
+    """Write poses.g2o, the graph with its optimised poses, and errors.json; rejected: measurements left out as false.
 
     covariances (n, k, k) of poses `rows` (n,), relative to the first one: covariances.csv, unless there are none
     errors: by name: of each start, of the guess itself, of the baselines where they were run
     """
     d, minimum = graph.dim, optimised.chordal
-    figures: dict[str, object] = {"best": optimised.start, **errors}
+    figures: dict[str, object] = {"best": optimised.start, **errors, "rejected": list(rejected)}
     if minimum is not None:
         names = ("cost", "bound", "gap", "certified", "eigenvalue", "dimensions")
         figures["chordal"] = {name: getattr(minimum, name) for name in names}
     paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
+    best, points = graph.at(optimised.world_T_pose), {}
+    if graph.landmarks is not None and optimised.landmarks is not None:
+        best = best.with_landmarks(graph.landmarks.at(optimised.landmarks))
+        points = {"landmarks": optimised.landmarks}
     with atomic_directory(output) as folder:
-        write_g2o(folder / "poses.g2o", graph.at(optimised.world_T_pose))
+        write_g2o(folder / "poses.g2o", best)
         if len(rows):
             write_covariances(folder / "covariances.csv", "id", graph.ids[rows].tolist(), covariances)
         write_figures(folder / "errors.json", figures)
-        write_bytes(folder / "above.png", png(paths_from_above(paths)))
+        write_bytes(folder / "above.png", png(paths_from_above(paths, points)))

@@ -28,7 +28,7 @@ from saga_fg.settings import (
     Settings,
     setting,
 )
-from saga_fg.types.road_map import LaneAcross
+from saga_fg.types.lanes_across import LanesAcross
 
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
@@ -47,8 +47,8 @@ class NodeTable:
     where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
     or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
     unknown; existence (n,) probability that a node is a real object, None: all are; open (n,) the weight with which a
-    stop line lets waiting vehicles go; lanes: by row of a stop line, the lanes that cross it; derived: values that
-    rules share, kept with the table
+    stop line lets waiting vehicles go; lanes: those that cross stop lines, these by row; derived: values that rules
+    share, kept with the table
     """
 
     id: IntArray
@@ -66,7 +66,7 @@ class NodeTable:
     unseen: FloatArray | None = None
     existence: FloatArray | None = None
     open: FloatArray | None = None
-    lanes: Mapping[int, tuple[LaneAcross, ...]] = field(default_factory=dict)
+    lanes: LanesAcross | None = None
     derived: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:

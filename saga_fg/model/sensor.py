@@ -248,11 +248,14 @@ class Sensor(Settings):
     def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
         """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
 
-        Without a place of the sensor (None) the range is unknown, and its part of the noise is left out.
+        Without a place of the sensor (None) the range is unknown, and its part of the noise is left out. A covariance
+        that came with the detection is taken as it is.
         """
         label, position = detections.boxes.label, detections.boxes.position[:, :2]
         probability = self.probability(detections.score, label)
-        return self.position_covariance(label, position, probability, position if origin is None else origin)
+        R = self.position_covariance(label, position, probability, position if origin is None else origin)
+        reported = detections.position_covariance
+        return np.where(np.isfinite(reported[:, :1, :1]), reported, R)
 
     def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """R (N, 2, 2), (m/s)^2."""

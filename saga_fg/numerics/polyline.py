@@ -1,8 +1,9 @@
-"""Places along a polyline: distance s along it, offset e to its left, direction."""
+"""Places along polylines: distance s along one, offset e to its left, direction."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -17,29 +18,77 @@ class Feet(NamedTuple):
     e: FloatArray
     direction: FloatArray
 
-    def select(self, rows: IntArray) -> Feet:
+    def select(self, rows: IntArray | BoolArray) -> Feet:
         """The feet of some rows."""
         return Feet(*(column[rows] for column in self))
 
 
+class Polylines(NamedTuple):
+    """L polylines as S pieces, one line after the other.
+
+    start (S, 2), m, and unit direction t (S, 2) of each piece; low, high (S,): bounds of the way along it, m, infinite
+    at both ends of a line; before (S,): length of the line before it, m; middle (S,): s of its middle; angle (S,), rad,
+    without jumps; first (L,), pieces (L,): its pieces; length (L,), m; base (L,) of keys s + base that sort all pieces
+    """
+
+    start: FloatArray
+    t: FloatArray
+    low: FloatArray
+    high: FloatArray
+    before: FloatArray
+    middle: FloatArray
+    angle: FloatArray
+    first: IntArray
+    pieces: IntArray
+    length: FloatArray
+    base: FloatArray
+
+    @classmethod
+    def of(cls, lines: Sequence[FloatArray]) -> Self:
+        """Polylines (k, 2) of one piece at least, of points apart."""
+        parts = [_pieces(np.zeros((1, 2))), *map(_pieces, lines)]  # none, and those of each line
+        start, t, low, high, before, middle, angle = (np.concatenate(column) for column in zip(*parts, strict=True))
+        pieces = np.array([len(line) - 1 for line in lines], dtype=np.int64)
+        length = np.array([np.hypot(*np.diff(line, axis=0).T).sum() for line in lines])
+        first, base = np.cumsum(pieces) - pieces, np.cumsum(length + 1) - length
+        return cls(start, t, low, high, before, middle, angle, first, pieces, length, base)
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def feet(self, line: IntArray, places: FloatArray) -> Feet:
+        """The feet of places (m, 2) on polylines `line` (m,); first and last pieces run on straight."""
+        count = self.pieces[line]
+        begin = np.cumsum(count) - count
+        row = np.repeat(np.arange(len(line)), count)
+        piece = np.arange(len(row)) + (self.first[line] - begin)[row]
+        t, place = self.t[piece], places[row]
+        offset = place - self.start[piece]
+        along = np.clip(offset[:, 0] * t[:, 0] + offset[:, 1] * t[:, 1], self.low[piece], self.high[piece])
+        apart = offset - along[:, None] * t
+        distance = apart[:, 0] ** 2 + apart[:, 1] ** 2
+        least = np.minimum.reduceat(distance, begin) if len(line) else distance
+        hit = np.flatnonzero(distance == least[row])
+        k = hit[np.unique(row[hit], return_index=True)[1]]  # the first of equals
+        t, apart = t[k], apart[k]
+        s = self.before[piece[k]] + along[k]
+        return Feet(places - apart, s, t[:, 0] * apart[:, 1] - t[:, 1] * apart[:, 0], self.direction_at(line, s))
+
+    def direction_at(self, line: IntArray, s: FloatArray) -> FloatArray:
+        """Unit directions (m, 2) at distances s (m,) along `line` (m,), turning evenly from piece to piece."""
+        key = np.clip(s, 0.0, self.length[line]) + self.base[line]
+        first, last = self.first[line], self.first[line] + self.pieces[line] - 1
+        passed = np.searchsorted(np.repeat(self.base, self.pieces) + self.middle, key, side="right")
+        a, b = np.clip(passed - 1, first, last), np.clip(passed, first, last)
+        apart = self.middle[b] - self.middle[a]
+        share = np.where(apart > 0, (s - self.middle[a]) / np.where(apart > 0, apart, 1.0), 0.0)
+        angle = self.angle[a] + share * (self.angle[b] - self.angle[a])
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
 def feet(polyline: FloatArray, places: FloatArray) -> Feet:
     """The feet on a polyline (k, 2) of places (m, 2); its first and last pieces run on straight."""
-    start, step = polyline[:-1], np.diff(polyline, axis=0)
-    length = np.hypot(*step.T)
-    t = step / length[:, None]
-    offset = places[:, None] - start
-    along = np.einsum("mki,ki->mk", offset, t)
-    low, high = np.zeros(len(step)), length.copy()
-    low[0], high[-1] = -np.inf, np.inf
-    along = np.clip(along, low, high)
-    nearest = start + along[..., None] * t
-    k = np.argmin(((places[:, None] - nearest) ** 2).sum(axis=-1), axis=1)
-    rows = np.arange(len(places))
-    point = nearest[rows, k]
-    apart = places - point
-    e = t[k, 0] * apart[:, 1] - t[k, 1] * apart[:, 0]
-    s = np.concatenate([[0.0], np.cumsum(length)])[k] + along[rows, k]
-    return Feet(point, s, e, direction_at(polyline, s))
+    return Polylines.of([polyline]).feet(np.zeros(len(places), dtype=np.int64), places)
 
 
 def on_it(polyline: FloatArray, s: FloatArray) -> BoolArray:
@@ -49,8 +98,15 @@ def on_it(polyline: FloatArray, s: FloatArray) -> BoolArray:
 
 def direction_at(polyline: FloatArray, s: FloatArray) -> FloatArray:
     """Unit directions (m, 2) at distances s (m,) along a polyline (k, 2), turning evenly from piece to piece."""
-    step = np.diff(polyline, axis=0)
+    return Polylines.of([polyline]).direction_at(np.zeros(len(s), dtype=np.int64), s)
+
+
+def _pieces(line: FloatArray) -> tuple[FloatArray, ...]:
+    """The pieces of one polyline (k, 2), as in `Polylines`."""
+    step = np.diff(line, axis=0)
     length = np.hypot(*step.T)
-    middle = np.cumsum(length) - length / 2
-    angle = np.interp(s, middle, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    end = np.cumsum(length)
+    low, high = np.zeros(len(step)), length.copy()
+    low[:1], high[-1:] = -np.inf, np.inf
+    angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    return line[:-1], step / length[:, None], low, high, end - length, end - length / 2, angle

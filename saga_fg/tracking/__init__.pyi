@@ -12,6 +12,7 @@ from .settings import (
     TrafficFlowSettings,
 )
 from .stationarity import StationaritySettings
+from .table_tracking import track
 from .tracker import Tracker
 
 __all__ = [
@@ -33,4 +34,5 @@ __all__ = [
     "TrackerSettings",
     "TrackerView",
     "TrafficFlowSettings",
+    "track",
 ]

@@ -27,7 +27,8 @@ from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.signal_inference import FirstVehicles
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
-from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, Lane, LaneAcross, RoadMap, StopLine
+from saga_fg.types.lanes_across import LanesAcross
+from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, Lane, RoadMap, StopLine
 from saga_fg.types.signal import COLOUR_LABELS, COLOURS, STATES, SignalSettings, colour_updated, colours, updated
 
 
@@ -65,7 +66,7 @@ class MapNodes:
     classes   of elements that become nodes
     id, label, name, place  (n,) of the nodes
     light     (n,) name of the light that governs each, "" for none
-    across    by name of a stop line of the map, the lanes that cross it, world
+    across    the stop lines of the map, in order of their nodes, and the lanes that cross them; None without lines
     beliefs   by light, the probabilities of its states
     drivers   first vehicles before the lines, from which the states are inferred
     """
@@ -77,7 +78,7 @@ class MapNodes:
     name: tuple[str, ...] = ()
     place: tuple[Place, ...] = ()
     light: tuple[str, ...] = ()
-    across: Mapping[str, tuple[LaneAcross, ...]] = field(default_factory=dict)
+    across: LanesAcross | None = None
     beliefs: Mapping[str, FloatArray] = field(default_factory=dict)
     drivers: FirstVehicles = field(default_factory=FirstVehicles.none)
     _roads: Mapping[str, Lane | StopLine] = field(default_factory=dict)
@@ -95,10 +96,15 @@ class MapNodes:
         if road_map is self._latest:
             return
         self._latest = road_map
-        self._add_roads(road_map)
         new = [each for each in _elements(road_map) if each[1] in self.classes and each[0] not in self.name]
-        if not new:
-            return
+        if new:
+            self._add_nodes(new, road_map.deviation, origin, joint)
+        self._add_roads(road_map)
+
+    def _add_nodes(
+        self, new: Sequence[tuple[str, str, Place, str]], deviation: float, origin: FloatArray, joint: JointTrackState
+    ) -> None:
+        """Add elements (`_elements`) of a map of this deviation, m."""
         names, labels, places, lights = zip(*new, strict=True)
         ids = -np.arange(len(self) + 1, len(self) + len(new) + 1, dtype=np.int64)
         self.id, self.label = np.concatenate([self.id, ids]), np.concatenate([self.label, np.array(labels)])
@@ -107,7 +113,7 @@ class MapNodes:
         self.light += lights
         fresh = {name: self.settings.stationary for name in lights if name and name not in self.beliefs}
         self.beliefs = {**self.beliefs, **fresh}
-        n, P = len(ids), road_map.deviation**2 * np.eye(2)
+        n, P = len(ids), deviation**2 * np.eye(2)
         middle = np.array([place.middle for place in places]) - origin
         still = np.zeros((n, 2)), np.zeros((n, 2, 2))
         joint.add(ids, np.array(labels), Kinematics(middle, still[0], np.tile(P, (n, 1, 1)), still[1]))
@@ -118,11 +124,11 @@ class MapNodes:
         roads = {each.name: each for each in lanes_and_lines}
         if STOP_LINE not in self.classes or roads.keys() <= self._roads.keys():
             return
-        self._roads = {**roads, **self._roads}
+        self._roads = {**self._roads, **{name: each for name, each in roads.items() if name not in self._roads}}
+        nodes = [self._roads.get(self.name[k]) for k in np.flatnonzero(self.label == STOP_LINE).tolist()]
         lanes = [each for each in self._roads.values() if isinstance(each, Lane)]
-        lines = [each for each in self._roads.values() if isinstance(each, StopLine)]
-        pairs = {line.name: [LaneAcross.of(lane, line) for lane in lanes] for line in lines}
-        self.across = {name: tuple(lane for lane in found if lane is not None) for name, found in pairs.items()}
+        lines = [each for each in nodes if isinstance(each, StopLine)]
+        self.across = LanesAcross.of(lanes, lines) if lines else None
 
     def predict(self, dt: float) -> None:
         """Predict the states of the lights by `dt` s."""
@@ -187,14 +193,11 @@ class MapNodes:
         governed = n + np.flatnonzero([bool(light) for light in self.light])
         closed, opened = np.zeros(n + m), np.zeros(n + m)
         closed[governed], opened[governed] = self.settings.closed(states), self.settings.open(states)
-        lanes = {
-            n + k: tuple(
-                lane.with_line_moved(position[k] + origin - self.place[k].middle)._replace(centre=lane.centre - origin)
-                for lane in self.across[name]
-            )
-            for k, name in enumerate(self.name)
-            if name in self.across
-        }
+        lanes = None
+        if self.across is not None:
+            lines = np.flatnonzero(self.label == STOP_LINE)
+            middles = np.array([self.place[k].middle for k in lines.tolist()])
+            lanes = self.across.placed(origin, position[lines] + origin - middles, n + lines)
         outline = {n + k: place.outline + position[k] for k, place in enumerate(self.place) if len(place.outline)}
         width = {n + k: place.width for k, place in enumerate(self.place) if place.width > 0}
         return NodeTable(

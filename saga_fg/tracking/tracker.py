@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -85,6 +85,19 @@ class Tracker:
         self._clock = replace(self.settings.clock, max_jump=max_jump)
         self._state = TrackerState(self.settings, self.rules, self.providers)
         self._last_step_failed = False
+
+    def __repr__(self) -> str:
+        """How many tracks there are, and the settings that differ from the defaults."""
+        sensors = ", ".join(self.sensors) or "by the defaults"
+        usual = TrackerSettings()
+        named = [item.name for item in fields(self.settings) if item.name not in ("estimator", "edges")]
+        changed = [name for name in named if getattr(self.settings, name) != getattr(usual, name)]
+        state = self._state
+        at = f" at {state.clock.newest:.3f} s" if len(state.table) else ""
+        return (
+            f"Tracker({len(state.table)} tracks{at}; estimator {self.settings.estimator}, "
+            f"{len(self.rules)} edge rules, sensors {sensors}; changed: {', '.join(changed) or 'nothing'})"
+        )
 
     def step(self, frame: Frame) -> Tracks:
         """Take in one frame and return all reported tracks, in world coordinates, at the newest time seen so far.

@@ -10,11 +10,13 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.arrays import FloatArray, checked, checked_covariances, from_upper_triangle, upper_triangle
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements
+from saga_fg.types.html_table import html_table
+from saga_fg.types.pandas_tables import Table, boxes_of_table
 from saga_fg.types.road_map import RoadMap
 
 Coordinates = Literal["world", "ego", "sensor"]
@@ -28,7 +30,7 @@ class Detection:
 
     position: centre (x, y, z), m; size: (length, width, height), m; yaw: rad about z; velocity: (vx, vy), m/s over
     ground; score: the detector's confidence, any finite number (probability or logit: see the sensor's model);
-    range_rate: m/s, see `Detections`.
+    range_rate: m/s, position_covariance: (xx, xy, yy), m^2, see `Detections`.
     """
 
     label: str
@@ -38,6 +40,7 @@ class Detection:
     velocity: tuple[float, float] = (NAN, NAN)
     score: float = 1.0
     range_rate: float = NAN
+    position_covariance: tuple[float, float, float] = (NAN, NAN, NAN)
 
     def __post_init__(self) -> None:
         Detections.of([self])
@@ -45,16 +48,22 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Detections(Columns):
-    """N detections as columns: `boxes`, their `score` (N,) and `range_rate` (N,). Iterating gives `Detection`s.
+    """N detections as columns: `boxes`, `score` (N,), `range_rate` (N,), `position_covariance` (N, 2, 2).
+
+    Iterating gives `Detection`s.
 
     A range rate (m/s; NaN, as by default: not measured) is measured by radars: the component of the velocity
     *over ground* along the horizontal line of sight from the sensor, positive when the object moves away. Where the
     radar gives it relative to itself, add the component of the sensor's own velocity along that line first.
+
+    A covariance of the horizontal position, m^2, in the coordinates of the boxes, is reported by some detectors; it
+    takes the place of the noise of the sensor's model. NaN, as by default: not reported.
     """
 
     boxes: Boxes
     score: FloatArray
     range_rate: FloatArray = field(default_factory=lambda: np.array(NAN))  # a single number serves all
+    position_covariance: FloatArray = field(default_factory=lambda: np.array(NAN))
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
@@ -64,6 +73,7 @@ class Detections(Columns):
             row = int(np.argmax(np.abs(rate) > MAX_SPEED))
             raise InputError(f"range_rate[{row}]: expected numbers within {MAX_SPEED:g}, got {rate[row]:g}")
         vars(self).update(score=checked("score", self.score, (n,)), range_rate=rate)
+        vars(self)["position_covariance"] = _position_covariances(self.position_covariance, n)
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Self:
@@ -81,7 +91,19 @@ class Detections(Columns):
         )
         n = len(detections)
         rate = checked("range_rate", [d.range_rate for d in detections], (n,), "finite-or-nan")
-        return cls(boxes, checked("score", [d.score for d in detections], (n,)), rate)
+        entries = [d.position_covariance for d in detections]
+        covariance = from_upper_triangle(checked("position_covariance", entries, (n, 3), "finite-or-nan"))
+        score = checked("score", [d.score for d in detections], (n,))
+        return cls(boxes, score, rate, covariance)
+
+    @classmethod
+    def from_pandas(cls, table: Table) -> Self:
+        """Return the rows of a `pandas.DataFrame` as detections of one moment.
+
+        Columns: x, y, and where known z, length, width, height (m), yaw (rad), vx, vy (m/s), range_rate (m/s), score or
+        confidence, label or class. Missing values are unknown. Raises `InputError` naming the column.
+        """
+        return cls(*boxes_of_table(table))
 
     @classmethod
     def empty(cls) -> Self:
@@ -102,14 +124,43 @@ class Detections(Columns):
             velocity=tuple(b.velocity[row].tolist()),
             score=float(self.score[row]),
             range_rate=float(self.range_rate[row]),
+            position_covariance=tuple(upper_triangle(self.position_covariance[[row]])[0].tolist()),
         )
 
     def __iter__(self) -> Iterator[Detection]:
         return (self[row] for row in range(len(self)))
 
+    def _repr_html_(self) -> str:
+        columns = (
+            self.boxes.label,
+            *self.boxes.position[:, :2].T,
+            *self.boxes.size[:, :2].T,
+            self.boxes.yaw,
+            self.score,
+        )
+        rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        names = ("class", "x, m", "y, m", "length, m", "width, m", "yaw, rad", "score")
+        return html_table(f"{len(self)} detections", names, rows)
+
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""
-        return type(self)(self.boxes.transformed(target_T_source), self.score, self.range_rate)
+        R = target_T_source[:2, :2]
+        covariance = R @ self.position_covariance @ R.T
+        return type(self)(self.boxes.transformed(target_T_source), self.score, self.range_rate, covariance)
+
+
+def _position_covariances(value: FloatArray, n: int) -> FloatArray:
+    """Covariances (n, 2, 2), NaN where unknown. Raises `InputError` for others than positive definite ones."""
+    if np.ndim(value) == 0:
+        return np.full((n, 2, 2), value)
+    covariance = checked("position_covariance", value, (n, 2, 2), "finite-or-nan")
+    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
+    if not len(known):
+        return covariance
+    whole = covariance.copy()
+    whole[known] = checked_covariances("position_covariance", covariance[known], len(known), 2)
+    whole.flags.writeable = False
+    return whole
 
 
 @dataclass(frozen=True, eq=False)

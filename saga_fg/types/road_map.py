@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.polyline import feet
 from saga_fg.settings import Positive, Settings, required_setting, setting
 
 Point = tuple[float, float]
@@ -115,31 +113,6 @@ class RoadMap(Settings):
 
     def __len__(self) -> int:
         return len(self.lights) + len(self.stop_lines) + len(self.lanes) + len(self.walls)
-
-
-class LaneAcross(NamedTuple):
-    """A lane that crosses a stop line: its centre line (k, 2), its width, m, and where the middle of the line is along
-    it, s, and to its left, e, m; its direction (2,) there."""
-
-    centre: FloatArray
-    width: float
-    s: float
-    e: float
-    direction: FloatArray
-
-    @classmethod
-    def of(cls, lane: Lane, line: StopLine) -> LaneAcross | None:
-        """None for a lane that does not cross the line in its direction of travel, straight on beyond its ends."""
-        centre, ends = np.array(lane.centre), line.ends
-        at = feet(centre, ends.mean(axis=0)[None])
-        ahead = at.direction[0] @ (math.cos(line.heading), math.sin(line.heading)) > 0
-        crosses = ahead and abs(at.e[0]) <= np.hypot(*(ends[0] - ends[1])) / 2
-        return cls(centre, lane.width, float(at.s[0]), float(at.e[0]), at.direction[0]) if crosses else None
-
-    def with_line_moved(self, by: FloatArray) -> LaneAcross:
-        """The same lane, and the line moved by (2,), m."""
-        along, (x, y) = self.direction @ by, self.direction
-        return self._replace(s=self.s + float(along), e=self.e + float(x * by[1] - y * by[0]))
 
 
 def _require_name(name: str) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids, upper_triangle
 from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
+from saga_fg.types.html_table import html_table
+from saga_fg.types.pandas_tables import Table, new_table
 
 KNOWN_SPEED_DEVIATION = 2.0  # m/s; a velocity of a larger standard deviation counts as unknown
 
@@ -107,3 +109,41 @@ class Tracks(Columns):
 
     def __iter__(self) -> Iterator[Track]:
         return (self[row] for row in range(len(self)))
+
+    def to_pandas(self) -> Table:
+        """Return a `pandas.DataFrame`, a row for each track, with `table_columns`. Needs the extra `pandas`."""
+        return new_table([self.table_columns()])
+
+    def table_columns(self) -> dict[str, Any]:
+        """Return the columns (N,) of a table, named as in the files of `saga-fg track file`.
+
+        Covariances of the horizontal position are cov_xx, cov_xy, cov_yy, of the velocity cov_vxvx and so on.
+        """
+        vectors: tuple[tuple[tuple[str, ...], FloatArray], ...] = (
+            (("x", "y", "z"), self.boxes.position),
+            (("length", "width", "height"), self.boxes.size),
+            (("yaw",), self.boxes.yaw[:, None]),
+            (("vx", "vy"), self.boxes.velocity),
+            (("score",), self.score[:, None]),
+            (("cov_xx", "cov_xy", "cov_yy"), upper_triangle(self.position_covariance)),
+            (("cov_vxvx", "cov_vxvy", "cov_vyvy"), upper_triangle(self.velocity_covariance)),
+            (("coasting",), self.coasting[:, None]),
+        )
+        first = {"timestamp": np.full(len(self), self.timestamp), "id": self.id, "label": self.boxes.label}
+        return first | {name: values[:, k] for names, values in vectors for k, name in enumerate(names)}
+
+    def _repr_html_(self) -> str:
+        deviation = np.sqrt(np.trace(self.position_covariance, axis1=1, axis2=2) / 2)
+        speed = np.linalg.norm(self.boxes.velocity, axis=1)
+        columns = (
+            self.id,
+            self.boxes.label,
+            *self.boxes.position[:, :2].T,
+            deviation,
+            speed,
+            self.score,
+            self.coasting,
+        )
+        rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        names = ("id", "class", "x, m", "y, m", "position ±, m", "speed, m/s", "score", "unseen for, s")
+        return html_table(f"{len(self)} tracks at {self.timestamp:.3f} s", names, rows)

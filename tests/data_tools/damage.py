@@ -148,6 +148,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "Plaza": Target(plaza, lambda: read_plaza(plaza[0])),
         "ETH and UCY": one("eth/obsmat.txt", OBSMAT, lambda path: EthUcy(folder).scene("eth")),
         **_traffic(folder),
+        **_recordings(folder),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
@@ -246,6 +247,22 @@ def _traffic(folder: Path) -> dict[str, Target]:
     path = folder / "platoons.parquet"
     parquet.write_table(pyarrow.table(text | {"t": [0.1, 0.2], "veh": [1, 1]} | numbers), path)
     return {**found, "OpenACC": Target((path,), lambda: OpenAccPlatoons(folder).recording("a-b"))}
+
+
+def _recordings(folder: Path) -> dict[str, Target]:
+    """A drive as MCAP and as SQLite, where the packages that write them are installed."""
+    if any(importlib.util.find_spec(name) is None for name in ("mcap_ros2", "mcap_protobuf", "rosbags")):
+        return {}
+    from data_tools.datasets.mcap.dataset import McapRecording
+    from tests.data_tools import mcap_example as example
+
+    messages = [message for message in example.drive() if message[3] < example.START + 2 * example.STEP]
+    mcap = example.write_mcap(folder / "drive.mcap", messages, plain=True)
+    sqlite = next(example.write_bag(folder / "bag", messages).glob("*.db3"))
+    return {
+        "recording, MCAP": Target((mcap,), lambda: McapRecording(mcap).scene("drive")),
+        "recording, SQLite": Target((sqlite,), lambda: McapRecording(sqlite).scene(sqlite.stem)),
+    }
 
 
 def _read_nuscenes(root: Path) -> list[Scene]:

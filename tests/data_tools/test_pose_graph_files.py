@@ -73,14 +73,14 @@ def test_writing_and_reading_gives_the_same_graph(tmp_path: Path, text: str) -> 
 @pytest.mark.parametrize(
     ("text", "old", "new", "message"),
     [
-        (PLANAR, "VERTEX_SE2 3", "VERTEX_XY 3", r"line 2: expected one of VERTEX_SE2.* got 'VERTEX_XY'"),
+        (PLANAR, "VERTEX_SE2 3", "VERTEX_XYZ 3", r"line 2: expected one of VERTEX_SE2.* got 'VERTEX_XYZ'"),
         (PLANAR, "3 0 0 0", "3 0 0", "line 2: expected 4 values after VERTEX_SE2, got 3"),
         (PLANAR, "3 0 0 0", "3 0 nan 0", "line 2: y: expected a finite number, got 'nan'"),
         (PLANAR, "3 0 0 0", "3 0 0 east", "line 2: heading: expected a finite number, got 'east'"),
         (PLANAR, "3 0 0 0", "3 0 1e300 0", r"line 2: y: expected a number within 1e\+09, got 1e\+300"),
         (SPATIAL, "0 0 0.6 0.8", "0 0 0.6 1e300", r"line 2: qw: expected a number within 1e\+15, got 1e\+300"),
         (PLANAR, "4 1 0.5 5", "1e300 1 0.5 1e300", r"line 6: I11: expected a number within 1e\+15, got 1e\+300"),
-        (PLANAR, "VERTEX_SE2 3", "VERTEX_SE2 7", "line 2: id: pose 7 is given twice"),
+        (PLANAR, "VERTEX_SE2 3", "VERTEX_SE2 7", "line 2: id: 7 is given twice"),
         (PLANAR, "VERTEX_SE2 3", "VERTEX_SE2 3.5", "line 2: id: expected a whole number"),
         (PLANAR, "EDGE_SE2 3 7", "EDGE_SE2 3 8", "line 6: second: there is no pose 8"),
         (PLANAR, "EDGE_SE2 3 7", "EDGE_SE2 7 7", "line 6: second: expected another pose"),

@@ -31,10 +31,10 @@ const wait = setInterval(() => {
 </script>"""
 
 
-def tried_in_browser(page: str, script: str, folder: Path) -> Any:
+def tried_in_browser(page: str, script: str, folder: Path, hash_: str = "") -> Any:
     """Return the object `found` that `script` fills once the page is ready; `faults` are its errors.
 
-    The test is skipped where there is no Chromium.
+    The address of the page ends in `hash_`. The test is skipped where there is no Chromium.
     """
     chromium = os.environ.get("CHROMIUM") or next(
         filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
@@ -46,7 +46,7 @@ def tried_in_browser(page: str, script: str, folder: Path) -> Any:
     path.write_text(page, encoding="utf-8")
     done = subprocess.run(
         [chromium, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}",
-         "--window-size=1300,900", "--virtual-time-budget=10000", "--dump-dom", path.as_uri()],
+         "--window-size=1300,900", "--virtual-time-budget=10000", "--dump-dom", path.as_uri() + hash_],
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     match = re.search(r'<pre id="found">(.*?)</pre>', done.stdout)

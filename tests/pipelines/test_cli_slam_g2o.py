@@ -94,7 +94,11 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
     wrong[false, :2, 2] += [7.0, -5.0]
     write_g2o(tmp_path / "false.g2o", replace(graph, first_T_second=wrong))
     off = {}
-    for name, options in (("plain", []), ("robust", ["--robust", "geman-mcclure"])):
+    for name, options in (
+        ("plain", []),
+        ("robust", ["--robust", "geman-mcclure"]),
+        ("consensus", ["--robust", "consensus"]),
+    ):
         output = tmp_path / name
         result = CliRunner().invoke(
             app, ["slam", "g2o", str(tmp_path / "false.g2o"), "--output", str(output), *options]
@@ -104,13 +108,18 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
         found = np.linalg.inv(found[0]) @ found
         off[name] = np.abs((found - np.linalg.inv(truth[0]) @ truth)[:, :2, 2]).max()
     assert off["robust"] < 0.3 * off["plain"]
+    assert off["consensus"] < 0.3 * off["plain"]
+    named = [f"{graph.ids[graph.first[k]]} {graph.ids[graph.second[k]]}" for k in false]
+    rejected = json.loads((tmp_path / "consensus" / "errors.json").read_text())["rejected"]
+    assert set(named) <= set(rejected)
+    assert len(rejected) <= len(named) + 1
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--robust", "huber", "--compare"], "--compare: expected without --robust"),
-        (["--robust", "huber", "--certify"], "--certify: expected without --robust"),
+        (["--robust", "huber", "--compare"], "--compare: expected without a robust loss"),
+        (["--robust", "huber", "--certify"], "--certify: expected without a robust loss"),
         (
             ["--covariances", "10,elephant"],
             "--covariances: expected all, last, none or ids of poses with commas, got 'e",

@@ -101,7 +101,7 @@ def test_a_frame_is_read_with_all_its_fields():
         (b'{"timestamp": 1, "ego": {"x": 1, "y": 2}, "detections": []}', "ego.yaw: expected a number"),
         (b'{"timestamp": 1, "seq": -1, "detections": []}', "seq: expected an integer"),
         (b'{"timestamp": 1, "timestmap": 1, "detections": []}', "did you mean 'timestamp'"),
-        (b'{"type": "stop"}', "type: expected frame, status, subscribe, reset, got 'stop'"),
+        (b'{"type": "stop"}', "type: expected frame, status, subscribe, predict, reset, got 'stop'"),
         (b'{"type": "status", "x": 1}', "unknown field"),
     ],
 )

@@ -45,14 +45,26 @@ position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coas
 """
 
 from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.predictions import (
+    PREDICTION_COLUMNS,
+    PredictionRows,
+    prediction_writer,
+    predictions_path,
+    read_predictions,
+)
 from data_tools.datasets.detection_files.track_rows import TrackRows, read_tracks
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
 
 __all__ = [
+    "PREDICTION_COLUMNS",
     "TRACK_COLUMNS",
     "DetectionFile",
+    "PredictionRows",
     "TrackRows",
+    "prediction_writer",
+    "predictions_path",
     "read_detections",
+    "read_predictions",
     "read_scenes_in_parts",
     "read_tracks",
     "track_rows",

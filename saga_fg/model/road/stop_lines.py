@@ -14,7 +14,7 @@ import numpy as np
 from saga_fg.model.interactions import NodeTable, unit
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.numerics.polyline import feet, on_it
+from saga_fg.types.lanes_across import LanesAcross
 from saga_fg.types.road_map import STOP_LINE
 
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
@@ -53,28 +53,32 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
 
 def _approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     offset = nodes.position[source] - nodes.position[target]
-    u = facing = unit(nodes.heading[target])
+    u = unit(nodes.heading[target])
     way = np.einsum("ei,ei->e", offset, u)
-    left, right = (np.array([nodes.outline[j][end] for j in source.tolist()]).reshape(-1, 2) for end in (0, 1))
+    ends = _ends(nodes, source)
     aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
     aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
-    comes = (np.abs(aside) < np.hypot(*(left - right).T) / 2) & aligned & (way > 0)
-    crossing, nearest = -aside, np.full(len(target), np.inf)
-    for line in np.unique(source).tolist() if nodes.lanes else ():
-        of_line = np.flatnonzero(source == line)
-        place = nodes.position[target[of_line]]
-        for lane in nodes.lanes.get(line, ()):
-            low, high = lane.centre.min(axis=0) - lane.width, lane.centre.max(axis=0) + lane.width
-            rows = of_line[((place >= low) & (place <= high)).all(axis=1)]
-            if len(rows) == 0:
-                continue
-            at = feet(lane.centre, nodes.position[target[rows]])
-            inside = (np.abs(at.e) <= np.minimum(lane.width / 2, nearest[rows])) & on_it(lane.centre, at.s)
-            inside &= np.einsum("ei,ei->e", at.direction, facing[rows]) > 0
-            mine, at = rows[inside], at.select(np.flatnonzero(inside))
-            way[mine], crossing[mine], u[mine] = lane.s - at.s, at.e - lane.e, at.direction
-            comes[mine], nearest[mine] = lane.s > at.s, np.abs(at.e)
-    return Approach(comes, way, u, crossing)
+    comes = (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2) & aligned & (way > 0)
+    found = Approach(comes, way, u, -aside)
+    if nodes.lanes is not None:
+        _follow_lanes(found, nodes, nodes.lanes, target, source)
+    return found
+
+
+def _follow_lanes(found: Approach, nodes: NodeTable, lanes: LanesAcross, target: IntArray, source: IntArray) -> None:
+    """Change the approaches of those in a lane that crosses the line, to that of the nearest such lane."""
+    vehicles, vehicle = np.unique(target, return_inverse=True)
+    there = lanes.inside(nodes.position[vehicles], unit(nodes.heading[vehicles]))
+    foot = np.full((len(vehicles), len(lanes.centre)), -1)
+    foot[there.vehicle, there.lane] = np.arange(len(there.vehicle))
+    row, crossed = lanes.crossings(source)
+    of = foot[vehicle[row], lanes.lane[crossed]]
+    row, crossed, at = row[of >= 0], crossed[of >= 0], there.feet.select(of[of >= 0])
+    order = np.lexsort((np.abs(at.e), row))
+    nearest = order[np.unique(row[order], return_index=True)[1]]
+    row, crossed, at = row[nearest], crossed[nearest], at.select(nearest)
+    found.way[row], found.crossing[row] = lanes.s[crossed] - at.s, at.e - lanes.e[crossed]
+    found.direction[row], found.comes[row] = at.direction, lanes.s[crossed] > at.s
 
 
 class ComingVehicles(NamedTuple):
@@ -98,6 +102,12 @@ class ComingVehicles(NamedTuple):
         crossing, way = self.approach.crossing, self.approach.way
         one_lane = (self.source[:, None] == self.source) & (np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE)
         return self.select(~(one_lane & (way < way[:, None])).any(axis=1))
+
+
+def _ends(nodes: NodeTable, source: IntArray) -> FloatArray:
+    """Left and right ends (E, 2, 2) of lines about their middles, m."""
+    lines, row = np.unique(source, return_inverse=True)
+    return np.array([nodes.outline[j] for j in lines.tolist()]).reshape(-1, 2, 2)[row]
 
 
 def _near(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> tuple[IntArray, IntArray]:
@@ -127,7 +137,7 @@ def passed_vehicles(nodes: NodeTable, classes: tuple[str, ...], max_distance: fl
     """All vehicles that have crossed a line straight on and are within some distance of it."""
     target, source = _near(nodes, classes, max_distance)
     beyond, across = nodes.position[target] - nodes.position[source], unit(nodes.heading[source])
-    ends = np.array([nodes.outline[j] for j in source.tolist()]).reshape(-1, 2, 2)
+    ends = _ends(nodes, source)
     aside = across[:, 0] * beyond[:, 1] - across[:, 1] * beyond[:, 0]
     passed = np.einsum("ei,ei->e", beyond, across)
     aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4

@@ -3,19 +3,41 @@
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses, nearest_rotations
 from saga_fg.slam.pose_graph.chordal_cost import ChordalCost
+from saga_fg.slam.pose_graph.consensus import Consensus, consensus, trusted
 from saga_fg.slam.pose_graph.graph import PoseGraph
-from saga_fg.slam.pose_graph.optimisation import OptimisedPoses, factor_graph, optimise_poses, pose_array, pose_values
+from saga_fg.slam.pose_graph.landmarks import (
+    LandmarkObservations,
+    ObservationKind,
+    PointLandmarks,
+    PosePriors,
+)
+from saga_fg.slam.pose_graph.optimisation import (
+    OptimisedPoses,
+    factor_graph,
+    graph_error,
+    optimise_poses,
+    pose_array,
+    pose_values,
+)
 
 __all__ = [
     "ChordalCost",
     "ChordalMinimum",
+    "Consensus",
+    "LandmarkObservations",
+    "ObservationKind",
     "OptimisedPoses",
+    "PointLandmarks",
     "PoseGraph",
+    "PosePriors",
     "chordal_minimum",
     "chordal_poses",
+    "consensus",
     "factor_graph",
+    "graph_error",
     "nearest_rotations",
     "optimise_poses",
     "pose_array",
     "pose_values",
+    "trusted",
 ]

@@ -10,13 +10,14 @@ vector, translation) in space.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
+from saga_fg.slam.pose_graph.landmarks import PointLandmarks, PosePriors
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -33,6 +34,8 @@ class PoseGraph:
     first, second   (M,) rows of the poses between which was measured
     first_T_second  (M, d + 1, d + 1) the measurements
     information     (M, k, k) of the tangent, k = 3 or 6; positive definite
+    landmarks       points seen from the poses
+    priors          poses known from outside; without them the first pose is held
 
     Raises `InputError` where these do not fit together, or a rotation is none.
     """
@@ -43,10 +46,18 @@ class PoseGraph:
     second: IntArray
     first_T_second: FloatArray
     information: FloatArray
+    landmarks: PointLandmarks | None = None
+    priors: PosePriors | None = None
 
     @classmethod
     def of_measurements(
-        cls, ids: IntArray, first: IntArray, second: IntArray, first_T_second: FloatArray, information: FloatArray
+        cls,
+        ids: IntArray,
+        first: IntArray,
+        second: IntArray,
+        first_T_second: FloatArray,
+        information: FloatArray,
+        priors: PosePriors | None = None,
     ) -> PoseGraph:
         """A graph without a guess: poses start at dead reckoning from the first one, along the fewest measurements.
 
@@ -54,7 +65,7 @@ class PoseGraph:
         """
         size = np.asarray(first_T_second).shape[-1]
         still = np.tile(np.eye(size), (len(ids), 1, 1))
-        graph = cls(ids, still, first, second, first_T_second, information)
+        graph = cls(ids, still, first, second, first_T_second, information, priors=priors)
         return graph.at(_dead_reckoned(graph)) if len(graph) else graph
 
     def __post_init__(self) -> None:
@@ -98,7 +109,18 @@ class PoseGraph:
 
     def at(self, world_T_pose: FloatArray) -> PoseGraph:
         """Return this graph with other poses."""
-        return PoseGraph(self.ids, world_T_pose, self.first, self.second, self.first_T_second, self.information)
+        return replace(self, world_T_pose=world_T_pose)
+
+    def with_landmarks(self, landmarks: PointLandmarks | None) -> PoseGraph:
+        """Return this graph with landmarks; those without a guess are placed where the poses see them."""
+        if landmarks is not None and np.isnan(landmarks.position).any():
+            landmarks = landmarks.placed(self.world_T_pose)
+        return replace(self, landmarks=landmarks)
+
+    @property
+    def poses_alone(self) -> bool:
+        """Whether there are neither landmarks nor priors."""
+        return self.landmarks is None and self.priors is None
 
     def components(self) -> IntArray:
         """Return the connected component (N,) of each pose, numbered from 0 in the order of their first poses."""

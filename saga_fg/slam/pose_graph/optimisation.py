@@ -3,7 +3,8 @@
 Pose graphs have many local minima, and the start decides which one a solver finds. Dead reckoning may lie in the basin
 of a bad one; the chordal start (`chordal_poses`) uses every measurement and no guess, in closed form. Both are tried,
 and the lower error is kept; so is the minimum of the chordal cost, where it is to be certified
-(`saga_fg.slam.pose_graph.certificate`). The first pose is fixed.
+(`saga_fg.slam.pose_graph.certificate`). The first pose is fixed, unless priors say where poses are; the chordal start
+is then moved to the first of them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,17 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors import FactorError, Robust, Solution, SolverSettings, between_factor, pose, pose_prior_factor, solve
+from factors import (
+    FactorError,
+    ResidualFactors,
+    Robust,
+    Solution,
+    SolverSettings,
+    between_factor,
+    pose,
+    pose_prior_factor,
+    solve,
+)
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
@@ -30,8 +41,9 @@ _SOLVER = SolverSettings(tolerance=1e-3)  # steps below a thousandth of a standa
 @dataclass(frozen=True, eq=False)
 class OptimisedPoses:
     """world_T_pose: (N, d + 1, d + 1) at the minimum; error: E there; start: which start led there; errors: E that each
-    start led to; solution: the same as the solver gave it, keys being rows of the graph; chordal: the minimum of the
-    chordal cost, and what is proven about it, where that was asked for.
+    start led to; solution: the same as the solver gave it, keys being rows of the graph, then of its landmarks;
+    chordal: the minimum of the chordal cost, and what is proven about it, where that was asked for; landmarks: (L, d)
+    their places.
     """
 
     world_T_pose: FloatArray
@@ -40,6 +52,7 @@ class OptimisedPoses:
     errors: Mapping[str, float]
     solution: Solution
     chordal: ChordalMinimum | None = None
+    landmarks: FloatArray | None = None
 
     def covariances(self, rows: IntArray | None = None) -> FloatArray:
         """Covariance (n, k, k) of poses `rows` (n,), or all, each in its tangent, relative to the first one.
@@ -69,27 +82,68 @@ def optimise_poses(graph: PoseGraph, robust: Robust | None = None, certify: bool
     Raises `InputError` for a graph that is not connected, or too badly conditioned.
     """
     factors = factor_graph(graph, robust)
-    starts = {"chordal": chordal_poses(graph), "guess": graph.world_T_pose}
-    chordal = chordal_minimum(graph, starts["chordal"]) if certify else None
+    if certify and not graph.poses_alone:
+        raise InputError("certify: expected a graph of poses alone, the proof covers neither landmarks nor priors")
+    starts = {"guess": graph}
+    if graph.landmarks is None or not graph.components().any():  # otherwise landmarks hold it together
+        starts = {"chordal": _chordal_start(graph), **starts}
+    chordal = chordal_minimum(graph, starts["chordal"].world_T_pose) if certify else None
     if chordal is not None:
-        starts["chordal minimum"] = chordal.world_T_pose
+        starts["chordal minimum"] = graph.at(chordal.world_T_pose)
+    seen = landmark_factors(graph)
     try:
-        solutions = {name: solve(factors, [], pose_values(start), _SOLVER) for name, start in starts.items()}
+        solutions = {name: solve(factors, seen, _values(start), _SOLVER) for name, start in starts.items()}
     except FactorError as error:
         raise InputError(f"{_UNLIKE}: {error}") from error
     best = min(solutions, key=lambda name: solutions[name].error)
-    values = solutions[best].values
     errors = {name: solution.error for name, solution in solutions.items()}
-    return OptimisedPoses(pose_array(values, graph.dim), solutions[best].error, best, errors, solutions[best], chordal)
+    values = solutions[best].values
+    poses = pose_array(values, graph.dim, len(graph))
+    found = None
+    if graph.landmarks is not None:
+        found = np.stack([values.atVector(len(graph) + row) for row in range(len(graph.landmarks.ids))])
+    return OptimisedPoses(poses, solutions[best].error, best, errors, solutions[best], chordal, found)
+
+
+def _chordal_start(graph: PoseGraph) -> PoseGraph:
+    poses = chordal_poses(graph)
+    if (priors := graph.priors) is not None:
+        poses = priors.world_T_pose[0] @ np.linalg.inv(poses[priors.pose[0]]) @ poses
+    start = graph.at(poses)
+    return start if graph.landmarks is None else start.with_landmarks(graph.landmarks.placed(poses))
+
+
+def landmark_factors(graph: PoseGraph) -> list[ResidualFactors]:
+    """Factors of the landmarks, whose keys follow those of the poses."""
+    return [] if graph.landmarks is None else [seen.factors(len(graph)) for seen in graph.landmarks.observations]
+
+
+def graph_error(graph: PoseGraph, robust: Robust | None = None) -> float:
+    """E at the poses and landmarks of a graph."""
+    values = _values(graph)
+    return float(factor_graph(graph, robust).error(values)) + sum(f.error(values) for f in landmark_factors(graph))
+
+
+def _values(graph: PoseGraph) -> gtsam.Values:
+    values = pose_values(graph.world_T_pose)
+    if graph.landmarks is not None:
+        for row, place in enumerate(graph.landmarks.position):
+            values.insert(len(graph) + row, place)
+    return values
 
 
 def factor_graph(graph: PoseGraph, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
-    """GTSAM's factors of a pose graph, keys being its rows, with a prior that holds the first pose."""
+    """GTSAM's factors of a pose graph, keys being its rows: what holds the first pose, or the priors, come first."""
     factors = gtsam.NonlinearFactorGraph()
     k = graph.information.shape[1] if len(graph.information) else 3 * (graph.dim - 1)
-    factors.add(pose_prior_factor(0, graph.world_T_pose[0], _ANCHOR * np.eye(k)))
-    covariances = np.linalg.inv(graph.information)
-    covariances = (covariances + covariances.swapaxes(1, 2)) / 2
+    if (priors := graph.priors) is None:
+        factors.add(pose_prior_factor(0, graph.world_T_pose[0], _ANCHOR * np.eye(k)))
+    else:
+        for row, known, spread in zip(
+            priors.pose.tolist(), priors.world_T_pose, _inverses(priors.information), strict=True
+        ):
+            factors.add(pose_prior_factor(row, known, spread))
+    covariances = _inverses(graph.information)
     successive = np.abs(graph.second - graph.first) == 1
     for first, second, measured, covariance, trusted in zip(
         graph.first.tolist(), graph.second.tolist(), graph.first_T_second, covariances, successive, strict=True
@@ -106,7 +160,12 @@ def pose_values(world_T_pose: FloatArray) -> gtsam.Values:
     return values
 
 
-def pose_array(values: gtsam.Values, dim: int) -> FloatArray:
-    """The poses of GTSAM's values with keys 0 ... N - 1, as (N, dim + 1, dim + 1)."""
+def pose_array(values: gtsam.Values, dim: int, count: int | None = None) -> FloatArray:
+    """The poses of GTSAM's values with keys 0 ... N - 1, as (N, dim + 1, dim + 1); count: N, unless all are poses."""
     at = values.atPose2 if dim == 2 else values.atPose3
-    return np.stack([at(row).matrix() for row in range(values.size())])
+    return np.stack([at(row).matrix() for row in range(values.size() if count is None else count)])
+
+
+def _inverses(matrices: FloatArray) -> FloatArray:
+    inverse = np.linalg.inv(matrices)
+    return np.asarray((inverse + inverse.swapaxes(1, 2)) / 2)

@@ -19,7 +19,8 @@ from saga_fg.model.road.lane_keeping import InLane, KeepLane
 from saga_fg.model.road.starting import GreenLight, Starting
 from saga_fg.model.road.stopping import RedLight, Stopping
 from saga_fg.numerics.polyline import direction_at, feet
-from saga_fg.types.road_map import Lane, LaneAcross, RoadMap, StopLine, TrafficLight
+from saga_fg.types.lanes_across import LanesAcross
+from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
 from saga_fg.types.signal import STATES, SignalSettings, colour_updated, colours
 from tests.saga_fg.road_scenes import bent_lane, queue, table, taper
 
@@ -185,12 +186,11 @@ def test_where_a_lane_ends_vehicles_go_straight_on_to_the_line():
         {1: np.array([[0, 1.75], [0, -1.75]])},
     )
     line = StopLine("line", (0.0, 1.75), (0.0, -1.75), "light")
-    short = LaneAcross.of(Lane("short", ((-10.0, 0.0), (5.0, 0.0))), line)
-    before = LaneAcross.of(Lane("before", ((-100.0, 0.2), (-10.0, 0.2))), line)
-    assert short is not None
-    assert before is not None
+    short = Lane("short", ((-10.0, 0.0), (5.0, 0.0)))
+    before = Lane("before", ((-100.0, 0.2), (-10.0, 0.2)))
     for lanes in ((), (short,), (short, before)):
-        assert RedLight().pairs(replace(nodes, lanes={1: lanes})).target.tolist() == [0]
+        across = replace(LanesAcross.of(lanes, [line]), line=np.ones(len(lanes), dtype=np.int64))
+        assert RedLight().pairs(replace(nodes, lanes=across)).target.tolist() == [0]
 
 
 def test_the_queue_brakes_through_following():
@@ -223,10 +223,11 @@ def test_the_way_to_a_line_is_along_the_lane():
         {1: 3.5},
     )
     left, right = (tuple(point) for point in with_line.outline[2].tolist())
-    crossing = LaneAcross.of(Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light"))
-    assert crossing is not None
+    mapped = Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light")
+    crossing = LanesAcross.of(mapped[:1], mapped[1:]).placed(np.zeros(2), np.zeros((1, 2)), np.array([2]))
+    assert crossing.line.tolist() == [2]
     assert len(RedLight().pairs(with_line).target) == 0  # straight on it would miss the line
-    with_line = replace(with_line, lanes={2: (crossing,)})
+    with_line = replace(with_line, lanes=crossing)
     assert RedLight().pairs(with_line).target.tolist() == [0]
     at = feet(lane, nodes.position[:1])
     arc, speed = 50 * 1.2 - 1 - at.s[0], 8.0 * (at.direction[0] @ (np.cos(0.2), np.sin(0.2)))

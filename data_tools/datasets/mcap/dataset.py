@@ -1,0 +1,241 @@
+"""A recording as a dataset of one scene: the objects of its topics, each topic a sensor, and the pose of the vehicle.
+
+Objects are brought from the frame of their message to the vehicle's by the transforms at the time of the message; the
+moments of the scene are these times. The tokens of the moments are the times in ns, as the messages have them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.datasets.mcap.messages import (
+    DEFAULT_EGO,
+    OBJECT_TYPES,
+    ODOMETRY_TYPES,
+    TRANSFORM_TYPES,
+    transform_records,
+)
+from data_tools.datasets.mcap.objects import MessageObjects, MessageType, message_objects
+from data_tools.datasets.mcap.recording import LoggedMessage, Recording
+from data_tools.datasets.mcap.transforms import TransformRecord, TransformTree
+from data_tools.files.error_messages import error_context, unknown_name
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """How to read a recording.
+
+    topics    topic by the sensor's name; empty: the one topic of objects that there is
+    classes   name to take for a class that is there, "" to leave it out
+    world     frame to track in; None: the topmost above the vehicle
+    ego       frame of the vehicle
+    odometry  topic of `nav_msgs/Odometry` for the pose; None: the transforms, and where there are none, the only topic
+    """
+
+    topics: Mapping[str, str] = field(default_factory=dict)
+    classes: Mapping[str, str] = field(default_factory=dict)
+    world: str | None = None
+    ego: str = DEFAULT_EGO
+    odometry: str | None = None
+
+
+class McapRecording:
+    """The one scene of a recording, named for its file or folder; it is read when asked for.
+
+    Raises `InputError` for topics that are not there or hold no objects, with those that do.
+    """
+
+    def __init__(self, path: str | Path, options: RecordingOptions | None = None) -> None:
+        self.options = options or RecordingOptions()
+        self._recording = Recording(path)
+        self.scenes = (self._recording.name,)
+        with error_context(str(self._recording.path)):
+            self.sensors = self._chosen()
+        self.world = ""  # frame of the results, known when the scene is read
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files of the recording."""
+        return tuple(self._recording.files)
+
+    @property
+    def form(self) -> MessageType:
+        """The type of message for results: that of the first sensor."""
+        topic = next(iter(self.sensors.values()))
+        return OBJECT_TYPES[self._recording.topics[topic].type]
+
+    def scene(self, name: str) -> Scene:
+        """Read the recording. Raises `InputError` naming file, topic, message and field; and for another name.
+
+        Messages at times of which the pose is unknown are left out; a warning says how many.
+        """
+        if name not in self.scenes:
+            raise InputError(f"{self._recording.path}: {unknown_name('scene', name, self.scenes)}")
+        sensor_of = {topic: sensor for sensor, topic in self.sensors.items()}
+        poses = self._pose_topics()
+        seen: list[tuple[LoggedMessage, MessageObjects]] = []
+        records: list[TransformRecord] = []
+        for logged in self._recording.messages([*sensor_of, *poses]):
+            with error_context(f"{self._recording.path}: {logged.topic.name}: message {logged.number}"):
+                try:
+                    if logged.topic.name in sensor_of:
+                        rows = OBJECT_TYPES[logged.topic.type].rows(logged.message)
+                        rows.stamp = rows.stamp or logged.log_time
+                        seen.append((_without_content(logged), message_objects(rows, self.options.classes)))
+                    else:
+                        records += transform_records(logged)
+                except AttributeError as error:
+                    raise InputError(
+                        f"{error.name}: expected this field in {logged.topic.type}, its definition here has none"
+                    ) from error
+        with error_context(str(self._recording.path)):
+            if not seen:
+                raise InputError(f"expected messages of {', '.join(sensor_of)}, there are none")
+            frames = _frames(seen, sensor_of, self._placed(seen, TransformTree(records)))
+            times, first = np.unique([frame.timestamp for frame in frames], return_index=True)
+            moments = [frames[k] for k in first.tolist()]
+            world_T_ego = [np.eye(4) if frame.world_T_ego is None else frame.world_T_ego for frame in moments]
+            return Scene(name, times, np.array(world_T_ego), tuple(frame.token for frame in moments), frames)
+
+    def _placed(self, seen: list[tuple[LoggedMessage, MessageObjects]], tree: TransformTree) -> _Places:
+        """Where the vehicle and the frames of the messages are, at the times of the messages."""
+        time: IntArray = np.array([objects.stamp for _, objects in seen], dtype=np.int64)
+        used = list(dict.fromkeys(objects.frame for _, objects in seen if objects.frame))
+        for child, parents in tree.contested.items():
+            log.warning("%s: frame %s has several parents: %s", self._recording.path, child, ", ".join(parents))
+        if not len(tree):
+            if len(used) > 1:
+                raise InputError(f"expected transforms (/tf) between the frames {', '.join(used)}, there are none")
+            self.world = self.options.world or (used or ["world"])[0]
+            log.warning(
+                "%s: no transforms (/tf) and no odometry: frame %s is taken for one that stands still",
+                self._recording.path,
+                self.world,
+            )
+            return _Places(self.world, None, np.ones(len(time), dtype=bool), {})
+        for frame in (*used, *([self.options.world] if self.options.world else [])):
+            if frame not in tree.frames:
+                message = next(
+                    (f"{m.topic.name}: message {m.number}: " for m, o in seen if o.frame == frame), "--world: "
+                )
+                raise InputError(f"{message}{unknown_name('frame', frame, tree.frames)}")
+        ego = self.options.ego if self.options.ego in tree.frames else None
+        if ego is None and self.options.ego != DEFAULT_EGO:
+            raise InputError(f"--ego: {unknown_name('frame', self.options.ego, tree.frames)}")
+        self.world = self.options.world or tree.root(ego or used[0])
+        for frame in (*used, *([ego] if ego else [])):
+            if not tree.connected(self.world, frame):
+                raise InputError(f"expected transforms between the frames {self.world} and {frame}, there are none")
+        world_T_ego, known = tree.lookup(self.world, ego, time) if ego else (None, np.ones(len(time), dtype=bool))
+        base = ego or self.world
+        places = {frame: tree.lookup(base, frame, time) for frame in used if frame != self.world}
+        for k, (_, objects) in enumerate(seen):
+            if objects.frame in places:
+                known[k] &= places[objects.frame][1][k]
+        if not known.all():
+            if not known.any():
+                raise InputError(
+                    f"expected transforms between {self.world} and {base} at the times of the messages, there are none"
+                )
+            log.warning(
+                "%s: left out %d of %d messages, at whose times the transforms between %s and %s are unknown",
+                self._recording.path,
+                int((~known).sum()),
+                len(known),
+                self.world,
+                " and ".join(dict.fromkeys([base, *places])),
+            )
+        return _Places(self.world, world_T_ego, known, {frame: T for frame, (T, _) in places.items()})
+
+    def _chosen(self) -> dict[str, str]:
+        """Topic by sensor."""
+        topics = self._recording.topics
+        fit = [each for each in topics.values() if each.type in OBJECT_TYPES]
+        there = "; ".join(f"{each.name} ({each.type}, {each.count} messages)" for each in fit) or "none"
+        if not self.options.topics:
+            filled = [each for each in fit if each.count]
+            if len(filled) != 1:
+                raise InputError(
+                    f"expected --topic with one or several of the topics that hold objects: {there}{self._others(fit)}"
+                )
+            log.info("%s: topic %s", self._recording.path, filled[0].name)
+            return {filled[0].name.lstrip("/"): filled[0].name}
+        for name in self.options.topics.values():
+            if name not in topics:
+                known = tuple(sorted(each.name for each in fit)) or tuple(sorted(topics))
+                raise InputError(f"--topic: {unknown_name('topic', name, known)}")
+            if topics[name].type not in OBJECT_TYPES:
+                raise InputError(f"--topic {name}: {topics[name].type}: expected a topic that holds objects: {there}")
+        return dict(self.options.topics)
+
+    def _others(self, fit: Iterable[object]) -> str:
+        """Topics of other types, where none fits."""
+        if list(fit):
+            return ""
+        others = [f"{each.name} ({each.type})" for each in self._recording.topics.values()]
+        more = f", ... ({len(others)} in all)" if len(others) > 12 else ""
+        return f"; types that do: {', '.join(OBJECT_TYPES)}; there are {', '.join(others[:12]) or 'no topics'}{more}"
+
+    def _pose_topics(self) -> list[str]:
+        """Topics of transforms, and of odometry where it is asked for or there is nothing else."""
+        topics = [each for each in self._recording.topics.values() if each.count]
+        transforms = [each.name for each in topics if each.type in TRANSFORM_TYPES]
+        odometry = [each.name for each in topics if each.type in ODOMETRY_TYPES]
+        path, wanted = self._recording.path, self.options.odometry
+        if wanted is not None:
+            if wanted not in odometry:
+                raise InputError(f"{path}: --odometry: {unknown_name('topic', wanted, tuple(odometry))}")
+            return [*transforms, wanted]
+        moving = [name for name in transforms if not name.endswith("tf_static")]
+        if moving or not odometry:
+            return transforms
+        if len(odometry) > 1:
+            raise InputError(f"{path}: expected --odometry with one of {', '.join(odometry)}, since there is no /tf")
+        return [*transforms, odometry[0]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """world_T_ego (N, 4, 4) at the N messages, None without a vehicle; which are known; base_T_frame by frame, the
+    base being the vehicle, or the world without one.
+    """
+
+    world: str
+    world_T_ego: FloatArray | None
+    known: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    base_T_frame: Mapping[str, FloatArray]
+
+
+def _frames(
+    seen: list[tuple[LoggedMessage, MessageObjects]], sensor_of: Mapping[str, str], places: _Places
+) -> list[Frame]:
+    """The messages whose place is known as frames, in order of time."""
+    frames = []
+    for k in np.argsort([objects.stamp for _, objects in seen], kind="stable").tolist():
+        logged, objects = seen[k]
+        if not places.known[k]:
+            continue
+        pose = None if places.world_T_ego is None else places.world_T_ego[k]
+        detections, base_T_frame = objects.detections, places.base_T_frame.get(objects.frame)
+        if base_T_frame is not None:
+            detections = detections.transformed(base_T_frame[k])
+        in_ego = base_T_frame is not None and pose is not None
+        with error_context(f"{logged.topic.name}: message {logged.number}"):
+            sensor, token = sensor_of[logged.topic.name], str(objects.stamp)
+            frames.append(Frame(objects.stamp / 1e9, sensor, detections, pose, "ego" if in_ego else "world", token))
+    return frames
+
+
+def _without_content(logged: LoggedMessage) -> LoggedMessage:
+    return LoggedMessage(logged.topic, logged.number, logged.log_time, None)

@@ -1,0 +1,141 @@
+"""Figures of tracks without ground truth: how many, how long, how sure, how fast."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.datasets.results import SceneResult
+from data_tools.figures import FigureTable, cell
+from pipelines.report.charts import Chart, Series, distribution
+from saga_fg.numerics.arrays import FloatArray, StrArray
+
+SHORT = 3  # moments; a track of fewer
+UNSEEN = 0.15  # s since the last detection, from which a track coasts
+COLUMNS = (
+    *("class", "tracks", "short", "boxes", "life, s", "unseen", "gaps", "speed, m/s", "position ±, m"),
+    *("score",),
+)
+TITLE = (
+    f"Tracks; short: fewer than {SHORT} moments; life, speed, deviation and score: medians; unseen: share of boxes "
+    "without a detection; gaps: times that a track was lost from view and seen again"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lives:
+    """T tracks as wholes: their class, s from first to last box, boxes, and gaps, (T,)."""
+
+    label: StrArray
+    seconds: FloatArray
+    boxes: FloatArray
+    gaps: FloatArray
+
+    def of(self, label: str) -> _Lives:
+        rows = np.flatnonzero((self.label == label) | (label == "all"))
+        return _Lives(self.label[rows], self.seconds[rows], self.boxes[rows], self.gaps[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class _Boxes:
+    """N boxes: their class, speed (m/s), deviation of the position (m), score, and whether they are unseen, (N,)."""
+
+    label: StrArray
+    speed: FloatArray
+    deviation: FloatArray
+    score: FloatArray
+    unseen: FloatArray
+
+    def of(self, label: str) -> _Boxes:
+        rows = np.flatnonzero((self.label == label) | (label == "all"))
+        return _Boxes(*(column[rows] for column in vars(self).values()))
+
+
+def track_figures(results: Sequence[SceneResult]) -> FigureTable:
+    """Return a table with a row for each class."""
+    lives, boxes = _lives(results), _boxes(results)
+    classes = np.unique(lives.label).tolist()
+    rows = [_row(name, lives.of(name), boxes.of(name)) for name in (["all"] if len(classes) > 1 else []) + classes]
+    return FigureTable(TITLE, COLUMNS, tuple(rows))
+
+
+def track_charts(results: Sequence[SceneResult]) -> list[Chart]:
+    """Return the number of tracks over time, and distributions of lives, speeds and scores by class."""
+    lives, boxes = _lives(results), _boxes(results)
+    classes = np.unique(lives.label).tolist()
+    charts = [
+        distribution("Life of tracks", "s", "share of tracks below", [(c, lives.of(c).seconds) for c in classes]),
+        distribution("Speed", "m/s", "share of boxes below", [(c, _known(boxes.of(c).speed)) for c in classes]),
+        distribution("Score", "score", "share of boxes below", [(c, _known(boxes.of(c).score)) for c in classes]),
+    ]
+    return [_counts(results), *(chart for chart in charts if chart.series)]
+
+
+def _counts(results: Sequence[SceneResult]) -> Chart:
+    series = []
+    for each in results[:8]:
+        counts = np.bincount(each.found.frame, minlength=len(each.scene))
+        times = each.scene.timestamps - each.scene.timestamps[:1]
+        series.append(Series(each.scene.name, times.tolist(), counts.tolist()))
+    return Chart("Tracks at a time", "s", "tracks", series)
+
+
+def _row(name: str, lives: _Lives, boxes: _Boxes) -> tuple[str, ...]:
+    known = np.isfinite(boxes.unseen)
+    return (
+        name,
+        cell(len(lives.label)),
+        cell(int((lives.boxes < SHORT).sum())),
+        cell(len(boxes.label)),
+        cell(_median(lives.seconds)),
+        cell(float(boxes.unseen[known].mean()) if known.any() else float("nan")),
+        cell(int(lives.gaps.sum())) if known.any() else cell(float("nan")),
+        *(cell(_median(column)) for column in (boxes.speed, boxes.deviation, boxes.score)),
+    )
+
+
+def _known(values: FloatArray) -> FloatArray:
+    return values[np.isfinite(values)]
+
+
+def _median(values: FloatArray) -> float:
+    known = _known(values)
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _unseen(result: SceneResult) -> FloatArray:
+    """Return (N,) 1 for a box that coasts, 0 for one that was detected, NaN where it is not known."""
+    if result.coasting is None:
+        return np.full(len(result.found), np.nan)
+    return np.where(np.isnan(result.coasting), np.nan, result.coasting > UNSEEN)
+
+
+def _boxes(results: Sequence[SceneResult]) -> _Boxes:
+    tables = [each.found for each in results]
+    variance = [np.trace(table.position_covariance, axis1=1, axis2=2) / 2 for table in tables]
+    columns = (
+        [np.linalg.norm(table.boxes.velocity, axis=1) for table in tables],
+        [np.sqrt(each) for each in variance],
+        [table.score for table in tables],
+        [_unseen(each) for each in results],
+    )
+    label = np.concatenate([np.empty(0, dtype="<U1"), *(table.boxes.label for table in tables)])
+    return _Boxes(label, *(np.concatenate([np.empty(0), *parts]) for parts in columns))
+
+
+def _lives(results: Sequence[SceneResult]) -> _Lives:
+    parts: list[tuple[StrArray, FloatArray, FloatArray, FloatArray]] = []
+    for each in results:
+        table, unseen = each.found, np.nan_to_num(_unseen(each))
+        ids, first, number, count = np.unique(table.id, return_index=True, return_inverse=True, return_counts=True)
+        time = each.scene.timestamps[table.frame]
+        order = np.lexsort((table.frame, number))
+        ends = np.cumsum(count)
+        seconds = time[order][ends - 1] - time[order][ends - count]
+        again = (unseen[order][:-1] == 1) & (unseen[order][1:] == 0) & (number[order][:-1] == number[order][1:])
+        gaps = np.bincount(number[order][1:][again], minlength=len(ids))
+        parts.append((table.boxes.label[first], seconds, count.astype(np.float64), gaps.astype(np.float64)))
+    label = np.concatenate([np.empty(0, dtype="<U1"), *(part[0] for part in parts)])
+    return _Lives(label, *(np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (1, 2, 3)))

@@ -1,0 +1,235 @@
+r"""Which loop closures of a pose graph are true.
+
+Odometry (between successive poses) is trusted. First, graduated non-convexity with truncated least squares from dead
+reckoning: in each step of mu one weighted Gauss-Newton step,
+
+    w = 1                     s^2 <= mu/(mu+1) c^2                s: distance of the loop's residual
+        0                     s^2 >= (mu+1)/mu c^2                c^2: 99 % quantile of chi^2
+        c/s sqrt(mu(mu+1)) - mu   in between
+
+Then data snooping: each loop is judged by the solution without it,
+
+    d^2 = r^T ( 1 -+ S )^-1 r,     S = J H^-1 J^T        - for a loop that takes part in H, + for one that does not
+
+whitened. Covariances in files are often far too large, and a false loop then hides in them; so the gate on d^2 is
+
+    min( c'^2, m k c^2 ),     c'^2: 99.9 % quantile,  k = median of d^2 over the loops taken / median of chi^2
+
+with k the variance of unit weight, and m room for tails. The worst loops go, the best of the others come in, until
+nothing changes.
+
+Sources: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020; Baarda, A
+testing procedure for use in geodetic networks, 1968.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.stats import chi2
+
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.slam.pose_graph.chordal_cost import factorised
+from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.optimisation import factor_graph, pose_array, pose_values
+
+PROBABILITY = 0.99  # of a true loop within c
+_CERTAIN = 0.999  # of a true loop within the gate: few of many loops may be lost
+_TAILS = 8.0  # m: loops of recordings have tails far longer than Gaussian ones
+_FEWEST = 8  # loops that tell a variance of unit weight
+_STEP = 1.4  # of mu, as in the paper
+_NONE = 1e-3  # weight that counts as 0
+_MOST_STAGES, _MOST_ROUNDS, _SETTLING = 200, 50, 3
+_BLOCK = 200  # loops whose covariances are solved for at once
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """graph: without the false loops, at the poses of the rest; kept (M,): which measurements are in it."""
+
+    graph: PoseGraph
+    kept: BoolArray
+
+
+def trusted(graph: PoseGraph) -> BoolArray:
+    """Which measurements (M,) are odometry: they join successive poses."""
+    return np.asarray(np.abs(graph.second - graph.first) == 1)
+
+
+def consensus(graph: PoseGraph) -> Consensus:
+    """The graph without false loops. Raises `InputError` for landmarks, priors, and a graph that is not connected."""
+    if not graph.poses_alone:
+        raise InputError("consensus: expected a graph of poses alone, without landmarks and priors")
+    apart = graph.components() != 0
+    if apart.any():
+        raise InputError(f"pose {int(graph.ids[apart][0])}: expected measurements that connect it with the first pose")
+    loop = ~_spanning(graph)
+    problem = _Problem.of(graph)
+    if not loop.any():
+        return Consensus(graph, ~loop)
+    values = pose_values(_spanning_start(graph, ~loop))
+    values, weights = _graduated(problem, values, loop)
+    values, kept = _snooped(problem, values, loop, weights > 0.5)
+    poses = pose_array(values, graph.dim)
+    return Consensus(chosen_edges(graph, kept).at(poses), kept)
+
+
+def chosen_edges(graph: PoseGraph, kept: BoolArray) -> PoseGraph:
+    """The graph with some of its measurements (M,)."""
+    return replace(
+        graph,
+        first=graph.first[kept],
+        second=graph.second[kept],
+        first_T_second=graph.first_T_second[kept],
+        information=graph.information[kept],
+    )
+
+
+def _spanning(graph: PoseGraph) -> BoolArray:
+    """Odometry, and where it has gaps as many of the other measurements as connect its parts."""
+    odometry = trusted(graph)
+    n = len(graph)
+    cost = np.where(odometry, 1.0, 2.0)
+    low, high = np.minimum(graph.first, graph.second), np.maximum(graph.first, graph.second)
+    order = np.lexsort((cost, high, low))  # the cheapest of several between the same two
+    pairs = low[order] * n + high[order]
+    once = order[np.concatenate([[True], pairs[1:] != pairs[:-1]])]
+    tree = minimum_spanning_tree(csr_array((cost[once], (low[once], high[once])), shape=(n, n))).tocoo()
+    return np.asarray(
+        odometry | np.isin(np.arange(len(low)), once[np.isin(low[once] * n + high[once], tree.row * n + tree.col)])
+    )
+
+
+def _spanning_start(graph: PoseGraph, spanning: BoolArray) -> FloatArray:
+    """Dead reckoning along these measurements from the first pose."""
+    part = chosen_edges(graph, spanning)
+    start = PoseGraph.of_measurements(part.ids, part.first, part.second, part.first_T_second, part.information)
+    return np.asarray(graph.world_T_pose[0] @ start.world_T_pose)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The factors of a graph; k: size of the tangent. The first factor holds the first pose."""
+
+    factors: gtsam.NonlinearFactorGraph
+    k: int
+    edges: int
+
+    @classmethod
+    def of(cls, graph: PoseGraph) -> _Problem:
+        return cls(factor_graph(graph), 3 * (graph.dim - 1), len(graph.first))
+
+    @property
+    def gate(self) -> float:
+        return float(chi2.ppf(PROBABILITY, self.k))
+
+    def distances(self, values: gtsam.Values) -> FloatArray:
+        """Squares of the distances (M,), in variances."""
+        return np.array([2 * self.factors.at(1 + edge).error(values) for edge in range(self.edges)])
+
+    def step(self, values: gtsam.Values, weights: FloatArray) -> gtsam.Values:
+        """A step of Gauss and Newton with weights (M,)."""
+        taken = np.flatnonzero(weights > 0)
+        part, full = gtsam.NonlinearFactorGraph(), np.flatnonzero(weights[taken] >= 1)
+        part.add(self.factors.at(0))
+        for edge in taken[full].tolist():
+            part.add(self.factors.at(1 + edge))
+        linear = part.linearize(values)
+        unit = gtsam.noiseModel.Unit.Create(self.k)
+        for edge in taken[weights[taken] < 1].tolist():
+            row, root = self.factors.at(1 + edge).linearize(values), np.sqrt(weights[edge])
+            A = root * row.augmentedJacobian()
+            first, second = row.keys()
+            linear.add(
+                gtsam.JacobianFactor(
+                    first, A[:, : self.k], second, A[:, self.k : -1], np.ascontiguousarray(A[:, -1]), unit
+                )
+            )
+        return values.retract(linear.optimize())
+
+    def rows(self, values: gtsam.Values) -> tuple[csc_array, FloatArray]:
+        """Whitened Jacobian (M k, N k) of the measurements, and residuals (M, k)."""
+        linear = self.factors.linearize(values)
+        row, column, entry = linear.sparseJacobian_()
+        whole = coo_array((entry, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))).tocsc()
+        matrix = whole[self.k :]
+        size = matrix.shape[1] - 1
+        return matrix[:, :size].tocsc(), matrix[:, [size]].toarray().reshape(-1, self.k)
+
+
+def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tuple[gtsam.Values, FloatArray]:
+    """Poses and weights (M,) by truncated least squares."""
+    squares = problem.distances(values) / problem.gate
+    mu = 1 / max(2 * float(squares[loop].max()) - 1, 1e-9)
+    weights = np.ones(len(loop))
+    for _ in range(_MOST_STAGES):
+        between = np.sqrt(mu * (mu + 1) / np.maximum(squares, 1e-100)) - mu
+        weights = np.where(squares <= mu / (mu + 1), 1.0, np.where(squares >= (mu + 1) / mu, 0.0, between))
+        weights[~loop] = 1.0
+        values = problem.step(values, weights)
+        squares = problem.distances(values) / problem.gate
+        if mu >= 1 and (np.minimum(weights, 1 - weights) < _NONE).all():
+            break
+        mu *= _STEP
+    return values, weights
+
+
+def _snooped(
+    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray
+) -> tuple[gtsam.Values, BoolArray]:
+    """Take loops out and in, until all that are in pass the gate, and none besides."""
+    rows = np.flatnonzero(loop)
+    seen: set[bytes] = set()
+    squares = np.zeros(len(rows))
+    judged = np.ones(len(rows), dtype=bool)
+    kept = kept.copy()
+    for _ in range(_MOST_ROUNDS):
+        values = problem.step(problem.step(values, kept.astype(float)), kept.astype(float))
+        squares[judged] = _judged(problem, values, rows[judged], kept)
+        inside = kept[rows]
+        gate = float(chi2.ppf(_CERTAIN, problem.k))
+        if inside.sum() >= _FEWEST:
+            k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
+            gate = min(gate, _TAILS * k * problem.gate)
+        judged = inside | (squares < 10 * problem.gate)  # the others stay far out
+        outlying, fitting = inside & (squares > gate), ~inside & (squares <= gate)
+        if outlying.any():
+            kept[rows[outlying & (squares >= squares[outlying].max() / 2)]] = False
+        elif fitting.any():
+            kept[rows[np.argmin(np.where(fitting, squares, np.inf))]] = True
+        else:
+            break
+        if (state := kept.tobytes()) in seen:
+            break
+        seen.add(state)
+    for _ in range(_SETTLING):
+        values = problem.step(values, kept.astype(float))
+    return values, kept
+
+
+def _judged(problem: _Problem, values: gtsam.Values, edges: IntArray, kept: BoolArray) -> FloatArray:
+    """d^2 of loops (n,), each by a solution without it; infinite where the others do not determine it."""
+    k = problem.k
+    J, r = problem.rows(values)
+    taken = diags_array(np.repeat(kept.astype(float), k))
+    H = (J.T @ taken @ J).tocsc()[k:, k:]  # the first pose is held
+    solver = factorised(H)
+    found = np.empty(len(edges))
+    J = J.tocsr()[:, k:]
+    for at in range(0, len(edges), _BLOCK):
+        block = edges[at : at + _BLOCK]
+        part = J[(block[:, None] * k + np.arange(k)).ravel()]
+        spread = part @ solver.solve(part.T.toarray())
+        own = np.arange(len(block) * k).reshape(-1, k)
+        S = np.asarray(spread)[own[:, :, None], own[:, None, :]]
+        M = np.eye(k) + np.where(kept[block], -1.0, 1.0)[:, None, None] * (S + S.swapaxes(1, 2)) / 2
+        smallest = np.linalg.eigvalsh(M)[:, 0]
+        M[smallest <= 1e-9] = np.eye(k)
+        squares = (r[block] * np.linalg.solve(M, r[block][:, :, None])[:, :, 0]).sum(axis=1)
+        found[at : at + _BLOCK] = np.where(smallest <= 1e-9, np.inf, squares)
+    return found

@@ -1,0 +1,194 @@
+"""The page's player in a browser: what it shows first, its filters, its links, its keys."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_tools.metrics import SceneBoxes
+from pipelines.report import Report, ReportScene, report_page
+from pipelines.report.thresholds import PLAIN, start_thresholds
+from saga_fg import Boxes, Scene
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.dataset import Annotations
+from tests.pipelines.page_in_browser import tried_in_browser
+
+MOMENTS = 10
+KINDS = {  # class, y, score, moments, unseen for, s
+    "car-1": ("car", 0.0, 0.9, range(10), 0.0),
+    "car-2": ("car", 6.0, 0.8, range(10), 0.0),
+    "walker-3": ("pedestrian", -6.0, 0.7, range(10), 0.0),
+    "weak-4": ("car", 12.0, 0.2, range(10), 0.0),
+    "brief-5": ("car", 18.0, 0.9, range(2), 0.0),
+    "ghost-6": ("car", -12.0, 0.9, range(10), 0.0),
+}
+
+
+def scene(name: str, truth: bool = False) -> ReportScene:
+    """Six kinds of tracks that drive beside the vehicle; a second tracker has the first two alone."""
+    times = np.arange(MOMENTS) * 0.5
+    poses = np.array([yaw_transform(5 * t, 0.0) for t in times])
+    rows = [(k, id_, *kind) for k in range(MOMENTS) for id_, kind in KINDS.items() if k in kind[3]]
+
+    def table(chosen):
+        boxes = Boxes.of(
+            [row[2] for row in chosen],
+            [[2.5 * row[0] + 10, row[3], 0.0] for row in chosen],
+            [[4.0, 2.0, 1.5]] * len(chosen),
+            [0.0] * len(chosen),
+        )
+        ids = np.array([row[1] for row in chosen])
+        return SceneBoxes(np.array([row[0] for row in chosen]), ids, boxes, np.array([row[4] for row in chosen]))
+
+    unseen = np.array([0.5 if row[1] == "ghost-6" and row[0] >= 4 else 0.0 for row in rows])
+    whole, few = table(rows), table([row for row in rows if row[1] in ("car-1", "car-2")])
+    objects = []
+    for k in range(MOMENTS):
+        boxes = Boxes.of(["car", "car"], [[2.5 * k + 10, y, 0.0] for y in (0.0, 6.0)], [[4, 2, 1.5]] * 2, [0.0] * 2)
+        objects.append(Annotations(np.array(["a", "b"]), boxes, np.ones(2, dtype=bool)))
+    recorded = Scene(name, times, poses, ("",) * MOMENTS, (), objects if truth else None)
+    return ReportScene(recorded, {"few": few, "whole": whole}, {"whole": unseen})
+
+
+def page() -> str:
+    return report_page(Report("player", [], [scene("first"), scene("second")]))
+
+
+HELPERS = """
+  const $of = id => document.getElementById(id);
+  const counts = () => $of("view").dataset.tracks;
+  const key = (name, more) => document.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true, ...more}));
+  const followed = () => ($of("panel").querySelector("h2") || {}).textContent || "";
+  const at = k => { $of("time").value = k; $of("time").oninput(); };
+  const chip = name => [...$of("classes").children].find(each => each.textContent === name);
+"""
+
+
+def tried(script: str, folder: Path, hash_: str = ""):
+    found = tried_in_browser(page(), HELPERS + script, folder, hash_)
+    assert found["faults"] == []
+    return found
+
+
+def test_weak_brief_and_unseen_tracks_are_hidden_until_asked_for(tmp_path: Path) -> None:
+    found = tried(
+        """
+  at(5); found.first = counts();
+  $of("show-ghosts").click(); found.ghosts = counts(); $of("show-ghosts").click();
+  at(1); found.early = counts();
+  $of("show-confirmed").click(); found.brief = counts(); $of("show-confirmed").click();
+  const score = $of("score-0");
+  found.score = score.value;
+  score.value = 0; score.oninput(); found.weak = counts();
+  score.value = .75; score.oninput(); found.strong = counts();
+""",
+        tmp_path,
+    )
+    assert found["score"] == "0.3"
+    assert found["first"] == "3"  # car-1, car-2, walker-3
+    assert found["ghosts"] == "4"
+    assert found["early"] == "4"  # ghost-6 is seen yet
+    assert found["brief"] == "5"
+    assert found["weak"] == "5"
+    assert found["strong"] == "3"  # car-1, car-2, ghost-6
+
+
+def test_classes_can_be_switched_off_or_shown_alone(tmp_path: Path) -> None:
+    found = tried(
+        """
+  at(5);
+  found.chips = [...$of("classes").children].map(each => each.textContent);
+  found.colours = [...$of("classes").children].map(each => getComputedStyle(each).backgroundColor);
+  chip("car").click(); found.walkers = counts(); found.pressed = chip("car").getAttribute("aria-pressed");
+  chip("car").click(); found.all = counts();
+  chip("pedestrian").ondblclick(); found.alone = counts();
+  chip("pedestrian").ondblclick(); found.again = counts();
+""",
+        tmp_path,
+    )
+    assert found["chips"] == ["car", "pedestrian"]
+    assert len(set(found["colours"])) == 2
+    assert (found["walkers"], found["pressed"], found["all"]) == ("1", "false", "3")
+    assert (found["alone"], found["again"]) == ("1", "3")
+
+
+def test_a_link_leads_to_a_moment_and_a_track(tmp_path: Path) -> None:
+    script = "Object.assign(found, {scene: $of('scene').value, clock: $of('clock').value, followed: followed()});"
+    script += " key('ArrowRight'); found.hash = location.hash; found.beside = counts().split(' ').length;"
+    found = tried(script, tmp_path, "#scene=second&t=2.4&id=weak-4&method=whole&beside=few")
+    assert (found["scene"], found["clock"], found["followed"]) == ("second", "2.5 s", "track weak-4")
+    assert found["hash"] == "#scene=second&t=3.000&method=whole&beside=few&id=weak-4"
+    assert found["beside"] == 2
+    short = tried(script, tmp_path, "#id=5")  # the end of its id is enough, at its first moment
+    assert (short["clock"], short["followed"]) == ("0.0 s", "track brief-5")
+
+
+def test_two_results_side_by_side(tmp_path: Path) -> None:
+    found = tried(
+        """
+  at(5);
+  found.alone = counts();
+  $of("beside").value = "few"; $of("beside").onchange();
+  found.two = counts(); found.sliders = $of("scores").querySelectorAll("input").length;
+  const view = $of("view"); view.setPointerCapture = () => {};
+  const click = (type, x, y) => {
+    const box = view.getBoundingClientRect();
+    view.dispatchEvent(new PointerEvent(type, {clientX: box.x + x, clientY: box.y + y, pointerId: 1, bubbles: true}));
+  };
+  const width = view.clientWidth / 2;  // a car is 10 m before the vehicle, 9 pixels to a metre
+  for (const left of [0, width]) {
+    click("pointerdown", left + .42 * width + 90, view.clientHeight / 2);
+    click("pointerup", left + .42 * width + 90, view.clientHeight / 2);
+    (found.picked ??= []).push([followed(), new URLSearchParams(location.hash.slice(1)).get("id")]);
+    key("0");
+  }
+""",
+        tmp_path,
+    )
+    assert found["alone"] == "3"
+    assert found["two"] == "2 3"
+    assert found["sliders"] == 2
+    assert found["picked"] == [["track car-1", "car-1"]] * 2
+
+
+def test_keys_and_their_help(tmp_path: Path) -> None:
+    found = tried(
+        """
+  at(5);
+  key("n"); found.next = followed();
+  key("n"); found.other = followed();
+  key("p"); found.back = followed();
+  key("Escape"); found.none = followed();
+  key("]"); found.more = $of("score-0").value; key("["); found.less = $of("score-0").value;
+  key("ArrowRight", {shiftKey: true}); found.last = $of("clock").value;
+  key("g"); found.ghosts = $of("show-ghosts").checked;
+  key("?"); found.help = $of("help").open; found.keys = $of("keys").children.length;
+  key("ArrowLeft"); found.still = $of("clock").value;
+""",
+        tmp_path,
+    )
+    assert found["next"] == "track car-1"  # the nearest
+    assert found["other"] != found["back"] == found["next"]
+    assert found["none"] == ""
+    assert (found["more"], found["less"]) == ("0.35", "0.3")
+    assert found["last"] == found["still"] == "4.5 s"
+    assert found["ghosts"]
+    assert found["help"]
+    assert found["keys"] > 20
+
+
+def test_the_first_threshold_is_that_of_the_best_mota() -> None:
+    assert start_thresholds([scene("a")]) == {"few": PLAIN, "whole": PLAIN}
+    thresholds = start_thresholds([scene("a", truth=True)])
+    assert thresholds["few"] == pytest.approx(0.8)
+    assert thresholds["whole"] == pytest.approx(0.8)  # below come false boxes alone
+
+
+def test_boxes_at_hidden_objects_do_not_count() -> None:
+    boxes = Boxes.of(["car", "car"], [[0.0, 0, 0], [9.0, 0, 0]])
+    truth = Annotations(np.array(["a", "b"]), boxes, np.array([True, False]))
+    found = SceneBoxes(np.zeros(2, dtype=np.int64), np.array(["1", "2"]), boxes, np.array([0.9, 0.1]))
+    short = Scene("s", np.zeros(1), np.eye(4)[None], ("",), (), [truth])
+    assert start_thresholds([ReportScene(short, {"x": found}, {})]) == {"x": 0.9}

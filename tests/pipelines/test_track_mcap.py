@@ -1,0 +1,177 @@
+"""From a recording of ROS 2 or Foxglove to tracks in it, through the command; results are read by other libraries."""
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("mcap_ros2")
+pytest.importorskip("rosbags")
+
+from data_tools.datasets.mcap.results import TOPIC, read_track_messages
+from pipelines.cli import app
+from tests.data_tools import mcap_example as example
+from tests.data_tools.mcap_example import ARRAY, LIDAR, MOMENTS, START, STEP
+
+LAST = MOMENTS - 1
+
+
+def saga_fg(*arguments):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return result.exit_code, result.output
+
+
+def messages_of(path):
+    """Topic, time and content of all messages, by rosbags."""
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([path]) as reader:
+        return [(c.topic, c.msgtype, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+
+
+@pytest.fixture
+def drive(tmp_path):
+    return example.write_mcap(tmp_path / "drive.mcap", example.drive())
+
+
+def test_autoware_in_and_out(tmp_path, drive):
+    code, output = saga_fg("track", "mcap", drive, "--topic", f"lidar={LIDAR}", "--output", tmp_path / "tracks.mcap")
+    assert code == 0, output
+    found = messages_of(tmp_path / "tracks.mcap")
+    assert {(topic, kind) for topic, kind, *_ in found} == {(TOPIC, "autoware_perception_msgs/msg/TrackedObjects")}
+    assert [time for _, _, time, _ in found] == [START + k * STEP for k in range(MOMENTS)]
+    last = found[-1][3]
+    assert last.header.frame_id == "map"
+    assert last.header.stamp.sec * 10**9 + last.header.stamp.nanosec == START + LAST * STEP
+    car = next(each for each in last.objects if each.classification[0].label == 1)
+    place = car.kinematics.pose_with_covariance.pose.position
+    assert [place.x, place.y] == pytest.approx(example.objects(LAST)[0][1][:2], abs=0.1)
+    velocity = car.kinematics.twist_with_covariance.twist.linear
+    assert [velocity.x, velocity.y] == pytest.approx([8.0, 0.0], abs=0.3)  # along the car
+    assert car.shape.dimensions.x == pytest.approx(4.5)
+    assert car.object_id.uuid.any()
+    P = car.kinematics.pose_with_covariance.covariance.reshape(6, 6)
+    assert P[0, 0] > 0
+
+
+def test_detection_arrays_in_and_out_under_their_own_names(tmp_path):
+    path = example.write_bag(tmp_path / "bag", example.drive(example.detection_array, ARRAY, "/objects"))
+    names = "CAR=car, PEDESTRIAN=pedestrian, SIGN="
+    code, output = saga_fg("track", "mcap", path, "--classes", names, "--output", tmp_path / "tracks.mcap")
+    assert code == 0, output
+    *_, (topic, kind, _, last) = messages_of(tmp_path / "tracks.mcap")
+    assert (topic, kind) == (TOPIC, ARRAY)
+    assert {each.results[0].hypothesis.class_id for each in last.detections} == {"CAR", "PEDESTRIAN"}
+    assert len({each.id for each in last.detections}) == 2
+
+
+def test_foxglove_scenes_in_and_out(tmp_path):
+    pytest.importorskip("foxglove_schemas_protobuf")
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+    from mcap_protobuf.decoder import DecoderFactory
+    from mcap_protobuf.writer import Writer
+
+    path = tmp_path / "scene.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        for k in range(MOMENTS):
+            seconds, nanos = divmod(START + k * STEP, 10**9)
+            time = {"timestamp": {"seconds": seconds, "nanos": nanos}}
+            entities = [
+                {
+                    **time,
+                    "frame_id": "map",
+                    "id": label,
+                    "metadata": [{"key": "Class", "value": label}, {"key": "score", "value": "0.8"}],
+                    "cubes": [
+                        {"pose": {"position": example.vector(*place), "orientation": example.turn(np.pi / 2)},
+                         "size": example.vector(*size)}
+                    ],
+                }
+                for label, place, _, size in example.objects(k)
+            ]  # fmt: skip
+            entities.append({**time, "frame_id": "elsewhere", "id": "a line", "lines": [{}]})
+            update = SceneUpdate(deletions=[{**time, "type": 1}], entities=entities if k % 5 else [])
+            writer.write_message("/boxes", update, log_time=START + k * STEP)
+        writer.finish()
+    code, output = saga_fg("track", "mcap", path, "--output", tmp_path / "tracks.mcap")
+    assert code == 0, output
+    from mcap.reader import make_reader
+
+    with (tmp_path / "tracks.mcap").open("rb") as file:
+        *_, last = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert last.schema.name == "foxglove.SceneUpdate"
+    cars = [
+        e
+        for e in last.decoded_message.entities
+        if {"class": "car"}.items() <= {m.key: m.value for m in e.metadata}.items()
+    ]
+    assert [cars[0].cubes[0].pose.position.y] == pytest.approx(example.objects(LAST)[0][1][1:2], abs=0.2)
+    assert cars[0].frame_id == "map"
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv"])
+def test_results_are_shown_and_judged(tmp_path, drive, suffix):
+    tracks = tmp_path / f"tracks.{suffix}"
+    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    options = ("--recording", drive)
+    code, output = saga_fg("report", "mcap", tracks, *options, "--output", tmp_path / "report.html")
+    assert code == 0, output
+    code, output = saga_fg("view", "mcap", tracks, *options, "--save", tmp_path / "view.mcap")
+    assert code == 0, output
+    code, output = saga_fg("smooth", "mcap", drive, "--output", tmp_path / "labels")
+    assert code == 0, output
+    assert saga_fg("evaluate", "labels", "mcap", tmp_path / "labels", *options)[0] == 0
+
+
+def test_tracks_are_read_back_as_they_were(tmp_path, drive):
+    from data_tools.datasets.detection_files import read_tracks
+
+    for suffix in ("mcap", "csv"):
+        assert saga_fg("track", "mcap", drive, "--output", tmp_path / f"tracks.{suffix}")[0] == 0
+    a, b = read_track_messages(tmp_path / "tracks.mcap", "drive", {}), read_tracks(tmp_path / "tracks.csv")
+    assert a.id.tolist() == b.id.tolist()
+    assert a.timestamp == pytest.approx(b.timestamp, abs=1e-6)
+    assert a.boxes.label.tolist() == b.boxes.label.tolist()
+    assert a.boxes.position == pytest.approx(b.boxes.position)
+    assert a.boxes.velocity == pytest.approx(b.boxes.velocity, abs=1e-9)
+    assert a.boxes.size == pytest.approx(b.boxes.size)
+    assert a.score == pytest.approx(b.score, abs=1e-6)
+    assert a.position_covariance == pytest.approx(b.position_covariance)
+    assert a.velocity_covariance == pytest.approx(b.velocity_covariance, rel=1e-6, abs=1e-9)
+
+
+def test_several_recordings_in_parallel_and_again(tmp_path, drive):
+    bag = example.write_bag(tmp_path / "bag", example.drive())
+    command = ("track", "mcap", drive, bag, "--output", tmp_path / "run", "--workers", 2)
+    code, output = saga_fg(*command)
+    assert code == 0, output
+    assert sorted(path.name for path in (tmp_path / "run" / "tracks").iterdir()) == ["bag.mcap", "drive.mcap"]
+    assert "0 done, 2 unchanged" in saga_fg(*command)[1]
+    assert "2 done, 0 unchanged" in saga_fg(*command, "--world", "base_link")[1]
+    code, output = saga_fg("track", "mcap", drive, bag, "--output", tmp_path / "tracks.mcap")
+    assert code != 0
+    assert "expected one recording; several need --workers" in output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--topic", "/objects"), "unknown topic '/objects', expected one of: /perception/lidar/objects"),
+        (("--topic", "lidar="), "expected a topic, or SENSOR=TOPIC"),
+        (("--topic", f"a={LIDAR}", "--topic", f"a={LIDAR}"), "the sensor a is given twice"),
+        (("--classes", "car"), "--classes: expected THEIRS=OURS with commas between them, got 'car'"),
+    ],
+)
+def test_wrong_options(tmp_path, drive, options, message):
+    code, output = saga_fg("track", "mcap", drive, *options, "--output", tmp_path / "tracks.mcap")
+    assert code != 0
+    assert message in " ".join(output.split())
+
+
+def test_without_the_extra_it_is_named(tmp_path, drive, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "mcap_ros2", None)
+    code, output = saga_fg("track", "mcap", drive, "--output", tmp_path / "tracks.mcap")
+    assert code != 0
+    assert "pip install 'saga-fg[mcap]'" in " ".join(output.split())

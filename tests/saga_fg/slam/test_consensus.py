@@ -1,0 +1,47 @@
+"""False loops are left out, true ones kept, whatever the covariances in the file are worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_tools.pose_graphs import city, torus, with_false_loops
+from saga_fg import InputError
+from saga_fg.slam.pose_graph import PoseGraph, consensus, optimise_poses, trusted
+from saga_fg.slam.pose_graph.consensus import chosen_edges
+
+
+def graph_of(dim: int) -> PoseGraph:
+    graph, _ = city(200, seed=1) if dim == 2 else torus(100, seed=1, windings=10)
+    return graph
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("scale", [1.0, 1 / 25])
+def test_the_optimum_is_that_without_the_false_loops(dim: int, scale: float) -> None:
+    """scale: of the information, as files have it that overstate their noise."""
+    graph = graph_of(dim)
+    graph = replace(graph, information=scale * graph.information)
+    spoilt = with_false_loops(graph, 0.5, seed=3)
+    agreed = consensus(spoilt)
+    true = len(graph.first)
+    assert not agreed.kept[true:].any()
+    assert agreed.kept[:true].mean() > 0.98
+    assert agreed.kept[trusted(spoilt)].all()
+    clean, found = optimise_poses(graph), optimise_poses(agreed.graph)
+    off = (found.world_T_pose - clean.world_T_pose)[:, :dim, dim]
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
+
+
+def test_a_gap_in_the_odometry_is_bridged() -> None:
+    graph = graph_of(2)
+    agreed = consensus(chosen_edges(graph, ~trusted(graph) | (np.minimum(graph.first, graph.second) != 150)))
+    assert agreed.kept.mean() > 0.98
+
+
+def test_a_graph_in_pieces_is_refused() -> None:
+    graph = graph_of(2)
+    with pytest.raises(InputError, match="expected measurements that connect it with the first pose"):
+        consensus(chosen_edges(graph, graph.first < 10))

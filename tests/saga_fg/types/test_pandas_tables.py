@@ -1,0 +1,123 @@
+"""Tables of pandas in and out, and the one-line tracker."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import saga_fg
+from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, Tracker, Tracks
+from saga_fg.types.pandas_tables import moments_of_table
+
+pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
+
+
+def table(**more):
+    rows = [{"timestamp": k / 10, "x": 1.0 * k - 12 * n, "y": 0.5 * n} for k in range(12) for n in range(2)]
+    return pd.DataFrame(rows).assign(**more)
+
+
+def test_all_columns_become_detections() -> None:
+    rows = pd.DataFrame(
+        {
+            "x": [1.0, 2.0], "y": [3.0, 4.0], "z": [0.5, None], "length": [4.0, None], "width": [2.0, 1.0],
+            "height": [1.5, 1.6], "yaw": [0.1, np.nan], "vx": [5.0, None], "vy": [0.0, None], "range_rate": [1.0, None],
+            "confidence": [0.7, 0.8], "class": ["car", "truck"], "colour": ["red", "blue"],
+        }
+    )  # fmt: skip
+    found = Detections.from_pandas(rows)
+    assert found[0] == Detection("car", (1.0, 3.0, 0.5), (4.0, 2.0, 1.5), found.boxes.yaw[0], (5.0, 0.0), 0.7, 1.0)
+    assert found.boxes.label.tolist() == ["car", "truck"]
+    assert found.boxes.position[1].tolist() == [2.0, 4.0, 0.0]
+    assert np.isnan(found.boxes.velocity[1]).all()
+    assert found.score.tolist() == [0.7, 0.8]
+    assert len(Detections.from_pandas(rows[:0])) == 0
+
+
+def test_frames_come_in_order_of_time_and_by_sensor() -> None:
+    rows = table(sensor=["lidar", "camera"] * 12).sample(frac=1, random_state=1)
+    moments = list(moments_of_table(rows))
+    assert len(moments) == 24
+    assert [time for time, _, _ in moments] == sorted(time for time, _, _ in moments)
+    assert {sensor for _, sensor, _ in moments} == {"lidar", "camera"}
+    assert all(len(found) == 1 for _, _, found in moments)
+
+
+def test_times_of_pandas_are_seconds() -> None:
+    start = pd.Timestamp("2024-05-01 12:00:00")
+    for unit in ("s", "ns"):
+        times = table().assign(timestamp=lambda t: (start + pd.to_timedelta(t.timestamp, unit="s")).dt.round("100ms"))
+        if unit == "ns":
+            times["timestamp"] = times.timestamp.astype("datetime64[ns]")
+        first, *_ = next(moments_of_table(times))
+        assert first == pytest.approx(start.timestamp())
+
+
+def test_a_row_without_a_place_is_a_moment_without_detections() -> None:
+    rows = pd.concat([table(), pd.DataFrame({"timestamp": [5.0], "x": [None], "y": [None]})])
+    *_, (time, _, found) = moments_of_table(rows)
+    assert (time, len(found)) == (5.0, 0)
+
+
+def test_a_table_is_tracked_in_one_line() -> None:
+    tracks = saga_fg.track(table(label="car"))
+    assert sorted(tracks.id.unique()) == [1, 2]
+    assert tracks.timestamp.min() == pytest.approx(0.1)  # from the second detection on
+    last = tracks[tracks.timestamp == tracks.timestamp.max()].set_index("id")
+    assert last.vx.to_numpy() == pytest.approx([10, 10], abs=0.5)
+    assert (last.cov_xx > 0).all()
+    assert list(saga_fg.track(table()[:0]).columns) == list(tracks.columns)
+    tracker = Tracker()
+    for time, sensor, rows in moments_of_table(table(label="car")):
+        now = tracker.step(Frame(time, sensor, Detections.from_pandas(rows)))
+    pd.testing.assert_frame_equal(now.to_pandas(), tracks[-2:].reset_index(drop=True))
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([1, 2], r"expected a pandas.DataFrame, got list"),
+        (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"timestamp, y missing, there are t, x"),
+        (pd.DataFrame({"timestamp": [1.0], "x": ["far"], "y": [1.0]}), r"x: expected numbers"),
+        (pd.DataFrame({"timestamp": [1e15], "x": [1.0], "y": [1.0]}), r"timestamp"),
+    ],
+)
+def test_tables_that_cannot_be_used_are_refused(rows, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        saga_fg.track(rows)
+
+
+def test_without_pandas_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'saga-fg\[pandas\]'"):
+        Tracks.empty(0.0).to_pandas()
+
+
+def test_pandas_is_not_imported_before() -> None:
+    code = "import sys, saga_fg; saga_fg.track, saga_fg.Tracks; assert 'pandas' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_notebooks_show_tables() -> None:
+    many = Detections.of([Detection("<car>", (k, 2.0, 0.0)) for k in range(30)])
+    shown = many._repr_html_()
+    assert "30 detections" in shown
+    assert "and 10 more" in shown
+    assert "&lt;car&gt;" in shown
+    assert "nan" not in shown
+    tracker = Tracker()
+    for k in range(3):
+        tracks = tracker.step(Frame(k / 10, "lidar", many))
+    assert f"{len(tracks)} tracks at 0.200 s" in tracks._repr_html_()
+
+
+def test_a_tracker_says_what_it_holds() -> None:
+    tracker = Tracker(saga_fg.TrackerSettings(min_hits=3), {"radar": saga_fg.Sensor()})
+    assert repr(tracker).startswith("Tracker(0 tracks; ")
+    tracker.step(Frame(1.5, "radar", Detections.of([Detection("car", (0.0, 0.0, 0.0))])))
+    assert repr(tracker) == (
+        "Tracker(1 tracks at 1.500 s; estimator kalman, 2 edge rules, sensors radar; changed: min_hits)"
+    )
