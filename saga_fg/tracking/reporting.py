@@ -2,7 +2,7 @@ r"""Report: the tracks of sufficient existence that are detected, or whose place
 
 Each has a score and a calibrated covariance:
 
-    score       max(p, g m) ( hits / (opportunities + prior_opportunities) )^w      when detected; while coasting times r
+    score       max(p, g m) ( hits / (opportunities + prior_opportunities) )^w     while coasting times r
     P_reported  = ( c (1 + h (1 - p)) )^2 P + ( b (1 + k (1 - p)) )^2 u u^T
 
 The score rests on all evidence of the track so far: p is the probability of its latest detection, m that of its best

@@ -37,9 +37,7 @@ def compared(scene: Scene, family: str) -> CommonBoxes:
     assert scene.ground_truth is not None
     truth = SceneBoxes.of_annotations(scene.ground_truth)
     visible = np.concatenate([moment.visible for moment in scene.ground_truth])
-    return common_boxes(
-        LabelledScene(truth, visible, truth.boxes.velocity, np.zeros(len(truth)), systems), gate=2.0
-    )
+    return common_boxes(LabelledScene(truth, visible, truth.boxes.velocity, np.zeros(len(truth)), systems), gate=2.0)
 
 
 @pytest.mark.parametrize("family", list(SCENES))

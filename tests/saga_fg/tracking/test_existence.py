@@ -106,5 +106,6 @@ def _scores_of_one_object(family, probability, seen):
         value = (np.log(p / (1 - p)) + 2.4) / 0.4 if family == "kitti" else p
         tracks = tracker.step(frame(dt * k, [(0.0, 0.0)] * there, score=value))
         assert len(tracks) <= 1
-        scores |= {k: float(value) for value in tracks.score}
+        if len(tracks):
+            scores[k] = float(tracks.score[0])
     return scores
