@@ -14,10 +14,13 @@ from running_graph_picture import write_running_graph_pictures
 
 from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
+from data_tools.simulator.laser_drive import laser_drive
 from data_tools.simulator.street import SimulatedScans
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint, street
+from pipelines.slam.laser_results import write_laser_slam
+from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import lidar_slam
 from pipelines.slam.results import write_joint
@@ -58,6 +61,9 @@ def main() -> None:
         scans = SimulatedScans(seed=0, count=40, curbs=True)
         write_lidar_slam(Path(folder) / "slam", lidar_slam(scans), scans)
         shutil.copy(Path(folder) / "slam" / "above.png", HERE / "slam_above.png")
+        log, _ = laser_drive(seed=0)
+        write_laser_slam(Path(folder) / "laser", log, laser_slam(log), 30.0, 0.0)
+        shutil.copy(Path(folder) / "laser" / "map.png", HERE / "laser_map.png")
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from data_tools.files.error_messages import unknown_name
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
+    from data_tools.datasets.area_map import AreaMap
     from data_tools.datasets.parts import Parts
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
@@ -45,6 +46,9 @@ TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "learn noise
 
 TrackedScenes = Iterable[tuple["Scene", Sequence["Tracks"]]]
 """Scenes with one `Tracks` for each of their timestamps."""
+
+Images = Mapping[str, Sequence[Path | None]]
+"""Image files by camera, for each moment of a scene."""
 
 Innovations = Mapping[str, "FloatArray"]
 """Squared distances of tracks and the detections they took, in sigmas, by class."""
@@ -173,6 +177,14 @@ class DatasetSource(ABC):
 
     def scans(self, scenes: Collection[str]) -> Mapping[str, ScanSequence]:
         """LiDAR scans by scene, of those that have some."""
+        return {}
+
+    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
+        """Maps to draw, by scene, of those that have one."""
+        return {}
+
+    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
+        """Camera images by scene, of those that have some."""
         return {}
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:

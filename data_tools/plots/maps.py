@@ -77,3 +77,18 @@ def scan_map_from_above(
     ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))
     ax.legend(frameon=True, fontsize=9, loc="upper right")
     return figure
+
+
+def occupancy_picture(probability: FloatArray, origin: FloatArray, cell: float, path: FloatArray) -> Any:
+    """Return a matplotlib `Figure` of an occupancy grid (W, H), dark where occupied, and a path (N, 2), m."""
+    from matplotlib.figure import Figure
+
+    width, height = probability.shape
+    size = 12.0 / max(width, height)
+    figure = Figure(figsize=(max(3.0, size * width), max(3.0, size * height)), dpi=200, layout="constrained")
+    ax = figure.subplots()
+    extent = (origin[0], origin[0] + width * cell, origin[1], origin[1] + height * cell)
+    ax.imshow(1 - probability.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
+    ax.plot(path[:, 0], path[:, 1], color=COLOURS[0], linewidth=0.6)
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    return figure

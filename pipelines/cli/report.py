@@ -9,7 +9,7 @@ import typer
 
 from pipelines.cli import options
 from pipelines.cli.console import working
-from pipelines.cli.datasets import dataset_commands
+from pipelines.cli.datasets import Source, dataset_commands
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource
@@ -23,6 +23,9 @@ def _report(
         Path | None,
         typer.Option("--beside", help="Another result of the same recordings, to show side by side.", metavar="RESULT"),
     ] = None,
+    images: Annotated[
+        int, typer.Option("--images", min=0, help="Width of the camera images in the page, pixels; 0 leaves them out.")
+    ] = 240,
     verbose: options.Verbose = False,
 ) -> None:
     """Make a page of a tracking result: a player, charts, and figures, of errors where there is ground truth."""
@@ -35,15 +38,23 @@ def _report(
         raise InputError(f"{output}: expected a file name that ends in .html")
     check_writable(output)
     with working("making the page"):
-        page = report_page(result_report(source, result, beside))
+        page = report_page(result_report(source, result, beside, images))
         write_text(output, page)
     typer.echo(f"{output}: {len(page) / 1e6:.1f} MB")
+
+
+def _texts(source: Source) -> dict[str, str | None]:
+    """Options of datasets without camera images."""
+    from data_tools.datasets.source import DatasetSource
+
+    return {"images": None} if source.images is DatasetSource.images else {}
 
 
 _commands = dataset_commands(
     "report",
     _report,
     ("report {result} --output report.html", "report {result} --beside other/{tracks} --output report.html"),
+    _texts,
 )
 report_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 

@@ -82,6 +82,7 @@ def _report(comparison: Comparison, config: TrackConfig, first: int, start: int)
         notes=[NOTE],
         start=start,
         ghosts=True,  # of these it tells
+        beside="kf",
     )
 
 

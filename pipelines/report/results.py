@@ -14,6 +14,7 @@ from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable
 from pipelines.config import load_config
 from pipelines.report.charts import Chart, accuracy_charts, latency_chart
+from pipelines.report.images import thumbnails
 from pipelines.report.page import Report
 from pipelines.report.run_record import RunRecord, read_run_record
 from pipelines.report.scenes import ReportScene
@@ -31,10 +32,11 @@ class _Result:
     record: RunRecord | None
 
 
-def result_report(source: DatasetSource, result: Path, beside: Path | None = None) -> Report:
+def result_report(source: DatasetSource, result: Path, beside: Path | None = None, images: int = 0) -> Report:
     """Report on the result of any tracker; with figures where the dataset has ground truth, else of the tracks alone.
 
     beside  another result of the same recordings, to show beside it
+    images  width of the camera images to show, pixels; 0: none
 
     Raises `InputError` for missing or broken files, and for a result that does not fit the dataset or the other one.
     """
@@ -44,6 +46,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     scenes = _scenes(source, results[0])
     for other in results[1:]:
         scenes = [_joined(scene, other, added) for scene, added in _pairs(scenes, _scenes(source, other))]
+    scenes = _on_the_ground(source, scenes, images)
     tables: list[FigureTable] = []
     charts: list[Chart] = []
     for each in results:
@@ -133,6 +136,16 @@ def _joined(scene: ReportScene, result: _Result, other: ReportScene | None) -> R
         coasting={**other.coasting, **scene.coasting},
         predictions={**other.predictions, **scene.predictions},
     )
+
+
+def _on_the_ground(source: DatasetSource, scenes: Sequence[ReportScene], width: int) -> list[ReportScene]:
+    """Add the maps of the places and the images of the cameras."""
+    by_name = {each.scene.name: each.scene for each in scenes}
+    maps, images = source.maps(by_name), source.images(by_name) if width else {}
+    return [
+        replace(each, map=maps.get(name), cameras=thumbnails(images.get(name, {}), width))
+        for name, each in zip(by_name, scenes, strict=True)
+    ]
 
 
 def _figures(source: DatasetSource, found: Mapping[str, SceneResult]) -> tuple[list[FigureTable], list[Chart]]:

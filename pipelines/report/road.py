@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.area_map import AreaMap
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
@@ -50,6 +51,14 @@ def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: Floa
         "lines": [[number[line.light], *_centimetres(line.ends, origin)] for line in lines.values()],
         "lights": [_centimetres(place, origin) for place in places],
         "colours": _colours(places, detections),
+    }
+
+
+def map_data(known: AreaMap, origin: FloatArray) -> dict[str, Any]:
+    """Return areas and lines, ready for JSON, in cm about the scene's start."""
+    return {
+        "areas": [[kind, *(_centimetres(ring, origin) for ring in rings)] for kind, rings in known.areas],
+        "lines": [_centimetres(line, origin) for line in known.lines],
     }
 
 

@@ -3,7 +3,8 @@
     scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]],
              "horizons": [ms], "predictions": [[prediction, ...]], [] without}},
-             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see `pipelines.report.road`}
+             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see `pipelines.report.road`,
+             "map": {"areas": [[kind, ring, ...]], "lines": [[x, y, ...]]} or null, "cameras": {name: [JPEG]}}
     track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
     prediction [id, horizon, x, y, cov_xx, cov_xy, cov_yy]
     object     [class, x, y, length, width, yaw, visible]
@@ -22,9 +23,12 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.area_map import AreaMap
 from data_tools.datasets.detection_files import PredictionRows
 from data_tools.metrics import SceneBoxes
-from pipelines.report.road import road_data
+from pipelines.report.images import Thumbnails
+from pipelines.report.road import map_data, road_data
+from pipelines.report.unseen import unseen_for
 from pipelines.tracking import TrackedScene
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
@@ -49,10 +53,11 @@ class ReportScene:
 
     scene     with its detections, and ground truth where there is one
     tracks    by the tracker's name
-    coasting  by the tracker's name, s since the last detection, (N,) of its tracks; may be left out
+    coasting  by the tracker's name, s since the last detection, (N,) of its tracks; found from detections if left out
     rules     find the edges between the tracks of a moment
     sensors   models by name, which place detections in the world
     predictions  by the tracker's name, of its tracks; may be left out
+    map       of the place; cameras: thumbnails of images for each moment, by camera
     """
 
     scene: Scene
@@ -61,6 +66,8 @@ class ReportScene:
     rules: Sequence[EdgeRule] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     predictions: Mapping[str, PredictionRows] = field(default_factory=dict)
+    map: AreaMap | None = None
+    cameras: Thumbnails = field(default_factory=dict)
 
 
 def scene_of_run(
@@ -85,6 +92,10 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
     truth = [t.boxes for t in scene.ground_truth] if scene.ground_truth is not None else None
     names = [table.boxes.label for table in report.tracks.values()] + [b.label for b in (*(truth or ()), *shown[0])]
     labels = np.unique(np.concatenate([np.empty(0, dtype="<U1"), *names]))
+    coasting = dict(report.coasting)
+    for name, table in report.tracks.items() if scene.frames else ():
+        if name not in coasting:
+            coasting[name] = unseen_for(table, scene.timestamps, shown[0])
     ego = np.column_stack([scene.world_T_ego[:, :2, 3] - origin, yaw_of(scene.world_T_ego[:, :3, :3])])
     return {
         "name": scene.name,
@@ -92,7 +103,7 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
         "ego": _whole(ego * [100, 100, 1000]),
         "labels": labels.tolist(),
         "methods": {
-            name: _method(table, report.coasting.get(name), labels, origin, len(scene), report.rules)
+            name: _method(table, coasting.get(name), labels, origin, len(scene), report.rules)
             | predictions_data(report.predictions.get(name), table, scene.timestamps, origin)
             for name, table in report.tracks.items()
         },
@@ -107,6 +118,8 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
             for boxes, score in zip(*shown, strict=True)
         ],
         "road": road_data(scene.frames, shown[0], origin),
+        "map": None if report.map is None else map_data(report.map, origin),
+        "cameras": dict(report.cameras),
     }
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings
+from pipelines.slam.laser_slam import LaserSettings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -26,6 +27,7 @@ class SlamSettings:
     landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
     joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, with objects")
+    laser: LaserSettings = settings_group(LaserSettings, "laser: planar laser and wheels")
 
     def new_providers(self) -> list[FactorProvider]:
         """Fresh providers. Raises `InputError` for a name that cannot be resolved."""

@@ -87,7 +87,7 @@ class TrackTable(Columns):
 
     def snapshot(self) -> Self:
         """A copy that shares no array with this table."""
-        return self.select(np.arange(len(self)))
+        return self.copied()
 
     @property
     def tentative(self) -> BoolArray:

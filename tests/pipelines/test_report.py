@@ -7,6 +7,7 @@ import html
 import json
 import re
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from pipelines.report import (
 from pipelines.report.charts import SHARES
 from pipelines.report.run_record import record_path, write_run_record
 from pipelines.report.scenes import edges_of_frames, scene_data
+from pipelines.report.unseen import unseen_for
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
 from tests.pipelines.page_in_browser import tried_in_browser
@@ -97,10 +99,19 @@ def test_what_is_not_known_is_null():
     scene = SimulatedTraffic(SHORT, scenes=1, seed=1).scene("scene-0001")
     from pipelines.report import ReportScene
 
-    row = scene_data(ReportScene(scene, {"x": table}, {}))["methods"]["x"]["moments"][0][0]
+    row = scene_data(ReportScene(replace(scene, frames=()), {"x": table}, {}))["methods"]["x"]["moments"][0][0]
     assert row[4:6] == [100, 100]  # a metre square
     assert row[7:9] == [None, None]
     assert row[10:] == [None] * 4
+
+
+def test_results_that_do_not_tell_when_they_coast_are_compared_with_the_detections():
+    there = Boxes.of(["car", "car"], [[0, 0, 0], [9, 0, 0]])
+    tables = [there, there, there.select([0]), there]
+    frame, ids = np.repeat(np.arange(4), [2, 2, 1, 2]), np.array(["a", "b", "a", "b", "a", "a", "b"])
+    table = SceneBoxes(frame, ids, Boxes.concatenate(tables), np.ones(7))
+    seen = [Boxes.of(["car"], [[0.5, 0, 0]]), Boxes.of(["truck"], [[0, 0, 0]]), Boxes.empty(), there]
+    assert unseen_for(table, np.arange(4) * 0.5, seen).tolist() == [0, 0, 0.5, 0.5, 1, 0, 0]
 
 
 def test_the_page_holds_all_it_needs(runs):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Self
 
 from data_tools.datasets.detection_files.tracks import merge_tables
 from data_tools.datasets.kitti.dataset import KittiTracking, local_kitti
+from data_tools.datasets.kitti.images import kitti_images
 from data_tools.datasets.kitti.scored_sequences import ScoredSequence, result_sequences, scored_sequences
 from data_tools.datasets.kitti.tracking_results import TRACK_TABLE, write_kitti_labels, write_kitti_results
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
@@ -17,6 +18,7 @@ from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
+    Images,
     Innovations,
     LabelledScenes,
     TrackedScenes,
@@ -26,7 +28,7 @@ from data_tools.datasets.source import (
 )
 from data_tools.files.remote_files import is_url
 from saga_fg.errors import InputError
-from saga_fg.types.dataset import Dataset
+from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.datasets.kitti.velodyne import KittiScans
@@ -82,10 +84,12 @@ class KittiSource(DatasetSource):
 
         if is_url(self.dataroot):
             return {}
-        root = Path(self.dataroot)
-        root = root / "training" if (root / "training").is_dir() else root
+        root = self._folder()
         there = (name for name in scenes if (root / "velodyne" / name).is_dir())
         return {name: KittiScans(root, name, timed=False) for name in there}
+
+    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
+        return {} if is_url(self.dataroot) else kitti_images(self._folder(), scenes)
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         assert isinstance(dataset, KittiTracking)
@@ -127,6 +131,10 @@ class KittiSource(DatasetSource):
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
         classes, exempt = names("--classes", self.classes), self.persons == "exempt"
         return evaluate_kitti(scored, classes, overlaps(self.iou), hota, innovations, exempt)
+
+    def _folder(self) -> Path:
+        root = Path(self.dataroot)
+        return root / "training" if (root / "training").is_dir() else root
 
     def _chosen(self) -> tuple[str, ...] | None:
         return None if self.sequences is None else names("--sequences", self.sequences)

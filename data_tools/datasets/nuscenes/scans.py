@@ -63,7 +63,7 @@ def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScene
     taken: dict[str, tuple[Path, str]] = {}
     for sample, sensor, key, name in read_table(dataset.folder, "sample_data", fields):
         if key and sensor in mounted and sample in wanted:
-            file = _inside(dataset.folder, Path(dataroot), sample, name)
+            file = file_below(Path(dataroot), dataset.folder, sample, name)
             if file.is_file():
                 taken[sample] = (file, sensor)
     scans = {}
@@ -79,8 +79,8 @@ def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScene
     return scans
 
 
-def _inside(folder: Path, dataroot: Path, sample: str, name: object) -> Path:
-    """The file of a name in the tables, which must lie below the dataroot."""
+def file_below(dataroot: Path, folder: Path, sample: str, name: object) -> Path:
+    """The file that `sample_data` in `folder` names. Raises `InputError` for one outside the dataroot."""
     path = PurePosixPath(name) if isinstance(name, str) else PurePosixPath("..")
     if path.is_absolute() or ".." in path.parts:
         where = f"{folder / 'sample_data.json'}: sample {sample}: filename"

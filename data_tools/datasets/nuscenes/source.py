@@ -9,8 +9,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from data_tools.datasets.area_map import AreaMap
 from data_tools.datasets.nuscenes.dataset import NuScenes
+from data_tools.datasets.nuscenes.images import nuscenes_images
 from data_tools.datasets.nuscenes.labels import merge_label_parts, write_label_part, write_nuscenes_labels
+from data_tools.datasets.nuscenes.map_expansion import nuscenes_maps
 from data_tools.datasets.nuscenes.result_files import ResultMeta
 from data_tools.datasets.nuscenes.scans import NuScenesScans, nuscenes_scans
 from data_tools.datasets.nuscenes.splits import split_scenes
@@ -20,6 +23,7 @@ from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
+    Images,
     Innovations,
     LabelledScenes,
     TrackedScenes,
@@ -29,7 +33,7 @@ from data_tools.datasets.source import (
 )
 from data_tools.files.remote_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
-from saga_fg.types.dataset import Dataset
+from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
@@ -78,6 +82,16 @@ class NuScenesSource(DatasetSource):
         if is_url(self.dataroot):
             return {}
         return nuscenes_scans(NuScenes(self.dataroot, self.version, {}, scenes), self.dataroot)
+
+    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
+        if is_url(self.dataroot):
+            return {}
+        return nuscenes_maps(Path(self.dataroot), Path(self.dataroot) / self.version, scenes)
+
+    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
+        if is_url(self.dataroot):
+            return {}
+        return nuscenes_images(Path(self.dataroot), Path(self.dataroot) / self.version, scenes)
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         assert isinstance(dataset, NuScenes | NuScenesPart)

@@ -168,7 +168,7 @@ def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tupl
     mu = 1 / max(2 * float(squares[loop].max()) - 1, 1e-9)
     weights = np.ones(len(loop))
     for _ in range(_MOST_STAGES):
-        between = np.sqrt(mu * (mu + 1) / np.maximum(squares, 1e-300)) - mu
+        between = np.sqrt(mu * (mu + 1) / np.maximum(squares, 1e-100)) - mu
         weights = np.where(squares <= mu / (mu + 1), 1.0, np.where(squares >= (mu + 1) / mu, 0.0, between))
         weights[~loop] = 1.0
         values = problem.step(values, weights)

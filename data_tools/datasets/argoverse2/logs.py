@@ -1,5 +1,7 @@
 """Argoverse 2 sensor logs: annotations and poses, in; `Scene`s with ground truth alone, out.
 
+A log without annotations, as of the test split, has no moments of its own.
+
     LOG/annotations.feather            timestamp_ns, track_uuid, category, length_m, width_m, height_m,
                                        qw, qx, qy, qz, tx_m, ty_m, tz_m (in the ego frame), num_interior_pts
     LOG/city_SE3_egovehicle.feather    timestamp_ns, qw, qx, qy, qz, tx_m, ty_m, tz_m
@@ -13,25 +15,21 @@ needs pyarrow (extra [parquet]).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.central_differences import central_differences
-from data_tools.datasets.source import option
 from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.files.input_files import open_bytes
-from data_tools.files.remote_files import local_tree
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Dataset, Scene
+from saga_fg.types.dataset import Annotations, Scene
 
 CLASSES = {
     "REGULAR_VEHICLE": "car",
@@ -44,22 +42,35 @@ CLASSES = {
     "ARTICULATED_BUS": "bus",
     "VEHICULAR_TRAILER": "trailer",
 }
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_SIZE = ("length_m", "width_m", "height_m")
-_ANNOTATIONS = ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE, "num_interior_pts")
+POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+SIZE = ("length_m", "width_m", "height_m")
+_ANNOTATIONS = ("timestamp_ns", "track_uuid", "category", *SIZE, *POSE, "num_interior_pts")
+FILES = ("annotations.feather", "city_SE3_egovehicle.feather")
+KINDS = {
+    **dict.fromkeys(("timestamp_ns", "track_id"), "iu"),
+    **dict.fromkeys(("track_uuid", "category", "log_id"), "OU"),
+}  # of NumPy, of columns that are no numbers
 _LONGEST_GAP = 0.5  # s between boxes of an object, for a velocity
 _REACH = 2  # moments to either side, for a velocity
 
 
+@dataclass(frozen=True, eq=False)
+class ArgoverseScene(Scene):
+    """A log; categories: of the detections of each frame, (n,), in the words of Argoverse."""
+
+    categories: Sequence[StrArray] = ()
+
+
 class ArgoverseLogs:
-    """The logs below `root`: folders with annotations.feather and city_SE3_egovehicle.feather.
+    """The logs below `root`: folders with city_SE3_egovehicle.feather and, but for the test split, annotations.feather.
 
     Files are read when asked for. Raises `InputError` for a root without any, `MissingExtraError` without pyarrow.
     """
 
     def __init__(self, root: str | Path) -> None:
         self._root = Path(root)
-        self._scenes = tuple(sorted(path.parent.name for path in self._root.glob("*/annotations.feather")))
+        files = [path for name in FILES for path in self._root.glob(f"*/{name}")]
+        self._scenes = tuple(sorted({path.parent.name for path in files}))
         if not self._scenes:
             raise InputError(f"{self._root}: expected LOG/annotations.feather, there is none")
         _pyarrow()
@@ -69,58 +80,71 @@ class ArgoverseLogs:
         """The names of the logs."""
         return self._scenes
 
-    def scene(self, name: str) -> Scene:
-        """Read a log; raises `InputError` for an unknown name, a missing column, or a time without a pose."""
+    def annotated(self, name: str) -> bool:
+        """True if a log has annotations."""
+        return (self._root / name / FILES[0]).is_file()
+
+    def scene(self, name: str) -> ArgoverseScene:
+        """Read a log with annotations; its frames are none, its categories those of the annotations.
+
+        Raises `InputError` for an unknown name, a missing column, or a time without a pose.
+        """
         if name not in self._scenes:
             raise InputError(f"{self._root}: {unknown_name('log', name, self._scenes)}")
         path = self._root / name / "annotations.feather"
-        rows = _columns(path, _ANNOTATIONS)
+        rows = columns_of(path, _ANNOTATIONS)
         stamp: IntArray = rows["timestamp_ns"]
         stamps, moment = np.unique(stamp, return_inverse=True)
-        poses = self._poses(name, stamps)
+        poses = self.poses(name, stamps)
         with error_context(str(path)):
-            ego_T_box = _transforms(rows)
+            ego_T_box = transforms(rows)
             world_T_box = poses[moment] @ ego_T_box
             category: StrArray = rows["category"].astype(np.str_)
-            label = np.array([CLASSES.get(c, c.lower()) for c in category.tolist()], dtype=np.str_)
+            label = class_names(category)
             ids: StrArray = rows["track_uuid"].astype(np.str_)
             time = (stamps - stamps[0]) * 1e-9 if len(stamps) else np.empty(0)
             position = world_T_box[:, :3, 3]
             velocity = central_differences(ids, time[moment], position[:, :2], _LONGEST_GAP, _REACH)
-            size = np.stack([rows[name] for name in _SIZE], axis=1).astype(np.float64)
+            size = np.stack([rows[name] for name in SIZE], axis=1).astype(np.float64)
             boxes = Boxes(label, position, size, yaw_of(world_T_box[:, :3, :3]), velocity)
             seen = rows["num_interior_pts"] > 0
             of_moment = [np.flatnonzero(moment == k) for k in range(len(stamps))]
             truth = [Annotations(ids[at], boxes.select(at), seen[at]) for at in of_moment]
-        return Scene(name, time, poses, tuple(map(str, stamps.tolist())), [], truth)
+        categories = [category[at] for at in of_moment]
+        return ArgoverseScene(name, time, poses, tuple(map(str, stamps.tolist())), [], truth, categories)
 
-    def _poses(self, name: str, stamps: IntArray) -> FloatArray:
-        """city_T_ego (K, 4, 4) at the annotated times."""
+    def poses(self, name: str, stamps: IntArray) -> FloatArray:
+        """city_T_ego (K, 4, 4) at some times, ns. Raises `InputError` for one without a pose."""
         path = self._root / name / "city_SE3_egovehicle.feather"
-        rows = _columns(path, ("timestamp_ns", *_POSE))
+        rows = columns_of(path, ("timestamp_ns", *POSE))
         order = np.argsort(rows["timestamp_ns"])
         known = rows["timestamp_ns"][order]
         at = np.minimum(np.searchsorted(known, stamps), max(len(known) - 1, 0))
         absent = known[at] != stamps if len(known) else np.ones(len(stamps), dtype=bool)
         if absent.any():
             raise InputError(
-                f"{path}: timestamp_ns: expected a pose at every annotated time, {stamps[absent][0]} has none"
+                f"{path}: timestamp_ns: expected a pose at every time of boxes, {stamps[absent][0]} has none"
             )
         with error_context(str(path)):
-            return _transforms(rows)[order][at]
+            return transforms(rows)[order][at]
 
 
-def _transforms(rows: dict[str, Any]) -> FloatArray:
+def class_names(category: StrArray) -> StrArray:
+    """Our names of classes (N,) for categories (N,)."""
+    return np.array([CLASSES.get(each, each.lower()) for each in category.tolist()], dtype=np.str_)
+
+
+def transforms(rows: dict[str, Any]) -> FloatArray:
     """(N, 4, 4) of the pose columns."""
-    quaternion, translation = (np.stack([rows[name] for name in names], axis=1) for names in (_POSE[:4], _POSE[4:]))
+    quaternion, translation = (np.stack([rows[name] for name in names], axis=1) for names in (POSE[:4], POSE[4:]))
     T = np.tile(np.eye(4), (len(quaternion), 1, 1))
     T[:, :3, :3] = quaternion_rotation(checked_quaternions("qw qx qy qz", quaternion))
     T[:, :3, 3] = translation
     return T
 
 
-def _columns(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
-    """The named columns of a Feather file as arrays."""
+def columns_of(path: Path, names: tuple[str, ...], may_lack: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The named columns of a Feather file as arrays, and those of `may_lack` that it has."""
     arrow = _pyarrow()
     try:
         with open_bytes(path) as file:
@@ -129,16 +153,17 @@ def _columns(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
             if missing:
                 there = ", ".join(table.column_names)
                 raise InputError(f"{path}: {missing[0]}: expected this column, the file has {there}")
+            names = (*names, *(name for name in may_lack if name in table.column_names))
             table = table.select(list(names))
             table.validate(full=True)  # its C++ trusts what it has read
-            empty = [name for name in names if table[name].null_count]
+            empty = [name for name in names if table[name].null_count and name not in may_lack]
             if empty:
                 raise InputError(f"{path}: {empty[0]}: expected a value in every row")
             columns = {name: table[name].to_numpy() for name in names}
     except (OSError, UnicodeDecodeError, arrow.ArrowException) as error:  # names of columns are decoded on demand
         raise InputError(f"{path}: expected a readable Feather file: {str(error).splitlines()[0]}") from error
     for name, column in columns.items():
-        kinds = {"timestamp_ns": "iu", "track_uuid": "OU", "category": "OU"}.get(name, "iuf")
+        kinds = KINDS.get(name, "iuf")
         if column.dtype.kind not in kinds:
             expected = "text" if kinds == "OU" else "whole numbers" if kinds == "iu" else "numbers"
             raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
@@ -151,18 +176,3 @@ def _pyarrow() -> Any:
     except ImportError as error:
         raise MissingExtraError("Argoverse logs: Feather needs pyarrow: pip install 'saga-fg[parquet]'") from error
     return pyarrow
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArgoverseSource(AnnotatedSource):
-    """Argoverse 2 sensor logs, annotated ten times a second; needs the extra [parquet]."""
-
-    name = "argoverse2"
-    family = "nuscenes"
-    example = "--dataroot data/av2"
-    dataroot: str = option("Folder of the logs, in each annotations.feather, city_SE3_egovehicle.feather; or its URL.")
-
-    @contextmanager
-    def annotated(self) -> Iterator[Dataset]:
-        with local_tree(self.dataroot, ["*/annotations.feather", "*/city_SE3_egovehicle.feather"]) as root:
-            yield ArgoverseLogs(root)

@@ -1,0 +1,153 @@
+"""Logs of the robot navigation toolkit CARMEN: planar laser scans and wheel odometry, as text, perhaps compressed.
+
+    FLASER n r_1 ... r_n  x y heading  odom_x odom_y odom_heading  time host logger_time
+    ROBOTLASER1 type start fov step largest accuracy remission n r_1 ... r_n m i_1 ... i_m  x y heading
+                odom_x odom_y odom_heading  tv rv forward side turn  time host logger_time
+
+m, rad and s; readings run from right to left. The first pose is the laser's, the second one the robot's, both by
+odometry; where they differ by the same transform throughout, that is where the laser is mounted. FLASER means 180
+degrees about the direction ahead: n readings of 180/n degrees where n is even, of 180/(n-1) where it is odd. Readings
+of the largest value that recurs say that nothing was hit. Source: http://carmen.sourceforge.net/logger_playback.html.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.files.input_files import read_text
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+
+_RECORDS = ("FLASER", "ROBOTLASER1")
+_UNPACK: dict[str, Callable[[bytes], bytes]] = {".bz2": bz2.decompress, ".gz": gzip.decompress}
+_LEAST_READINGS = 10
+_RECURS = 1e-4  # share of all readings from which on the largest value means that nothing was hit
+_RIGID = 1e-3  # m and rad, that the mounting may vary by
+_LARGEST = 1e6  # m
+
+
+@dataclass(frozen=True, eq=False)
+class LaserLog:
+    """time (n,) s, as logged, in the order of the file, not always sorted; ranges (n, m) m, NaN where nothing
+    was hit; angles (m,) rad from ahead; odometry (n, 3) of the robot, m and rad; robot_T_laser (3,): x, y, heading.
+    """
+
+    time: FloatArray
+    ranges: FloatArray
+    angles: FloatArray
+    odometry: FloatArray
+    robot_T_laser: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def first(self, count: int) -> LaserLog:
+        """The first scans."""
+        return replace(self, time=self.time[:count], ranges=self.ranges[:count], odometry=self.odometry[:count])
+
+    def points(self, row: int, largest_range: float = np.inf) -> FloatArray:
+        """Points (n, 2) that a scan hit, m, in the laser's frame."""
+        r = self.ranges[row]
+        hit = r < largest_range
+        return np.asarray(r[hit, None] * np.stack([np.cos(self.angles[hit]), np.sin(self.angles[hit])], axis=1))
+
+
+def read_carmen(path: str | Path) -> LaserLog:
+    """Read the front laser of a log; .bz2 and .gz are unpacked.
+
+    Raises `InputError` naming the line of a record with a wrong number of values, a number that is none or too large,
+    or another number of readings than the first.
+    """
+    file = Path(path)
+    rows: list[FloatArray] = []
+    angles: FloatArray | None = None
+    chosen, largest = "", np.inf
+    for number, line in enumerate(_lines(file), start=1):
+        tag = line[: line.find(" ")]
+        if tag not in _RECORDS or (chosen and tag != chosen):  # a log with both says the same twice
+            continue
+        where = f"{file}: line {number}"
+        fields = line.split()[1:]
+        found, here, most = _flaser(where, fields) if tag == "FLASER" else _robotlaser(where, fields)
+        if angles is None:
+            angles, chosen, largest = here, tag, most
+        if len(here) != len(angles):
+            raise InputError(f"{where}: expected {len(angles)} readings as before, got {len(here)}")
+        rows.append(found)
+    if angles is None:
+        raise InputError(f"{file}: expected records {' or '.join(_RECORDS)}, there are none")
+    table, m = np.array(rows), len(angles)
+    ranges, laser, robot = table[:, 1 : 1 + m], table[:, 1 + m : 4 + m], table[:, 4 + m :]
+    top = float(ranges.max())
+    if (ranges >= 0.999 * top).mean() > _RECURS:
+        largest = min(largest, 0.999 * top)
+    ranges = np.where((ranges > 0) & (ranges < largest), ranges, np.nan)
+    return LaserLog(table[:, 0], ranges, angles, robot, _mounting(robot, laser))
+
+
+def _flaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, float]:
+    n = _count(where, fields, 0)
+    if len(fields) != n + 10:
+        raise InputError(f"{where}: expected {n + 10} values after FLASER, for {n} readings, got {len(fields)}")
+    step = np.pi / (n if n % 2 == 0 else n - 1)
+    values = _numbers(where, [fields[n + 7], *fields[1 : n + 7]])
+    return values, np.asarray(-np.pi / 2 + step * np.arange(n), dtype=np.float64), np.inf
+
+
+def _robotlaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, float]:
+    n = _count(where, fields, 7)
+    m = _count(where, fields, 8 + n, 0)
+    if len(fields) != n + m + 23:
+        raise InputError(f"{where}: expected {n + m + 23} values after ROBOTLASER1, got {len(fields)}")
+    _, start, _, step, largest, *_ = _numbers(where, fields[:7])
+    at = 9 + n + m
+    values = _numbers(where, [fields[at + 11], *fields[8 : 8 + n], *fields[at : at + 6]])
+    return values, start + step * np.arange(n), float(largest)
+
+
+def _count(where: str, fields: list[str], at: int, least: int = _LEAST_READINGS) -> int:
+    text = fields[at] if at < len(fields) else "nothing"
+    if not text.isdigit() or not least <= int(text) <= 10**5:
+        raise InputError(f"{where}: expected a number of readings from {least}, got {text[:40]!r}")
+    return int(text)
+
+
+def _numbers(where: str, fields: list[str]) -> FloatArray:
+    try:
+        values = np.array(fields, dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{where}: expected numbers, {error}") from error
+    bad = ~(np.abs(values) < 1e15)
+    bad[1:] |= np.abs(values[1:]) > _LARGEST
+    if bad.any():
+        raise InputError(
+            f"{where}: expected finite numbers of the size of rooms, got {fields[int(np.argmax(bad))]!r:.40}"
+        )
+    return values
+
+
+def _mounting(robot: FloatArray, laser: FloatArray) -> FloatArray:
+    """The laser's pose on the robot, if it is the same throughout; corrected logs have other poses there."""
+    c, s = np.cos(robot[:, 2]), np.sin(robot[:, 2])
+    dx, dy = (laser - robot)[:, :2].T
+    turn = laser[:, 2] - robot[:, 2]
+    offset = np.stack([c * dx + s * dy, c * dy - s * dx, np.arctan2(np.sin(turn), np.cos(turn))], axis=1)
+    middle = np.median(offset, axis=0)
+    return middle if np.abs(offset - middle).max() < _RIGID else np.zeros(3)
+
+
+def _lines(file: Path) -> list[str]:
+    unpack = _UNPACK.get(file.suffix)
+    if unpack is None:
+        return read_text(file).splitlines()
+    try:
+        return unpack(file.read_bytes()).decode("utf-8", errors="replace").splitlines()
+    except (OSError, ValueError, EOFError, zlib.error) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from error

@@ -1,0 +1,109 @@
+r"""Registration of planar scans with a map of points on lines.
+
+    minimise over T   sum_i w_i ( n_i . (T p_i - m_i) )^2 / sigma^2  +  || T - T_0 ||^2_Omega
+
+p_i are points of the scan, m_i the nearest points of the map, n_i the normal of the line through the neighbours of m_i;
+w_i are Cauchy weights. T_0 with information Omega is what odometry says; along a bare corridor it alone decides.
+T = (x, y, heading) is stepped in the map's axes about the scan's origin by Gauss and Newton.
+
+Source: Censi, An ICP variant using a point-to-line metric, ICRA 2008.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from saga_fg.numerics.arrays import FloatArray
+
+SIGMA = 0.04  # m, of a point about its line: noise of the laser, and what is not a line
+_NEIGHBOURS, _REACH = 8, 0.4  # of a point that determine its line, and m from it
+_FLAT = 0.15  # largest ratio of the standard deviations across and along a line
+_ITERATIONS, _STEP = 20, 1e-4
+
+
+class Fit(NamedTuple):
+    """pose (3,); information (3, 3) of the points alone, in the map's axes; share: of the points that lie within `near`
+    of a line or point of the map.
+    """
+
+    pose: FloatArray
+    information: FloatArray
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class LineMap:
+    """points (n, 2), their normals (n, 2), and which lie on a line (n,)."""
+
+    tree: cKDTree
+    points: FloatArray
+    normals: FloatArray
+    flat: FloatArray
+
+    @classmethod
+    def of(cls, points: FloatArray, cell: float = 0.04) -> LineMap:
+        """A map of points (n, 2), one for each cell, m."""
+        points = thinned(points, cell)
+        tree = cKDTree(points)
+        k = min(_NEIGHBOURS, len(points))
+        distance, rows = tree.query(points, k=k, distance_upper_bound=_REACH)
+        known = np.isfinite(distance).reshape(len(points), k)
+        near = points[np.where(known, rows.reshape(len(points), k), 0)]
+        weight = known / np.maximum(known.sum(axis=1, keepdims=True), 1)
+        centre = (weight[:, :, None] * near).sum(axis=1)
+        off = near - centre[:, None]
+        xx, yy, xy = ((weight * a).sum(axis=1) for a in (off[..., 0] ** 2, off[..., 1] ** 2, off[..., 0] * off[..., 1]))
+        half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+        angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
+        normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        flat = (known.sum(axis=1) >= 4) & (half - root <= _FLAT**2 * (half + root))
+        return cls(tree, points, normals, flat)
+
+    def fit(self, scan: FloatArray, pose: FloatArray, prior: FloatArray, reach: float, near: float = 0.15) -> Fit:
+        """Register points (n, 2) of a scan from a pose (3,), of which odometry knows `prior` (3, 3).
+
+        reach: largest distance of a pair at the start, m; it shrinks to `near`
+        """
+        start, x = pose, pose.copy()
+        H, paired = np.zeros((3, 3)), np.zeros(0, dtype=bool)
+        for iteration in range(_ITERATIONS):
+            farthest = max(near, reach * 0.7**iteration)
+            c, s = np.cos(x[2]), np.sin(x[2])
+            arm = scan @ np.array([[c, s], [-s, c]])
+            at = arm + x[:2]
+            distance, rows = self.tree.query(at, distance_upper_bound=farthest)
+            paired = np.isfinite(distance)
+            rows, arms = rows[paired], arm[paired]
+            flat = self.flat[rows]
+            rows, arms = rows[flat], arms[flat]
+            if len(rows) < 5:
+                break
+            n = self.normals[rows]
+            r = ((at[paired][flat] - self.points[rows]) * n).sum(axis=1)
+            w = 1 / (1 + (r / (2 * SIGMA)) ** 2) / SIGMA**2
+            J = np.column_stack([n, n[:, 1] * arms[:, 0] - n[:, 0] * arms[:, 1]])
+            H = J.T @ (w[:, None] * J)
+            gradient = J.T @ (w * r) + prior @ difference(x, start)
+            step = -np.linalg.solve(H + prior, gradient)
+            x = x + step
+            if farthest == near and np.abs(step).max() < _STEP:
+                break
+        return Fit(x, H, float(paired.mean()) if len(scan) else 0.0)
+
+
+def difference(x: FloatArray, other: FloatArray) -> FloatArray:
+    """x - other (3,), the angle within a half turn."""
+    d = x - other
+    d[2] = np.arctan2(np.sin(d[2]), np.cos(d[2]))
+    return d
+
+
+def thinned(points: FloatArray, cell: float) -> FloatArray:
+    """One of the points (n, 2) in each cell, m."""
+    keys = np.floor(points / cell).astype(np.int64)
+    _, first = np.unique(keys[:, 0] * 4_000_037 + keys[:, 1], return_index=True)
+    return np.asarray(points[np.sort(first)])

@@ -1,0 +1,37 @@
+"""Camera images as thumbnails for the page: JPEG, in base64."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+from data_tools.datasets.source import Images
+from saga_fg.errors import InputError
+
+Thumbnails = Mapping[str, list[str | None]]
+QUALITY = 60  # of JPEG, in percent
+
+
+def thumbnails(images: Images, width: int) -> Thumbnails:
+    """Return the images of a scene by camera, `width` pixels wide or less. Raises `InputError` for a broken one."""
+    return {
+        camera: [None if file is None else _thumbnail(file, width) for file in files]
+        for camera, files in images.items()
+    }
+
+
+def _thumbnail(file: Path, width: int) -> str:
+    from PIL import Image, UnidentifiedImageError
+
+    buffer = io.BytesIO()
+    try:
+        with Image.open(file) as image:
+            image.draft("RGB", (2 * width, 2 * width))  # JPEG is then decoded at a fraction of its size
+            small = image.convert("RGB")
+            small.thumbnail((width, width))
+            small.save(buffer, "JPEG", quality=QUALITY)
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise InputError(f"{file}: expected an image: {error}") from error
+    return base64.b64encode(buffer.getvalue()).decode("ascii")

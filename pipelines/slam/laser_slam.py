@@ -1,0 +1,318 @@
+"""SLAM with a planar laser and wheel odometry.
+
+1. Each scan that has moved is registered with a map of the last keyframes, point to line; odometry is its prior.
+2. A keyframe comes every half metre or 30 degrees, and is measured from the one before: a graph that runs (iSAM2).
+3. Loops: each keyframe, with those just before it, is searched for in older submaps by branch and bound, inside the
+   window that the graph leaves open: it grows with the way along measurements between them, so that what has been
+   closed before is searched closely and what has drifted widely. A place that has a rival is no loop. What is found is
+   registered point to line, and must determine all three coordinates.
+4. At the end false loops are found by consensus, and all keyframes are registered anew with every other pass of the
+   same place, twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+
+from data_tools.laser.carmen import LaserLog
+from data_tools.laser.line_map import LineMap, thinned
+from data_tools.laser.score_grid import ScoreGrid
+from pipelines.tracking import Progress
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.settings import Positive, PositiveInt, Range, Settings, setting
+from saga_fg.slam.pose_graph import PoseGraph
+from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
+
+_SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this
+_FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
+_DETERMINED = 0.02  # least ratio of information along and across of a loop: not a bare corridor
+_LEAST_POINTS = 20
+_TIGHT = 60.0  # m of way up to which a window stays small
+
+
+@dataclass(frozen=True)
+class LaserSettings(Settings):
+    """Settings of SLAM with a planar laser."""
+
+    largest_range: Positive = setting(30.0, "m: readings beyond are left out; raise for halls and yards")
+    scan_step: Positive = setting(0.1, "m: scans that moved less, and turned less than 3 degrees, are not registered")
+    keyframe_step: Positive = setting(0.5, "m between keyframes, 0.2 to 2; smaller costs time")
+    keyframe_turn: Positive = setting(0.5, "rad between keyframes")
+    local_keyframes: PositiveInt = setting(12, "keyframes in the map that scans are registered with")
+    submap_keyframes: PositiveInt = setting(16, "keyframes of a submap in which loops are searched")
+    odometry_drift: Positive = setting(0.15, "error of the wheels, share of the way: standard deviation")
+    odometry_turn: Positive = setting(0.1, "error of the wheels, rad per rad and per 2 m: standard deviation")
+    loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
+    loop_drift: Positive = setting(0.04, "half width of the search, share of the way since; raised: slower, finds more")
+
+
+@dataclass(eq=False)
+class _Keyframe:
+    """A scan (n, 2) of the graph, its pose by scan matching alone, and the row of the scan."""
+
+    points: FloatArray
+    matched: FloatArray
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class LaserPath:
+    """poses (n, 3, 3) of the robot at each scan, matched: by scan matching alone; loops taken, rejected as false;
+    keyframes: their rows; graph: of these, with the measurements kept.
+    """
+
+    poses: FloatArray
+    matched: FloatArray
+    loops: int
+    rejected: int
+    keyframes: IntArray
+    graph: PoseGraph
+
+
+@dataclass(eq=False)
+class LaserSlam:
+    """Scans in, poses out: `step` for each scan, `finish` at the end."""
+
+    settings: LaserSettings = field(default_factory=LaserSettings)
+    robot_T_laser: FloatArray = field(default_factory=lambda: np.eye(3))
+    _keyframes: list[_Keyframe] = field(default_factory=list)
+    _matched: list[FloatArray] = field(default_factory=list)
+    _graph: RunningPoseGraph | None = None
+    _map: LineMap | None = None
+    _at: FloatArray = field(default_factory=lambda: np.eye(3))
+    _odometry: FloatArray | None = None
+    _information: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    _submaps: dict[int, tuple[ScoreGrid, LineMap]] = field(default_factory=dict)
+
+    def step(self, points: FloatArray, odometry: FloatArray) -> FloatArray:
+        """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now."""
+        points = points @ self.robot_T_laser[:2, :2].T + self.robot_T_laser[:2, 2]
+        wheels = transform(odometry)
+        if self._odometry is None:
+            self._odometry = wheels
+            self._matched.append(self._at)
+            self._add_keyframe(points, self._at, np.eye(3))
+            return self._at
+        moved = np.linalg.inv(self._odometry) @ wheels
+        way, turn = np.hypot(moved[0, 2], moved[1, 2]), abs(heading(moved))
+        predicted = self._at @ moved
+        if (way < self.settings.scan_step and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
+            self._matched.append(predicted)
+            return self._now(predicted)
+        self._at, self._odometry = self._registered(points, predicted, way, turn), wheels
+        self._matched.append(self._at)
+        last = self._keyframes[-1].matched
+        since = np.linalg.inv(last) @ self._at
+        if (
+            np.hypot(since[0, 2], since[1, 2]) > self.settings.keyframe_step
+            or abs(heading(since)) > self.settings.keyframe_turn
+        ):
+            self._add_keyframe(points, self._at, since)
+        return self._now(self._at)
+
+    def finish(self, progress: Progress | None = None) -> LaserPath:
+        """All poses, after false loops are left out and passes of one place are registered with each other."""
+        assert self._graph is not None
+        agreed = self._graph.settled()
+        loops = int((np.abs(agreed.graph.second - agreed.graph.first) > 1).sum())
+        rejected = int((~agreed.kept).sum())
+        graph = agreed.graph
+        for turn in range(2):
+            again = self._passes(graph.world_T_pose)
+            if progress is not None:
+                progress("registering passes", turn + 1, 2)
+            if again:
+                graph = self._graph.settled(again).graph
+        rows = np.array([frame.row for frame in self._keyframes])
+        poses = self._all_poses(graph.world_T_pose, rows)
+        return LaserPath(poses, np.stack(self._matched), loops, rejected, rows, graph)
+
+    def _now(self, matched: FloatArray) -> FloatArray:
+        assert self._graph is not None
+        last = len(self._keyframes) - 1
+        return np.asarray(self._graph.pose(last) @ np.linalg.inv(self._keyframes[last].matched) @ matched)
+
+    def _registered(self, points: FloatArray, predicted: FloatArray, way: float, turn: float) -> FloatArray:
+        """The pose in the local map, where odometry and the scan agree on it."""
+        assert self._map is not None
+        s = self.settings
+        sigma = np.array([0.02 + s.odometry_drift * way] * 2 + [0.01 + s.odometry_turn * (turn + way / 2)])
+        prior = np.diag(sigma**-2.0)
+        scan = thinned(points, 0.05)
+        fit = self._map.fit(scan, vector(predicted), prior, reach=min(1.0, 0.3 + way))
+        if fit.share < 0.5:  # the wheels slipped, or much of what is seen is new
+            local = scan if len(scan) <= 200 else scan[:: len(scan) // 200 + 1]
+            grid = ScoreGrid.of(self._map.points)
+            found = grid.search(local, vector(predicted), 0.3 + way, 0.2 + turn / 2, 0.5)
+            if found is not None:
+                other = self._map.fit(scan, found.pose, 0.01 * prior, reach=0.3)
+                fit = max(fit, other, key=lambda each: each.share)
+        self._information = fit.information / _SMEAR + prior
+        return transform(fit.pose)
+
+    def _add_keyframe(self, points: FloatArray, matched: FloatArray, since: FloatArray) -> None:
+        self._keyframes.append(_Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1))
+        if self._graph is None:
+            self._graph = RunningPoseGraph(matched)
+        else:
+            self._graph.append(since, _covariance(self._information, matched))
+        recent = self._keyframes[-self.settings.local_keyframes :]
+        self._map = LineMap.of(np.concatenate([_moved(frame.points, frame.matched) for frame in recent]))
+        if len(self._keyframes) % 2 == 0:
+            loops = self._loops(len(self._keyframes) - 1)
+            if loops or len(self._keyframes) % 20 == 0:
+                self._graph.close(loops)
+
+    def _loops(self, row: int) -> list[Measured]:
+        """Loops of a keyframe to the two nearest older submaps whose windows reach it."""
+        assert self._graph is not None
+        graph, size = self._graph, self.settings.submap_keyframes
+        last = (row - 2 * size) // size  # the newest submap that is over
+        if last < 0:
+            return []
+        centres = np.arange(last + 1) * size + size // 2
+        way = graph.distances(row)[centres]
+        poses = graph.poses
+        window = 0.5 + self.settings.loop_drift * way
+        apart = np.linalg.norm(poses[centres, :2, 2] - poses[row, :2, 2], axis=1)
+        near = np.flatnonzero(apart < 4.0 + window)
+        near = near[np.argsort(apart[near])][:3]
+        found = []
+        source = self._source(row)
+        for submap in near.tolist():
+            centre = int(centres[submap])
+            guess = np.linalg.inv(poses[centre]) @ poses[row]
+            turn = np.deg2rad(5) + 0.01 * min(way[submap], _TIGHT)
+            loop = self._loop(submap, centre, row, source, guess, float(window[submap]), float(turn))
+            if loop is not None:
+                found.append(loop)
+                if len(found) == 2:
+                    break
+        return found
+
+    def _loop(
+        self, submap: int, centre: int, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
+    ) -> Measured | None:
+        grid, lines = self._submap(submap, centre)
+        found = grid.search(source, vector(guess), window, turn, self.settings.loop_score)
+        if found is None or found.rival > 0.92 * found.score:
+            return None
+        fit = lines.fit(self._keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
+        values = np.linalg.eigvalsh(fit.information[:2, :2])
+        if fit.share < self.settings.loop_score or values[0] < _DETERMINED * values[1]:
+            return None
+        measured = transform(fit.pose)
+        return Measured(centre, row, measured, _covariance(fit.information / _SMEAR, measured))
+
+    def _submap(self, submap: int, centre: int) -> tuple[ScoreGrid, LineMap]:
+        """Points of a submap in the frame of its middle keyframe."""
+        if submap not in self._submaps:
+            size = self.settings.submap_keyframes
+            frames = self._keyframes[submap * size : (submap + 1) * size]
+            points = self._joined(frames, self._keyframes[centre])
+            self._submaps[submap] = ScoreGrid.of(points), LineMap.of(points)
+        return self._submaps[submap]
+
+    def _source(self, row: int) -> FloatArray:
+        """Points of a keyframe and of the four before it, in its frame."""
+        frames = self._keyframes[max(0, row - 4) : row + 1]
+        return thinned(self._joined(frames, frames[-1]), 0.2)
+
+    def _joined(self, frames: list[_Keyframe], centre: _Keyframe) -> FloatArray:
+        back = np.linalg.inv(centre.matched)
+        return np.concatenate([_moved(frame.points, back @ frame.matched) for frame in frames])
+
+    def _passes(self, poses: FloatArray) -> list[Measured]:
+        """Registrations of each keyframe with the map of every other pass nearby."""
+        found: list[Measured] = []
+        maps: dict[int, LineMap] = {}
+        places = poses[:, :2, 2]
+        for row in range(len(poses)):
+            apart = np.linalg.norm(places[:row] - places[row], axis=1)
+            others = np.flatnonzero((apart < 3.0) & (np.arange(row) < row - 2 * self.settings.local_keyframes))
+            if not len(others):
+                continue
+            runs = np.split(others, np.flatnonzero(np.diff(others) > 10) + 1)
+            nearest = sorted((int(run[np.argmin(apart[run])]) for run in runs), key=lambda k: apart[k])
+            for other in dict.fromkeys(near // 3 * 3 for near in nearest[:4]):
+                if other not in maps:
+                    around = self._keyframes[max(0, other - 5) : other + 6]
+                    maps[other] = LineMap.of(self._joined(around, self._keyframes[other]))
+                guess = np.linalg.inv(poses[other]) @ poses[row]
+                fit = maps[other].fit(self._keyframes[row].points, vector(guess), np.diag([100.0, 100.0, 1000.0]), 0.4)
+                values = np.linalg.eigvalsh(fit.information[:2, :2])
+                if fit.share < 0.6 or values[0] < _DETERMINED * values[1]:
+                    continue
+                measured = transform(fit.pose)
+                found.append(Measured(other, row, measured, _covariance(fit.information / _SMEAR, measured)))
+        return found
+
+    def _all_poses(self, poses: FloatArray, rows: IntArray) -> FloatArray:
+        """Poses of all scans: the correction of the keyframes before and after, by the way between them."""
+        matched = np.stack(self._matched)
+        step = np.diff(vectors(matched), axis=0)
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]) + np.abs(np.sin(step[:, 2])))])
+        key = np.clip(np.searchsorted(rows, np.arange(len(matched)), side="right") - 1, 0, len(rows) - 1)
+        after = np.minimum(key + 1, len(rows) - 1)
+        length = way[rows[after]] - way[rows[key]]
+        share = np.where(length > 0, (way - way[rows[key]]) / np.where(length > 0, length, 1), 0.0)
+        from_before = poses[key] @ np.linalg.inv(matched[rows[key]]) @ matched
+        from_after = poses[after] @ np.linalg.inv(matched[rows[after]]) @ matched
+        one, other = vectors(from_before), vectors(from_after)
+        off = other - one
+        off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
+        return transforms(one + share[:, None] * off)
+
+
+def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
+    """The path of a log."""
+    slam = LaserSlam(settings or LaserSettings(), transform(log.robot_T_laser))
+    for row in range(len(log)):
+        slam.step(log.points(row, slam.settings.largest_range), log.odometry[row])
+        if progress is not None:
+            progress("scans", row + 1, len(log))
+    return slam.finish(progress)
+
+
+def transforms(x: FloatArray) -> FloatArray:
+    """Poses (n, 3): x, y, heading as (n, 3, 3)."""
+    c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
+    T = np.tile(np.eye(3), (len(x), 1, 1))
+    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
+    T[:, :2, 2] = x[:, :2]
+    return T
+
+
+def transform(x: FloatArray) -> FloatArray:
+    """A pose (3,) as (3, 3)."""
+    return np.asarray(transforms(x[None])[0])
+
+
+def vectors(T: FloatArray) -> FloatArray:
+    """Poses (n, 3, 3) as x, y, heading (n, 3)."""
+    return np.stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])], axis=1)
+
+
+def vector(T: FloatArray) -> FloatArray:
+    """A pose (3, 3) as x, y, heading."""
+    return np.asarray(vectors(T[None])[0])
+
+
+def heading(T: FloatArray) -> float:
+    """The heading of a pose (3, 3)."""
+    return float(np.arctan2(T[1, 0], T[0, 0]))
+
+
+def _moved(points: FloatArray, T: FloatArray) -> FloatArray:
+    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
+
+
+def _covariance(information: FloatArray, pose: FloatArray) -> FloatArray:
+    """Covariance in the pose's own frame of what is known in the axes of the map."""
+    R = np.eye(3)
+    R[:2, :2] = pose[:2, :2]
+    own = R.T @ np.linalg.inv(information + np.diag([1e-3, 1e-3, 1e-3])) @ R
+    return np.asarray((own + own.T) / 2 + np.diag(_FLOOR))

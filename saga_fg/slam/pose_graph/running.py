@@ -1,0 +1,117 @@
+"""A pose graph in the plane that grows pose by pose, its estimate by iSAM2; loops are under a robust loss.
+
+The loss bounds what a false loop can do while the graph runs. `settled` decides which loops are false, by consensus of
+all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import Robust, between_factor, pose_prior_factor
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.slam.pose_graph.consensus import Consensus, consensus
+from saga_fg.slam.pose_graph.graph import PoseGraph
+
+_LOSS = Robust("cauchy", 3.0)
+_ANCHOR = 1e-8  # variance of the first pose
+_TURN = 1.0  # m of path that a radian of turning counts as
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """first_T_second (3, 3) between two poses, with the covariance (3, 3) of its tangent."""
+
+    first: int
+    second: int
+    first_T_second: FloatArray
+    covariance: FloatArray
+
+
+class RunningPoseGraph:
+    """Poses from 0 on, each measured from the one before it, and loops."""
+
+    def __init__(self, world_T_first: FloatArray) -> None:
+        params = gtsam.ISAM2Params()
+        params.setRelinearizeThreshold(0.02)
+        params.relinearizeSkip = 1
+        self._solver = gtsam.ISAM2(params)
+        self._edges: list[Measured] = []
+        self._poses = [world_T_first]
+        self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._new.add(pose_prior_factor(0, world_T_first, _ANCHOR * np.eye(3)))
+        self._start.insert(0, _pose2(world_T_first))
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def edges(self) -> list[Measured]:
+        """The measurements: odometry and loops, in the order they came."""
+        return self._edges
+
+    def append(self, last_T_new: FloatArray, covariance: FloatArray) -> int:
+        """Add a pose by odometry from the last one; returns its number."""
+        row = len(self._poses)
+        self._poses.append(self._poses[-1] @ last_T_new)
+        self._edges.append(Measured(row - 1, row, last_T_new, covariance))
+        self._new.add(between_factor(row - 1, row, last_T_new, covariance))
+        self._start.insert(row, _pose2(self._poses[-1]))
+        return row
+
+    def close(self, loops: list[Measured]) -> None:
+        """Add loops, and solve."""
+        for loop in loops:
+            self._edges.append(loop)
+            self._new.add(between_factor(loop.first, loop.second, loop.first_T_second, loop.covariance, _LOSS))
+        self._solver.update(self._new, self._start)
+        self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._solver.update()
+        values = self._solver.calculateEstimate()
+        self._poses = [values.atPose2(row).matrix() for row in range(len(self._poses))]
+
+    def pose(self, row: int) -> FloatArray:
+        """The present estimate (3, 3) of a pose."""
+        return self._poses[row]
+
+    @property
+    def poses(self) -> FloatArray:
+        """The present estimates (N, 3, 3)."""
+        return np.stack(self._poses)
+
+    def distances(self, row: int) -> FloatArray:
+        """Length (N,) of the shortest way from a pose to each along measurements, m: what relative errors grow with."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import dijkstra
+
+        first, second = (np.array([getattr(edge, end) for edge in self._edges]) for end in ("first", "second"))
+        T = np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3)
+        length = np.hypot(T[:, 0, 2], T[:, 1, 2]) + _TURN * np.abs(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+        n = len(self._poses)
+        joined = coo_array((np.maximum(length, 1e-6), (first, second)), shape=(n, n)).tocsr()
+        return np.asarray(dijkstra(joined, directed=False, indices=row))
+
+    def graph(self, loops: list[Measured] | None = None) -> PoseGraph:
+        """The whole graph; loops: in place of those that came."""
+        edges = self._edges
+        if loops is not None:
+            edges = [edge for edge in edges if edge.second == edge.first + 1] + loops
+        first, second = (
+            np.array([getattr(edge, end) for edge in edges], dtype=np.int64) for end in ("first", "second")
+        )
+        between = np.array([edge.first_T_second for edge in edges]).reshape(-1, 3, 3)
+        information = np.linalg.inv(np.array([edge.covariance for edge in edges]).reshape(-1, 3, 3))
+        information = (information + information.swapaxes(1, 2)) / 2
+        ids: IntArray = np.arange(len(self._poses), dtype=np.int64)
+        return PoseGraph(ids, self.poses, first, second, between, information)
+
+    def settled(self, loops: list[Measured] | None = None) -> Consensus:
+        """The graph without false loops, optimised."""
+        return consensus(self.graph(loops))
+
+
+def _pose2(T: FloatArray) -> gtsam.Pose2:
+    return gtsam.Pose2(T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0]))

@@ -1,0 +1,63 @@
+"""SLAM with a planar laser: a simulated drive whose odometry does not close."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from typer.testing import CliRunner
+
+from data_tools.laser import LaserLog
+from data_tools.simulator.laser_drive import laser_drive, write_carmen
+from data_tools.trajectories import read_tum_poses
+from pipelines.cli import app
+from pipelines.slam.laser_slam import LaserSettings, laser_slam
+
+
+def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:
+    log, true = laser_drive(0, rounds=1.3)
+    write_carmen(tmp_path / "drive.log", log)
+    output = tmp_path / "out"
+    result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(output)])
+    assert result.exit_code == 0, result.output
+    assert "times real time" in result.stdout
+    figures = json.loads((output / "figures.json").read_text())
+    assert figures["loops"] >= 10
+    assert figures["entropy"] < figures["entropy_scan_matching"]
+    assert (output / "map.png").read_bytes().startswith(b"\x89PNG")
+    paths = {name: read_tum_poses(output / f"{name}.tum") for name in ("trajectory", "matched", "odometry")}
+    off = {name: np.linalg.norm(path.positions[:, :2] - true[:, :2, 2], axis=1) for name, path in paths.items()}
+    assert off["trajectory"].max() < 0.3
+    assert off["odometry"].max() > 2.0
+    again = np.linalg.norm(np.diff(paths["trajectory"].positions[:, :2], axis=0), axis=1)
+    np.testing.assert_allclose(again, 0.15, atol=0.05)  # no jumps where corrections begin
+
+
+def test_times_that_run_backwards_are_sorted_in_the_result(tmp_path: Path) -> None:
+    log, _ = laser_drive(1, rounds=0.1)
+    log.time[[10, 11]] = log.time[[11, 10]]
+    log.time[20] = log.time[19]
+    write_carmen(tmp_path / "drive.log", log)
+    output = tmp_path / "out"
+    result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(output)])
+    assert result.exit_code == 0, result.output
+    path = read_tum_poses(output / "trajectory.tum")
+    assert len(path) == len(log) - 1
+    np.testing.assert_allclose(path.timestamps, np.unique(log.time), atol=1e-6)
+
+
+def test_scans_that_hit_nothing_go_by_the_wheels() -> None:
+    log, true = laser_drive(2, rounds=0.12)
+    ranges = log.ranges.copy()
+    ranges[30:40] = np.nan
+    path = laser_slam(LaserLog(log.time, ranges, log.angles, log.odometry, log.robot_T_laser), LaserSettings())
+    assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.15
+
+
+def test_a_broken_log_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "bad.log").write_text("FLASER 3 1 2 3\n")
+    result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "bad.log"), "--output", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert "line 1: expected a number of readings from 10" in result.stderr
+    assert not (tmp_path / "out").exists()
