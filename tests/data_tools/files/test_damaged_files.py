@@ -50,6 +50,8 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
     read: dict[str, Any] = {name: target.read() for name, target in valid.items()}
     assert len(read.pop("Argoverse", "ab")) == len(read.pop("OpenACC", "ab")) == 2  # need pyarrow
+    for name in ("recording, MCAP", "recording, SQLite"):
+        assert len(read.pop(name, "ab")) == 2  # need the packages that write them
     assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES
     assert [len(scene) for scene in read["nuScenes"]] == [3, 2]
     assert len(read["tracks"].id) == len(read["labels"].tracks.id) == 2
