@@ -37,11 +37,26 @@ class HotaRow:
 def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[str, float]) -> list[HotaRow]:
     """Judge (truth, found) of all scenes for the classes of `thresholds`. Raises `MissingExtraError` w/o trackeval."""
     rows = []
+    similarities = _similarities(scenes)
     for label, threshold in thresholds.items():
         scored = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
-        for overlap, similarity in SIMILARITIES.items():
+        for overlap, similarity in similarities.items():
             rows.append(HotaRow(label, overlap, threshold, hota_metrics(scored, label, similarity)))
     return rows
+
+
+def _similarities(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> dict[str, Similarity]:
+    """The overlaps that boxes have; where truth or tracks are points, the nearness of centres, 0 from 4 m on."""
+    known = []
+    for one in zip(*scenes, strict=True):
+        size = np.concatenate([table.boxes.size for table in one])
+        known.append(np.isfinite(size).any(axis=0) if len(size) else np.ones(3, dtype=np.bool_))
+    length, width, height = np.all(known, axis=0).tolist() if known else (True, True, True)
+    if not (length and width):
+        return {"centre": "centre"}
+    if not height:
+        return {"2D": "bev_iou"}
+    return SIMILARITIES
 
 
 def hota_table(rows: Sequence[HotaRow]) -> FigureTable:
