@@ -1,13 +1,16 @@
-"""The ETH walking pedestrians: `eth/obsmat.txt` and `hotel/obsmat.txt`, in; `Scene`s with ground truth alone, out.
+"""Walking pedestrians of ETH and UCY: files of annotated places, in; `Scene`s with ground truth alone, out.
 
-    frame  person  x  z  y  vx  vz  vy                                 m and m/s in the ground plane, z = 0
+    frame  person  x  z  y  vx  vz  vy                       `eth/obsmat.txt`, `hotel/obsmat.txt`: m and m/s, z = 0
+    frame  person  x  y                                      `NAME.txt`, such as `zara01.txt`, `students03.txt`
 
-A row is a person at an annotated moment, every 0.4 s. Frames count those of the video, of which `eth` has 15 a second
-and `hotel` 25, as the velocity columns imply. The scenes have no vehicle (poses are the identity), no frames of
-detections and no sizes; the yaw is the course of the velocity column.
+A row is a person at an annotated moment, every 0.4 s. Frames count those of the video: `eth` has 15 a second and
+`hotel` 25, as the velocity columns imply; elsewhere the usual step between annotated frames is 0.4 s. Velocities that
+are not there are central differences. The scenes have no vehicle (poses are the identity), no frames of detections and
+no sizes; the yaw is the course of the velocity.
 
-Source: Pellegrini, Ess, Schindler, van Gool, You'll Never Walk Alone, ICCV 2009; files as OpenTraj distributes them,
-https://github.com/crowdbotp/OpenTraj.
+Sources: Pellegrini, Ess, Schindler, van Gool, You'll Never Walk Alone, ICCV 2009; Lerner, Chrysanthou, Lischinski,
+Crowds by Example, Eurographics 2007; files as OpenTraj (https://github.com/crowdbotp/OpenTraj) and Social GAN
+(https://github.com/agrimgupta92/sgan) distribute them.
 """
 
 from __future__ import annotations
@@ -20,52 +23,69 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.annotated import AnnotatedSource
+from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
 from data_tools.files.error_messages import error_context, unknown_name
 from data_tools.files.remote_files import local_tree
 from data_tools.files.text_tables import read_table
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import IntArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Dataset, Scene
 
 FRAME_RATES = {"eth": 15.0, "hotel": 25.0}  # of the videos, 1/s
 _COLUMNS = ("frame", "person", "x", "z", "y", "vx", "vz", "vy")
+_PLACES = ("frame", "person", "x", "y")
+_INTERVAL = 0.4  # s between annotations
+_LONGEST_GAP = 0.9  # s between annotations of a person, for a velocity
 
 
 class EthUcy:
-    """The recordings whose folder below `root` has an obsmat.txt: eth, hotel.
+    """The recordings below `root`: eth/obsmat.txt, hotel/obsmat.txt and NAME.txt; or the one of a file.
 
     Files are read when asked for. Raises `InputError` for a root without any.
     """
 
     def __init__(self, root: str | Path) -> None:
         self._root = Path(root)
-        self._scenes = tuple(name for name in FRAME_RATES if (self._root / name / "obsmat.txt").is_file())
-        if not self._scenes:
-            raise InputError(f"{self._root}: expected eth/obsmat.txt or hotel/obsmat.txt, there is neither")
+        known = {name: self._root / name / "obsmat.txt" for name in FRAME_RATES}
+        if self._root.is_file():
+            name = self._root.parent.name if self._root.name == "obsmat.txt" else self._root.stem
+            self._files = {name: self._root}
+        else:
+            there = {path.stem: path for path in sorted(self._root.glob("*.txt"))}
+            self._files = {name: path for name, path in known.items() if path.is_file()} | there
+        if not self._files:
+            raise InputError(f"{self._root}: expected eth/obsmat.txt or hotel/obsmat.txt, or NAME.txt, there is none")
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """The names of the recordings."""
-        return self._scenes
+        return tuple(self._files)
 
     def scene(self, name: str) -> Scene:
         """Read a recording; raises `InputError` for an unknown name or a line that is not as above."""
-        if name not in self._scenes:
-            raise InputError(f"{self._root}: {unknown_name('recording', name, self._scenes)}")
-        path = self._root / name / "obsmat.txt"
-        table = read_table(path, (len(_COLUMNS),), " ".join(_COLUMNS))
-        if not len(table):
+        if name not in self._files:
+            raise InputError(f"{self._root}: {unknown_name('recording', name, self.scenes)}")
+        path = self._files[name]
+        table = read_table(path, (len(_COLUMNS), len(_PLACES)), f"{' '.join(_COLUMNS)}, or {' '.join(_PLACES)}")
+        n = len(table)
+        if not n:
             raise InputError(f"{path}: expected rows, there are none")
         frame, person = table.integers(0, "frame", 0), table.integers(1, "person", 0)
-        x, y, vx, vy = table.numbers([2, 4, 5, 7], ("x", "y", "vx", "vy")).T
-        n = len(table)
+        seconds = frame / _frame_rate(name, frame)
+        if table.values.shape[1] == len(_COLUMNS):
+            place = table.numbers([2, 4], ("x", "y"))
+            velocity = table.numbers([5, 7], ("vx", "vy"))
+        else:
+            place = table.numbers([2, 3], ("x", "y"))
+            velocity = central_differences(person.astype(np.str_), seconds, place, _LONGEST_GAP)
         boxes = Boxes(
             np.full(n, "pedestrian"),
-            np.stack([x, y, np.zeros(n)], axis=1),
+            np.column_stack([place, np.zeros(n)]),
             np.full((n, 3), np.nan),
-            np.arctan2(vy, vx),
-            np.stack([vx, vy], axis=1),
+            np.arctan2(velocity[:, 1], velocity[:, 0]),
+            velocity,
         )
         order = np.argsort(frame, kind="stable")
         frames, first = np.unique(frame[order], return_index=True)
@@ -74,18 +94,24 @@ class EthUcy:
             with error_context(f"{path}: frame {number}"):
                 truth.append(Annotations(person[rows].astype(np.str_), boxes.select(rows), np.ones(len(rows), bool)))
         poses = np.tile(np.eye(4), (len(frames), 1, 1))
-        return Scene(name, frames / FRAME_RATES[name], poses, tuple(map(str, frames.tolist())), [], truth)
+        return Scene(name, frames / _frame_rate(name, frame), poses, tuple(map(str, frames.tolist())), [], truth)
+
+
+def _frame_rate(name: str, frame: IntArray) -> float:
+    """Frames of the video in a second."""
+    step = np.diff(np.unique(frame))
+    return FRAME_RATES.get(name, float(np.median(step)) / _INTERVAL if len(step) else 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EthUcySource(AnnotatedSource):
-    """ETH/UCY walking pedestrians, annotated every 0.4 s."""
+    """Walking pedestrians of ETH and UCY, annotated every 0.4 s."""
 
     name = "eth_ucy"
     example = "--dataroot data/eth_ucy --scenes hotel"
-    dataroot: str = option("Folder that holds eth/ and hotel/, or its URL.")
+    dataroot: str = option("Folder that holds eth/ and hotel/ or files NAME.txt, or its URL; or one such file.")
 
     @contextmanager
     def annotated(self) -> Iterator[Dataset]:
-        with local_tree(self.dataroot, ["*/obsmat.txt"]) as root:
+        with local_tree(self.dataroot, ["*/obsmat.txt", "*.txt"]) as root:
             yield EthUcy(root)

@@ -20,7 +20,7 @@ GROUP = "saga_fg.datasets"
 BUILT_IN = {
     "nuscenes": "data_tools.datasets.nuscenes.source:NuScenesSource",
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
-    "argoverse2": "data_tools.datasets.argoverse2:ArgoverseSource",
+    "argoverse2": "data_tools.datasets.argoverse2.source:ArgoverseSource",
     "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
     "ngsim": "data_tools.simulator.recorded_source:NgsimSource",
     "openacc": "data_tools.simulator.recorded_source:OpenAccSource",

@@ -77,7 +77,8 @@ class JointKalmanFilter(LatestMarginals):
 
     @property
     def nodes(self) -> IntArray:
-        return np.delete(self._state.layout.nodes, self._auxiliary.rows(self._state.layout))
+        nodes, others = self._state.layout.nodes, self.others
+        return np.delete(nodes, others) if len(others) else nodes
 
     @property
     def time(self) -> float:

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, UnknownNodeError
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    checked,
+    checked_covariances,
+    checked_ids,
+    checked_rows,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +34,22 @@ class StateLayout:
             object.__setattr__(self, name, array.astype(np.int64, copy=False))
 
     @cached_property
-    def _row(self) -> dict[int, int]:
-        return {node: row for row, node in enumerate(self.nodes.tolist())}
+    def _order(self) -> IntArray | None:
+        """(n,) rows by ascending id; None where they are in that order already."""
+        ascending = (self.nodes[1:] > self.nodes[:-1]).all()
+        return None if ascending else np.argsort(self.nodes)
+
+    @cached_property
+    def _sorted(self) -> IntArray:
+        """(n,) ids, ascending."""
+        return self.nodes if self._order is None else self.nodes[self._order]
+
+    def _places(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
+        """Places (k,) of ids (k,) in the ascending order, and which of them (k,) are in the layout."""
+        if len(self) == 0 or len(ids) == 0:
+            return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=bool)
+        at = np.minimum(np.searchsorted(self._sorted, ids.astype(np.int64, copy=False)), len(self) - 1)
+        return at, self._sorted[at] == ids
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -44,10 +66,10 @@ class StateLayout:
             raise InputError(f"nodes: expected a list of integer ids, got {nodes!r}")
         if len(ids) == len(self.nodes) and (ids == self.nodes).all():
             return np.arange(len(ids))
-        try:
-            return np.array([self._row[node] for node in ids.tolist()], dtype=np.int64)
-        except KeyError as error:
-            raise UnknownNodeError(f"node {error.args[0]} is not in the estimator") from None
+        at, known = self._places(ids)
+        if not known.all():
+            raise UnknownNodeError(f"node {ids[int(np.argmin(known))]} is not in the estimator")
+        return at if self._order is None else self._order[at]
 
     def spans(self, rows: IntArray) -> IntArray:
         """(k, d) places in the joint state of rows whose states have equal size d; `InputError` if they have not."""
@@ -67,9 +89,9 @@ class StateLayout:
     def extended(self, nodes: ArrayLike, dim: int) -> StateLayout:
         """Add nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
         ids = checked_ids("nodes", nodes)
-        for node in ids.tolist():
-            if node in self._row:
-                raise InputError(f"node {node} is in the estimator already")
+        _, known = self._places(ids)
+        if known.any():
+            raise InputError(f"node {ids[int(np.argmax(known))]} is in the estimator already")
         return StateLayout(np.concatenate([self.nodes, ids]), np.concatenate([self.dims, np.full(len(ids), dim)]))
 
     def without(self, rows: IntArray) -> StateLayout:

@@ -28,6 +28,8 @@ otherwise F_ij is read off the exponential of the block matrix [[M_i, K_ij A_oth
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -71,8 +73,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         place[numbers] = np.arange(len(numbers))
         rows = np.flatnonzero(~coupled & (place[kind] >= 0))
         of_row = place[kind[rows]]
-        generators, diffusions = (np.stack([getattr(kinds[k], n) for k in numbers]) for n in ("generator", "diffusion"))
-        (own,), noise = _phi_and_noise(generators, diffusions, dt, 0, _nilpotency([kinds[k] for k in numbers]))
+        own, noise = _own_motions(tuple(kinds[k] for k in numbers), dt)
         F.append(Blocks(rows, rows, own[of_row]))
         Q.append(Blocks(rows, rows, noise[of_row] * graph.diffusion_scale[rows, None, None]))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
@@ -95,8 +96,18 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
 
 def own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
     """F (d, d) and Q (d, d) of a node without edges over `dt` s."""
-    F, Q = linear_motions(node_type.generator[None], node_type.diffusion[None], dt, node_type.nilpotency)
+    F, Q = _own_motions((node_type,), dt)
     return F[0], Q[0]
+
+
+@lru_cache(maxsize=64)  # many sensors have one interval, again and again
+def _own_motions(types: tuple[NodeType, ...], dt: float) -> tuple[FloatArray, FloatArray]:
+    """F and Q (k, d, d), read-only, of nodes of k types, with states of equal size, without edges over `dt` s."""
+    generators, diffusions = np.stack([t.generator for t in types]), np.stack([t.diffusion for t in types])
+    F, Q = linear_motions(generators, diffusions, dt, _nilpotency(types))
+    for array in (F, Q):
+        array.flags.writeable = False
+    return F, Q
 
 
 def linear_motions(
@@ -184,7 +195,7 @@ def _own_dynamics(
     return M, Qc, c
 
 
-def _nilpotency(kinds: list[NodeType]) -> int | None:
+def _nilpotency(kinds: Sequence[NodeType]) -> int | None:
     """Smallest k with A^k = 0 for all these types, None if there is none."""
     steps = [t.nilpotency for t in kinds]
     return None if None in steps else max(step for step in steps if step is not None)

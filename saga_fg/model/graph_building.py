@@ -11,8 +11,8 @@ from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import NodeTable, applies
 from saga_fg.model.motion import distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
-from saga_fg.numerics.arrays import FloatArray, checked, checked_rows
+from saga_fg.model.scene_graph import Edges, ModeRecord, NonlinearEdges, SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, checked, checked_rows
 
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 
@@ -20,22 +20,28 @@ _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T 
 def build_graph(
     nodes: NodeTable,
     rules: Sequence[EdgeRule],
-    min_rate: float = 1e-3,
     explained_noise: float = 0.0,
     noise_scale: FloatArray | None = None,
+    modes: tuple[ModeRecord, ...] = (),
+    interacting: BoolArray | None = None,
+    min_rate: float = 1e-3,
 ) -> SceneGraph:
     """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
 
     Edges weaker than `min_rate` (1/s) are left out.
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
-    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it.
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `modes` are those
+    of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
     """
     groups: list[Edges] = []
     nonlinear: list[NonlinearEdges] = []
     total_rate = np.zeros(len(nodes))
+    graph_nodes, row = nodes, np.arange(len(nodes)) if interacting is None else np.flatnonzero(interacting)
+    if len(row) < len(nodes):
+        nodes = nodes.select(row)
     if len(nodes) > 1:
         kinds, kind = distinct_types(nodes.types)
         first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
@@ -54,14 +60,14 @@ def build_graph(
                 if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
                     continue
                 if isinstance(law, AccelerationLaw):
-                    nonlinear.append(NonlinearEdges(law, t, s, rate[mine], law.given(nodes, t, s)))
+                    nonlinear.append(NonlinearEdges(law, row[t], row[s], rate[mine], law.given(nodes, t, s)))
                 else:
-                    groups.append(Edges(type(law).__name__, t, s, rate[mine], *law.triples(nodes, t, s)))
-                np.add.at(total_rate, t, rate[mine])
+                    groups.append(Edges(type(law).__name__, row[t], row[s], rate[mine], *law.triples(nodes, t, s)))
+                np.add.at(total_rate, row[t], rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale
-    return SceneGraph(nodes.id, nodes.types, tuple(groups), scale, tuple(nonlinear))
+    return SceneGraph(graph_nodes.id, graph_nodes.types, tuple(groups), scale, tuple(nonlinear), modes)
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:

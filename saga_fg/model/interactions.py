@@ -15,7 +15,7 @@ Car-following is Helly's linear law (Helly 1959); with the gap taken from the pr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -71,6 +71,18 @@ class NodeTable:
 
     def __len__(self) -> int:
         return len(self.id)
+
+    def select(self, rows: IntArray) -> NodeTable:
+        """The nodes `rows` (k,), ascending."""
+        place = dict(zip(rows.tolist(), range(len(rows)), strict=True))
+        columns: dict[str, Any] = {"types": tuple(map(self.types.__getitem__, place))}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, np.ndarray):
+                columns[each.name] = value[rows]
+            elif isinstance(value, Mapping) and each.init:
+                columns[each.name] = {place[row]: entry for row, entry in value.items() if row in place}
+        return replace(self, **columns)
 
 
 class Triples(NamedTuple):

@@ -34,6 +34,7 @@ Singer (1970) for the first-order decay.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -97,11 +98,7 @@ class KnownCourses(Columns):
         assert isinstance(motion, Curvilinear)
         tau = max(motion.turn_time, _LEAST_TIME)
         theta = self.rate * turning_time(motion, dt)
-        (A_1, Qc_1), (A_2, Qc_2) = motion.along, motion.across
-        white = np.diag([0.0, 1.0, 0.0])
-        (F_along, F_across, _), (Q_along, Q_across, Q_white) = linear_motions(
-            np.stack([A_1, A_2, A_2]), np.stack([Qc_1, Qc_2, white]), dt
-        )
+        (F_along, F_across, _), (Q_along, Q_across, Q_white) = _one_axis(motion, dt)
         u = _unit(self.heading)
         ahead = u[:, :, None] * u[:, None]
         aside = np.eye(2) - ahead
@@ -121,6 +118,14 @@ class KnownCourses(Columns):
             self, heading=self.heading + theta, rate=self.rate * np.exp(-dt / tau), brake=np.zeros_like(self.brake)
         )
         return later, MatchedMotion(F, b, Q * scale[:, None, None])
+
+
+@lru_cache(maxsize=64)  # many sensors have one interval, again and again
+def _one_axis(motion: Curvilinear, dt: float) -> tuple[FloatArray, FloatArray]:
+    """F and Q (3, 3, 3) along the heading, across it, and across it of white acceleration of density 1."""
+    (A_1, Qc_1), (A_2, Qc_2) = motion.along, motion.across
+    white = np.diag([0.0, 1.0, 0.0])
+    return linear_motions(np.stack([A_1, A_2, A_2]), np.stack([Qc_1, Qc_2, white]), dt)
 
 
 def turning_time(motion: Curvilinear, dt: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -23,16 +23,30 @@ class Columns:
 
     def select(self, rows: IntArray | BoolArray | slice | Sequence[int]) -> Self:
         """The rows of a mask, of row indices or of a slice."""
-        index: Any = rows if isinstance(rows, slice) else np.asarray(rows, dtype=None if len(rows) else np.int64)
-        chosen: Self = object.__new__(type(self))  # rows of a validated table: nothing to check again
+        if isinstance(rows, slice):
+            return self._each(lambda column: column[rows])
+        index = np.asarray(rows, dtype=None if len(rows) else np.int64)
+        if index.dtype == np.bool_:
+            if len(index) != len(self):
+                raise IndexError(f"expected a mask of {len(self)} rows, got {len(index)}")
+            index = index.nonzero()[0]
+        return self._each(lambda column: column[index])
+
+    def copied(self) -> Self:
+        """A table of the same rows that shares no array with this one."""
+        return self._each(np.ndarray.copy)
+
+    def _each(self, change: Callable[[Any], Any]) -> Self:
+        """The table with its arrays changed: rows of a validated table, nothing to check again."""
+        mine, changed = vars(self), object.__new__(type(self))
         for name in self.__dataclass_fields__:
-            column = getattr(self, name)
-            if isinstance(column, Columns):
-                column = column.select(index)
-            elif isinstance(column, np.ndarray):  # anything else belongs to the whole table
-                column = column[index]
-            vars(chosen)[name] = column
-        return chosen
+            column = mine[name]
+            if isinstance(column, np.ndarray):  # anything else belongs to the whole table, or is one
+                column = change(column)
+            elif isinstance(column, Columns):
+                column = column._each(change)
+            vars(changed)[name] = column
+        return changed
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:

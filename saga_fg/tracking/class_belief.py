@@ -34,8 +34,7 @@ class ClassGroups:
     def __init__(self, groups: Sequence[Sequence[str]]) -> None:
         self._groups = tuple(tuple(group) for group in groups)
         self.classes = tuple(label for group in self._groups for label in group)
-        number = np.repeat(np.arange(len(self._groups)), [len(group) for group in self._groups])
-        self._mates = (number[:, None] == number).astype(np.float64)
+        self._number = [number for number, group in enumerate(self._groups) for _ in group]
         self._column = {label: k for k, label in enumerate(self.classes)}
 
     def __len__(self) -> int:
@@ -43,11 +42,14 @@ class ClassGroups:
 
     def same_group(self, labels: StrArray, others: StrArray) -> BoolArray:
         """(n, m) which classes (n,) equal others (m,) or share a group with them."""
-        (row, inside), (column, there) = self._rows(labels), self._rows(others)
-        if not self.classes:
-            return np.asarray(labels[:, None] == others)
-        mates = (self._mates[row[:, None], column] > 0) & inside[:, None] & there
-        return np.asarray(mates | (labels[:, None] == others))
+        (classes, of_row), (their_classes, of_column) = distinct(labels), distinct(others)
+        same = [[a == b or self._mated(a, b) for b in their_classes] for a in classes]
+        return np.array(same, dtype=bool).reshape(len(classes), len(their_classes))[of_row[:, None], of_column]
+
+    def _mated(self, label: str, other: str) -> bool:
+        """True if two classes share a group."""
+        a, b = self._column.get(label), self._column.get(other)
+        return a is not None and b is not None and self._number[a] == self._number[b]
 
     def likelihood(self, label: StrArray, sensor: Sensor) -> FloatArray:
         """L (m, C) of detections of the classes `label` (m,) by a sensor."""

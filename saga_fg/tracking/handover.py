@@ -28,10 +28,12 @@ import numpy as np
 
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching, least_total
+from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.initiation import unmeasured_velocity
 from saga_fg.tracking.relinking import area, least_log_odds, log_survival
 from saga_fg.tracking.tracker_state import TrackerState
+
+_FARTHEST = 100.0  # squared distance of two positions from which not even the narrowest densities join tracks
 
 
 def hand_over(state: TrackerState, matching: Matching) -> Matching:
@@ -69,29 +71,45 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     i, j = np.nonzero(
         same(table.label[new], table.label[old]) & (table.last_detected[old] < table.initiated[new][:, None])
     )
-    return new[i], old[j], others[i]
+    near = _near(state, new[i], old[j])
+    return new[i[near]], old[j[near]], others[i[near]]
+
+
+def _near(state: TrackerState, new: IntArray, old: IntArray) -> IntArray:
+    """Which pairs (k,) are near enough, moving or stationary, for their densities to count at all."""
+    now, still = state.kinematics(), state.table.stationarity
+    moving, _ = mahalanobis_of_pairs(now.position[new] - now.position[old], now.P[new] + now.P[old])
+    stationary, _ = mahalanobis_of_pairs(still.position[new] - still.position[old], still.P[new] + still.P[old])
+    return np.flatnonzero(np.minimum(moving, stationary) < _FARTHEST)
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
     """(k,) logs of `moving` and `stationary`, see the module."""
     table, stationarity = state.table, state.table.stationarity
-    now = state.kinematics()
-    boxes, prior = state.boxes(now.position, now.velocity).select(new), state.settings.stationarity.prior
-    _, V_0, p = unmeasured_velocity(state, boxes, prior)
-    p = np.clip(p, 1e-9, 1 - 1e-9)
+    now, prior = state.kinematics(), state.settings.stationarity.prior
+    each, of_pair = np.unique(new, return_inverse=True)  # a new track is in many pairs
+    _, V_0, p = unmeasured_velocity(state, state.boxes(now.position, now.velocity).select(each), prior)
+    V_0, p = V_0[of_pair], np.clip(p, 1e-9, 1 - 1e-9)[of_pair]
     s, s_new = (np.clip(stationarity.probability[rows], 0.0, 1 - 1e-9) for rows in (old, new))
     moving = np.log1p(-s) + np.log1p(-s_new) - np.log1p(-p)
     for node_type, rows in state.joint.rows_by_type(table.label[new]):
-        H = node_type.selector(POSITION + VELOCITY if node_type.has(VELOCITY) else POSITION)
-        estimator, ids, ids_new = state.joint.estimator, table.id[old[rows]], table.id[new[rows]]
-        P, S = H @ estimator.covariance(ids) @ H.T, H @ estimator.covariance(ids_new) @ H.T
-        moving[rows] += _log_density((estimator.mean(ids_new) - estimator.mean(ids)) @ H.T, P + S)
+        at = node_type.index(POSITION + VELOCITY if node_type.has(VELOCITY) else POSITION)
+        mean, P = _marginals(state, np.concatenate([old[rows], new[rows]]), at)
+        k = len(rows)
+        moving[rows] += _log_density(mean[k:] - mean[:k], P[k:] + P[:k])
         if node_type.has(VELOCITY):
             moving[rows] -= _log_density(np.zeros((len(rows), 2)), V_0[rows])
     apart = stationarity.position[new] - stationarity.position[old]
     still = _log_density(apart, stationarity.P[old] + stationarity.P[new])
     with np.errstate(divide="ignore"):
         return moving, np.asarray(np.log(s) + np.log(s_new) - np.log(p) + still)
+
+
+def _marginals(state: TrackerState, rows: IntArray, at: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Means (k, d) and covariances (k, d, d) of the components `at` (d,) of tracks `rows` (k,), which may repeat."""
+    each, of_row = np.unique(rows, return_inverse=True)
+    estimator, ids = state.joint.estimator, state.table.id[each]
+    return estimator.mean(ids)[:, at][of_row], estimator.covariance(ids)[:, at[:, None], at][of_row]
 
 
 def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:
@@ -120,6 +138,7 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     table.hits, table.opportunities = table.sensors.best_hits()
     for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):
         column[old] = column[new]
+    table.best_score[old] = np.maximum(table.best_score[old], table.best_score[new])
     table.confirmed[old] |= table.confirmed[new]
     table.has_moved[old] |= table.has_moved[new]
     table.existence[old] = np.maximum(table.existence[old], table.existence[new])
@@ -127,6 +146,10 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
 
 
 def _log_density(x: FloatArray, S: FloatArray) -> FloatArray:
-    """(k,) log N(x; 0, S) in d dimensions."""
-    d2 = (x * np.linalg.solve(S, x[:, :, None])[:, :, 0]).sum(axis=1)
-    return np.asarray(-0.5 * (d2 + np.linalg.slogdet(2 * math.pi * S)[1]))
+    """(k,) log N(x; 0, S) in 2 or 4 dimensions: that of the first two, and of the others given these."""
+    d2, log_det = mahalanobis_of_pairs(x[:, :2], S[:, :2, :2])
+    if x.shape[1] > 2:
+        gain = np.swapaxes(np.linalg.solve(S[:, :2, :2], S[:, :2, 2:]), 1, 2)
+        given = mahalanobis_of_pairs(x[:, 2:] - (gain @ x[:, :2, None])[:, :, 0], S[:, 2:, 2:] - gain @ S[:, :2, 2:])
+        d2, log_det = d2 + given[0], log_det + given[1]
+    return np.asarray(-0.5 * (d2 + log_det + x.shape[1] * math.log(2 * math.pi)))

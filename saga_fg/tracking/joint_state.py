@@ -111,9 +111,15 @@ class JointTrackState:
         if relative is not None:
             self._add_relative(ids, label, relative)
 
-    def remove(self, ids: IntArray) -> None:
-        """Marginalise tracks; their information on their neighbours stays."""
+    def remove(self, ids: IntArray, kept: IntArray | None = None) -> None:
+        """Marginalise tracks; their information on their neighbours stays, and so do the estimates of all others.
+
+        kept: rows of the other tracks where `ids` are some of those of the last call of `kinematics`
+        """
+        before = self._kinematics
         self._estimator_to_change().marginalise(ids)
+        if kept is not None and before is not None and len(before.P) == len(kept) + len(ids):
+            self._kinematics = before.select(kept)
         self._modes = {k: t.select(np.flatnonzero(~np.isin(t.ids, ids))) for k, t in self._modes.items()}
         for track in ids.tolist():
             del self._initiated[track]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from saga_fg.tracking.tracker_state import TrackerState
 
 log = logging.getLogger(__name__)
 
+LEAST_EXISTENCE = 0.1  # below, a coasting track that was never confirmed has no edges: most tracks, hardly an object
 MOST_STEPS = 100  # that an interval is predicted in
 
 
@@ -48,10 +48,11 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
     explained, nodes, lights = state.settings.explained_noise, node_table(state), state.map_nodes
     if watched and lights.infers:
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
-    state.graph = build_graph(nodes, state.rules, explained_noise=explained, noise_scale=noise)
-    before = state.kinematics().velocity
+    likely = table.confirmed | (table.existence >= LEAST_EXISTENCE) | (table.coasting(state.time) == 0)
+    interacting = np.concatenate([likely, np.ones(len(nodes) - len(table), dtype=bool)])
     courses, heading = known_courses(state, dt, unseen)
-    state.graph = replace(state.graph, modes=courses)
+    state.graph = build_graph(nodes, state.rules, explained, noise, courses, interacting)
+    before = state.kinematics().velocity
     state.joint.predict(state.graph, dt)
     table.box.turn_with(before, state.kinematics().velocity, unseen)
     table.box.yaw = np.where(np.isfinite(heading), heading, table.box.yaw)

@@ -31,6 +31,8 @@ from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.stationarity import log_density
 from saga_fg.tracking.tracker_state import TrackerState
 
+_ROUNDING = 1 + 1e-6
+_LEAST = 1e-300  # determinant that rounding leaves
 NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
 
 
@@ -47,11 +49,17 @@ def relinked(
     free = relinkable(state)
     free[matching.track] = False
     tracks, label = np.flatnonzero(free), measurements.boxes.label[rows]
-    i, j = np.nonzero(state.class_groups.same_group(state.table.label[tracks], label))
+    if len(tracks) == 0:
+        return matching
+    places, noise = measurements.boxes.position[rows, :2] - state.origin, measurements.R[rows, :2, :2]
+    others = state.class_groups.same_group(label, label).sum(axis=1)
+    i, j = np.nonzero(
+        _within_reach(state, tracks, position, P, places, noise)
+        & state.class_groups.same_group(state.table.label[tracks], label)
+    )
     if len(i) == 0:
         return matching
-    t, d, others = tracks[i], rows[j], state.class_groups.same_group(label, label).sum(axis=1)[j]
-    z, R = measurements.boxes.position[d, :2] - state.origin, measurements.R[d, :2, :2]
+    t, d, others, z, R = tracks[i], rows[j], others[j], places[j], noise[j]
     moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
     still = _log_density(z - state.table.stationarity.position[t], S)
     log_odds = log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / area(state))
@@ -59,6 +67,24 @@ def relinked(
     t, d = t[chosen], d[chosen]
     distance, _ = mahalanobis_of_pairs(z[chosen] - position[t], P[t] + R[chosen])
     return matching.append(Matching(t, d, distance))
+
+
+def _within_reach(
+    state: TrackerState, tracks: IntArray, position: FloatArray, P: FloatArray, z: FloatArray, R: FloatArray
+) -> BoolArray:
+    """(n, m) which tracks, by `position` and P (N, ...) of all, could be re-linked with places z (m, 2) of noise R.
+
+    Neither density exceeds that of a distance beyond sqrt(trace(P + R)), at a peak of covariance P.
+    """
+    table, found = state.table.stationarity, np.zeros((len(tracks), len(z)), dtype=bool)
+    most = log_survival(state)[tracks] + math.log(area(state) / (2 * math.pi)) - least_log_odds(state)
+    for mean, covariance in ((position, P), (table.position, table.P)):
+        mean, covariance = mean[tracks], covariance[tracks]
+        a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+        gate = np.maximum(2 * most - np.log(np.maximum(a * c - b * b, _LEAST)), 0.0) * _ROUNDING
+        dx, dy = z[:, 0] - mean[:, :1], z[:, 1] - mean[:, 1:]
+        found |= dx * dx + dy * dy <= gate[:, None] * ((a + c)[:, None] + R[:, 0, 0] + R[:, 1, 1])
+    return found
 
 
 def relinkable(state: TrackerState) -> BoolArray:

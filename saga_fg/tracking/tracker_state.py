@@ -184,8 +184,9 @@ class TrackerState:
     def remove(self, deleted: BoolArray) -> None:
         """Marginalise tracks (n,)."""
         if deleted.any():
-            self.joint.remove(self.table.id[deleted])
-            self.table = self.table.select(~deleted)
+            kept = np.flatnonzero(~deleted)
+            self.joint.remove(self.table.id[deleted], kept)
+            self.table = self.table.select(kept)
 
     def copied(self) -> TrackerState:
         """Return a state that changes independently of this one."""

@@ -27,6 +27,8 @@ from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.settings import TrafficFlowSettings
 from saga_fg.tracking.track_table import TrackTable
 
+_FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
+
 
 @dataclass(frozen=True, eq=False)
 class Passages(Columns):
@@ -43,13 +45,15 @@ class Passages(Columns):
     time: FloatArray
 
     @classmethod
-    def of(cls, table: TrackTable, position: FloatArray, now: Kinematics, time: float) -> Passages:
-        """Return the passages of tracks at positions (n, 2), world, at a time, s."""
-        ahead = np.nan_to_num(np.stack([np.cos(table.box.yaw), np.sin(table.box.yaw)], axis=-1))
+    def of(cls, table: TrackTable, rows: IntArray, now: Kinematics, origin: FloatArray, time: float) -> Passages:
+        """Return the passages of tracks `rows` (n,) with kinematics `now`, local from `origin`, at a time, s."""
+        yaw = table.box.yaw[rows]
+        ahead = np.nan_to_num(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1))
         speed = np.einsum("ni,ni->n", ahead, now.velocity)
         variance = np.einsum("ni,nij,nj->n", ahead, now.P_velocity, ahead)
-        stationary, times = table.stationarity.probability, np.full(len(table), time)
-        return cls(table.id, table.label, position, table.box.yaw, speed, variance, stationary, times)
+        stationary, position = table.stationarity.probability[rows], now.position + origin
+        times = np.full(len(rows), time)
+        return cls(table.id[rows], table.label[rows], position, yaw, speed, variance, stationary, times)
 
 
 class SpeedPrior(NamedTuple):
@@ -97,23 +101,27 @@ class TrafficFlowPrior:
             + (lateral / settings.lateral_scale) ** 2
             + (turn / settings.heading_scale) ** 2
         )
-        k = settings.weight * np.exp(-exponent / 2)
-        k = np.where((passages.label == label[:, None]) & np.isfinite(heading)[:, None], k, 0.0)
-        k = _nearest_of_each(k, passages.id)
-        still = (stationary + k @ passages.stationary) / (1 + k.sum(axis=1))
-        k = k * (1 - passages.stationary)
-        norm = 1 - stationary + k.sum(axis=1)
-        mean = k @ passages.speed / norm
-        square = passages.speed**2 + passages.variance + settings.spread**2
-        return SpeedPrior(still, mean, ((1 - stationary) * variance + k @ square) / norm - mean**2)
+        new, passage = np.nonzero(exponent < _FARTHEST)  # false where the heading is unknown
+        alike = passages.label[passage] == label[new]
+        new, passage = new[alike], passage[alike]
+        k = settings.weight * np.exp(-exponent[new, passage] / 2)
+        nearest = _nearest_of_each(new, passages.id[passage], k)
+        new, k, near = new[nearest], k[nearest], passages.select(passage[nearest])
+
+        def total(values: FloatArray) -> FloatArray:
+            return np.bincount(new, weights=values, minlength=len(label)).astype(np.float64, copy=False)
+
+        still = (stationary + total(k * near.stationary)) / (1 + total(k))
+        k = k * (1 - near.stationary)
+        norm = 1 - stationary + total(k)
+        mean = total(k * near.speed) / norm
+        square = near.speed**2 + near.variance + settings.spread**2
+        return SpeedPrior(still, mean, ((1 - stationary) * variance + total(k * square)) / norm - mean**2)
 
 
-def _nearest_of_each(k: FloatArray, ids: IntArray) -> FloatArray:
-    """k (m, n) with all but the largest entry of each track id (n,) in each row set to 0."""
-    order = np.lexsort((k, np.broadcast_to(ids, k.shape)), axis=1)
-    sorted_ids = ids[order]
-    last = np.ones(k.shape, dtype=bool)
-    last[:, :-1] = sorted_ids[:, 1:] != sorted_ids[:, :-1]
-    kept = np.zeros(k.shape, dtype=bool)
-    np.put_along_axis(kept, order, last, axis=1)
-    return np.where(kept, k, 0.0)
+def _nearest_of_each(new: IntArray, ids: IntArray, k: FloatArray) -> IntArray:
+    """Of pairs (e,) of new tracks and passages of tracks `ids`, those of the largest weight `k` of each two tracks."""
+    order = np.lexsort((k, ids, new))
+    last = np.ones(len(order), dtype=bool)
+    last[:-1] = (np.diff(new[order]) != 0) | (np.diff(ids[order]) != 0)
+    return order[last]

@@ -50,9 +50,9 @@ def unresolved_frames(
     rank = np.empty(len(boxes))
     rank[np.argsort(-probability, kind="stable")] = np.arange(len(boxes))
     covered = _overlaps(state, boxes, boxes, rank[None] < rank[:, None]).max(axis=1, initial=0.0) > OVERLAP
-    detected, now = state.table.select(matching.track), state.kinematics().select(matching.track)
-    surer = (detected.unresolved == 0) & (detected.existence >= probability[:, None])
-    live = _overlaps(state, boxes, detected.boxes(now.position + state.origin, now.velocity), surer)
+    detected, now = matching.track, state.kinematics()
+    surer = (state.table.unresolved[detected] == 0) & (state.table.existence[detected] >= probability[:, None])
+    live = _overlaps(state, boxes, state.boxes(now.position, now.velocity).select(detected), surer)
     covered |= live.max(axis=1, initial=0.0) > OVERLAP
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
     return np.where(covered & precise, FRAMES, 0.0)
@@ -68,9 +68,10 @@ def resolve_tracks(state: TrackerState, matching: Matching) -> None:
         return
     now = state.kinematics()
     boxes = state.boxes(now.position, now.velocity)
-    surer = (table.unresolved == 0) & (table.existence >= table.existence[rows][:, None])
-    overlap = _overlaps(state, boxes.select(rows), boxes, surer)
-    most, other = overlap.max(axis=1), ((overlap > OVERLAP) & detected).any(axis=1)
+    sure = np.flatnonzero((table.unresolved == 0) & (table.existence >= table.existence[rows].min()))
+    surer = table.existence[sure] >= table.existence[rows][:, None]
+    overlap = _overlaps(state, boxes.select(rows), boxes.select(sure), surer)
+    most, other = overlap.max(axis=1, initial=0.0), ((overlap > OVERLAP) & detected[sure]).any(axis=1)
     seen = detected[rows]
     apart = (most <= OVERLAP) | (other & (most <= MOST_OVERLAP))
     step = np.where(seen, -1.0 * apart, ALONE * other)
@@ -83,17 +84,19 @@ def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
     rows = np.flatnonzero(table.unresolved > 0)
     result = np.zeros(len(table), dtype=bool)
     if len(rows):
-        surer = np.tile(table.confirmed & (table.unresolved == 0), (len(rows), 1))
-        result[rows] = _overlaps(state, predicted.select(rows), predicted, surer).max(axis=1) > OVERLAP
+        sure = np.flatnonzero(table.confirmed & (table.unresolved == 0))
+        overlap = _overlaps(state, predicted.select(rows), predicted.select(sure))
+        result[rows] = overlap.max(axis=1, initial=0.0) > OVERLAP
     return result
 
 
-def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, surer: BoolArray) -> FloatArray:
-    """(n, m) bird's-eye IoU of boxes (n) with others (m) of their class that are `surer` (n, m); 0 elsewhere."""
+def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, surer: BoolArray | None = None) -> FloatArray:
+    """(n, m) bird's-eye IoU of boxes (n) with others (m) of their class, `surer` (n, m) ones alone; else 0."""
     result = np.zeros((len(boxes), len(others)))
     row, column = touching_pairs(boxes, others)
-    kept = surer[row, column]
-    row, column = row[kept], column[kept]
+    if surer is not None:
+        kept = surer[row, column]
+        row, column = row[kept], column[kept]
     if len(row) == 0:
         return result
     (classes, of_box), (their_classes, of_other) = distinct(boxes.label), distinct(others.label)

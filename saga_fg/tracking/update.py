@@ -51,8 +51,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         heading, time = np.arctan2(*now.velocity[seen, ::-1].T), np.full(len(seen), state.time)
         state.trails.update(TrailPoints(table.id[seen], now.position[seen] + state.origin, heading, time))
     if state.settings.traffic_flow_prior.weight > 0:
-        passing, now = table.select(t), state.kinematics().select(t)
-        state.traffic.update(Passages.of(passing, now.position + state.origin, now, state.time))
+        state.traffic.update(Passages.of(table, t, state.kinematics().select(t), state.origin, state.time))
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:

@@ -20,7 +20,7 @@ def frame(timestamp, position, sensor="lidar", label="car", yaw=0.0, velocity=No
         np.broadcast_to(np.asarray(yaw, dtype=float), n),
         None if velocity is None else np.broadcast_to(np.asarray(velocity, dtype=float), (n, 2)),
     )
-    return Frame(timestamp, sensor, Detections(boxes, np.broadcast_to(float(score), n)), **fields)
+    return Frame(timestamp, sensor, Detections(boxes, np.broadcast_to(np.asarray(score, dtype=float), n)), **fields)
 
 
 def seen(rng, truth, times, noise=0.1, sensor="lidar", **fields):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, traffic_rules
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, Repulsion, traffic_rules
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.numerics.geometry import yaw_transform
@@ -315,6 +315,25 @@ def test_a_graph_of_several_rules_groups_edges_by_the_types_of_their_ends():
         following = group.interaction == "CarFollowing"
         law = CarFollowing() if following else SharedVelocity()
         assert np.array_equal(group.A_other, law.triples(nodes, group.target, group.source).A_other)
+
+
+@given(seeds)
+def test_rules_see_the_nodes_that_interact_alone(seed):
+    rng = np.random.default_rng(seed)
+    nodes, rules = random_traffic(rng), (Following(), Neighbours(), Repulsion(classes=("car",), sources=("car",)))
+    nodes = replace(nodes, outline={3: np.zeros((2, 2)), 7: np.ones((2, 2))}, unseen=rng.uniform(size=len(nodes)))
+    interacting = rng.random(len(nodes)) < 0.6
+    some = nodes.select(np.flatnonzero(interacting))
+    assert some.id[list(some.outline)].tolist() == nodes.id[[k for k in (3, 7) if interacting[k]]].tolist()
+    whole = build_graph(nodes, rules, explained_noise=1.0, interacting=interacting)
+    part = build_graph(some, rules, explained_noise=1.0)
+    assert whole.nodes.tolist() == nodes.id.tolist()
+    assert (whole.diffusion_scale[~interacting] == 1).all()
+    assert np.array_equal(whole.diffusion_scale[interacting], part.diffusion_scale)
+    for ours, theirs in zip((*whole.edges, *whole.nonlinear), (*part.edges, *part.nonlinear), strict=True):
+        for end in ("target", "source"):
+            assert whole.nodes[getattr(ours, end)].tolist() == part.nodes[getattr(theirs, end)].tolist()
+        assert vars(ours)["rate"].tolist() == vars(theirs)["rate"].tolist()
 
 
 def test_weak_edges_and_edges_between_types_that_do_not_fit_are_left_out():

@@ -6,7 +6,7 @@ import pytest
 from saga_fg import ConstantVelocity, Detections, Frame, InputError, Tracker, TrackerSettings
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.tracking import AssociationSettings, ClassSettings
+from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 PATIENT = {
@@ -124,6 +124,18 @@ def test_a_users_rule_takes_the_place_of_the_settings():
     ]
     now, later = (tracker.tracks(t).boxes.velocity[1, 0] for t in (1.9, 2.4))
     assert later > now + 0.5, "the second object is at rest, but pulled along by the first"
+
+
+def test_a_coasting_track_that_hardly_exists_has_no_edges():
+    classes = {"default": ClassSettings(min_score=0.0, initiation_score=0.0)}
+    doubtful = TrackerSettings(classes, existence=ExistenceSettings(delete_below=0.0))
+    tracker, places = Tracker(doubtful, rules=(Chain(rate=0.3),)), [(0.0, 0.0), (30.0, 40.0), (60.0, 0.0)]
+    tied = []
+    for k, score in enumerate((0.09, None, 0.9, 0.9)):
+        detected = places[1:] if score is None else places
+        tracker.step(frame(0.1 * k, detected, score=[score or 0.9, 0.9, 0.9][-len(detected) :]))
+        tied.append([(g.target.tolist(), g.source.tolist()) for g in tracker.graph.edges] if tracker.graph else [])
+    assert tied == [[], [([1, 2], [0, 1])], [([2], [1])], [([1, 2], [0, 1])]]
 
 
 def test_a_rule_that_makes_no_sense_is_named_and_nothing_has_happened():
